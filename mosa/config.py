@@ -1,0 +1,74 @@
+"""From configuration to objects: the only place that knows both. Everything below takes explicit arguments."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from mosa.errors import ConfigError
+from mosa.modules.body import Body, SimulationSettings, World
+from mosa.modules.heterogeneity import HeterogeneityField
+from mosa.modules.material import Material
+from mosa.modules.stages import Stage
+from mosa.types import Ground, Scene
+
+
+def plain(cfg: DictConfig) -> dict[str, Any]:
+    """Resolved plain containers, fit for a checkpoint. Errors: ConfigError where a key cannot be resolved."""
+    try:
+        return OmegaConf.to_container(cfg, resolve=True)
+    except Exception as error:
+        raise ConfigError(f"the configuration cannot be resolved: {error}") from error
+
+
+def world_config(scene: Scene) -> dict[str, Any]:
+    """Plain description of the world a scene plays in."""
+    return {"ground": asdict(scene.ground) if scene.ground is not None else None, "gravity": scene.gravity.tolist(),
+            "up": scene.up.tolist(), "box": scene.box.tolist()}
+
+
+def build_world(config: Mapping[str, Any]) -> World:
+    ground = Ground(**config["ground"]) if config["ground"] is not None else None
+    return World(ground, *(torch.tensor(config[k], dtype=torch.float32) for k in ("gravity", "up", "box")))
+
+
+def run_config(cfg: dict[str, Any], scene: Scene, dx: float) -> dict[str, Any]:
+    """What a checkpoint keeps: the configuration, and what was measured from the data."""
+    return {"cfg": cfg, "world": world_config(scene), "density": scene.density, "dx": dx,
+            "frame_dt": float(scene.times[1] - scene.times[0])}
+
+
+def build_body(config: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Body:
+    """A body with the law, adapter and settings of a run. tensors: rest, volume, colors, opacities, covariances."""
+    cfg = config["cfg"]
+    torch.manual_seed(cfg["seed"])
+    settings = SimulationSettings(
+        dx=config["dx"], **{k: cfg["simulation"][k] for k in
+                            ("stride", "max_substeps", "courant", "precision", "contact_offset")})
+    law = dict(cfg["prior"])
+    options = law.pop("options", {})
+    material = Material(**{k: v for k, v in law.items() if k != "_target_"})
+    heterogeneity = None
+    if cfg["heterogeneity"]["enabled"]:
+        keys = {k: v for k, v in cfg["heterogeneity"].items() if k != "enabled"}
+        low, high = tensors["rest"].amin(0), tensors["rest"].amax(0)
+        heterogeneity = HeterogeneityField(low=low, high=high, **keys)
+    adapter = instantiate(cfg["adapter"]) if cfg["adapter"].get("_target_") else None
+    return Body(**tensors, density=config["density"], material=material, heterogeneity=heterogeneity, adapter=adapter,
+                settings=settings, law_options=options)
+
+
+def build_stages(fit: Mapping[str, Any], *, heterogeneity: bool, adapter: bool) -> list[Stage]:
+    """The stages of a run, without those that have nothing to optimise or no iterations."""
+    stages = [Stage(name, **fit[name]) for name in ("prior", "prior_eta", "joint")]
+    wanted = {"prior": True, "prior_eta": heterogeneity, "joint": adapter or heterogeneity}
+    stages = [s for s in stages if wanted[s.name] and s.iterations > 0]
+    if not stages or stages[0].name != "prior":
+        raise ConfigError("fit.prior.iterations: expected at least 1: every later figure is compared with the calibrated prior")
+    return stages

@@ -1,0 +1,96 @@
+"""What each built-in scene is: a shape, a hidden material, the drops, and how it is filmed. Fixed: figures depend on it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mosa.data.builtin.hidden_material import HiddenMaterial
+from mosa.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Drop:
+    """One sequence. axis, degrees: how the body is turned; speed: downwards at frame 0 [m/s]; offset: of its centre in the
+    horizontal plane [m]; contact: time at which its lowest point would reach the ground [s]."""
+
+    speed: float
+    axis: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    degrees: float = 0.0
+    offset: tuple[float, float] = (0.0, 0.0)
+    contact: float = 0.07
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """(3, 3)."""
+        axis = np.asarray(self.axis) / np.linalg.norm(self.axis)
+        return Rotation.from_rotvec(math.radians(self.degrees) * axis).as_matrix()
+
+
+@dataclass(frozen=True)
+class Footage:
+    """cameras, frames, native image size [px], fps; field: half width seen at the target [m]; target height, distance [m]."""
+
+    cameras: int = 12
+    frames: int = 15
+    size: int = 320
+    fps: float = 50.0
+    field: float = 0.29
+    target: float = 0.205
+    distance: float = 1.5
+    elevations: tuple[float, ...] = (0.16, 0.55, 0.95)
+
+
+@dataclass(frozen=True)
+class BuiltinObject:
+    """spacing of the truth's particles [m] (its grid is twice as coarse); pitch of its surface mesh [m]."""
+
+    shape: str
+    height: float
+    material: HiddenMaterial
+    drops: dict[str, Drop]
+    footage: Footage = field(default_factory=Footage)
+    spacing: float = 0.005
+    pitch: float = 0.0025
+
+
+RABBIT = HiddenMaterial(E=2e5, nu=0.3, ratio=1.6, fibre=(1.0, 0.3, 0.0), amplitude=0.2, period=0.125)
+# stiffer and slower to squash, fibres lean across the axis, and the stiffness varies along the body
+PEANUT = HiddenMaterial(
+    E=3e5, nu=0.35, ratio=1.9, fibre=(0.2, 0.5, 1.0), amplitude=0.25, period=0.16, axis=(0.3, 0.9, 0.3)
+)  # fmt: skip
+
+DROPS = {
+    "train": Drop(speed=2.5),
+    "test_60": Drop(speed=2.5, axis=(0.3, 0.2, 1.0), degrees=60.0, offset=(0.012, -0.008)),
+    "test_40": Drop(speed=3.2, axis=(1.0, 0.4, 0.2), degrees=40.0, offset=(-0.010, 0.010)),
+}
+
+OBJECTS = {
+    "rabbit": BuiltinObject("rabbit", 0.25, RABBIT, DROPS),
+    "peanut": BuiltinObject("peanut", 0.26, PEANUT, DROPS),
+    # the rabbit, small and short, for tests and sweeps: every stage of the program, none of its accuracy
+    "tiny": BuiltinObject(
+        "rabbit", 0.25, RABBIT,
+        {name: Drop(d.speed, d.axis, d.degrees, d.offset, contact=0.032) for name, d in DROPS.items()},
+        Footage(cameras=6, frames=5, size=128, field=0.23, target=0.15), spacing=0.0125, pitch=0.006,
+    ),
+}  # fmt: skip
+
+
+def object_named(name: str) -> BuiltinObject:
+    """Errors: ConfigError naming the known ones."""
+    if name not in OBJECTS:
+        raise ConfigError(f"scene.name: expected one of the built-in {', '.join(sorted(OBJECTS))}, found {name!r}")
+    return OBJECTS[name]
+
+
+def drop_named(name: str, sequence: str) -> Drop:
+    """Errors: ConfigError naming the known sequences."""
+    drops = object_named(name).drops
+    if sequence not in drops:
+        raise ConfigError(f"scene.sequence: {name} has {', '.join(drops)}, not {sequence!r}")
+    return drops[sequence]

@@ -1,0 +1,122 @@
+"""What every file format comes down to before it is a Scene: named cameras, numbered frames, images and mattes."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mosa.errors import ConfigError, DataError
+from mosa.types import Cameras
+
+WHITE = np.ones(3, np.float32)
+# columns 1 and 2 of a pose with OpenGL axes (y up, looks along -z) point against those of OpenCV (y down, z forward)
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Footage:
+    """cameras: V; frames: T frame numbers as in the files; times: (T,) [s]; images: (V, T, H, W, 3) in [0, 1] composited on
+    `background` (3,); mattes: (V, T, H, W) in [0, 1]."""
+
+    cameras: Cameras
+    frames: tuple[int, ...]
+    times: Tensor
+    images: Tensor
+    mattes: Tensor
+    background: Tensor
+
+
+def read_json(path: Path):
+    """Contents of a JSON file. Errors: DataError naming file and line."""
+    if not path.is_file():
+        raise DataError(f"{path}: file not found")
+    try:
+        return json.loads(path.read_text())
+    except json.JSONDecodeError as error:
+        raise DataError(f"{path}: expected JSON, found a mistake in line {error.lineno}, column {error.colno}: {error.msg}") from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: expected JSON text, found bytes that are no UTF-8") from error
+
+
+def matrix(value, shape: tuple[int, int], where: str) -> np.ndarray:
+    """A finite matrix of that shape from nested lists. Errors: DataError beginning with `where`."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{where}: expected a {shape[0]}x{shape[1]} matrix of numbers, found {str(value)[:80]}") from error
+    if array.shape == (4, 4) and shape == (3, 4):
+        array = array[:3]
+    if array.shape != shape:
+        raise DataError(f"{where}: expected a {shape[0]}x{shape[1]} matrix, found shape {array.shape}")
+    if not np.isfinite(array).all():
+        raise DataError(f"{where}: expected finite numbers, found {array[~np.isfinite(array)][0]}")
+    return array
+
+
+def number(value, where: str) -> float:
+    """A finite number. Errors: DataError beginning with `where`."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        raise DataError(f"{where}: expected a finite number, found {value!r}")
+    return float(value)
+
+
+def world_to_camera(c2w: np.ndarray, where: str) -> np.ndarray:
+    """w2c (4, 4) in OpenCV axes from c2w (3, 4) in OpenGL axes. Errors: DataError where c2w holds no rotation."""
+    full = np.eye(4)
+    full[:3] = c2w
+    rotation = full[:3, :3]
+    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if error > 1e-3 or np.linalg.det(rotation) < 0:
+        raise DataError(
+            f"{where}: expected a rotation in the first three columns, found one that is off orthonormal by {error:.2g} with "
+            f"determinant {np.linalg.det(rotation):.3g}; scaled or mirrored poses cannot be used"
+        )
+    opencv = full @ OPENGL_TO_OPENCV
+    return np.linalg.inv(opencv)
+
+
+def same_camera(known: tuple[np.ndarray, np.ndarray], K: np.ndarray, w2c: np.ndarray) -> bool:
+    """Whether two calibrations agree to 1e-3 px and 1e-5."""
+    return bool(np.abs(known[0] - K).max() < 1e-3 and np.abs(known[1] - w2c).max() < 1e-5)
+
+
+def frame_range(present: list[int], wanted, where: str) -> list[int]:
+    """The frame numbers of `present` inside `wanted` = (first, last), both included, or all of them where it is None.
+
+    Errors: ConfigError where an end is not there, DataError where numbers are missing in between.
+    """
+    if wanted is not None:
+        wanted = list(wanted)
+        if len(wanted) != 2 or not all(isinstance(f, int) and not isinstance(f, bool) for f in wanted):
+            raise ConfigError(f"scene.frames: expected [first, last], found {wanted}")
+        for end in wanted:
+            if end not in present:
+                raise ConfigError(f"scene.frames: {where} has no frame {end}, only {min(present)} to {max(present)}")
+        present = [f for f in present if wanted[0] <= f <= wanted[1]]
+    missing = sorted(set(range(present[0], present[-1] + 1)) - set(present)) if present else []
+    if missing:
+        raise DataError(f"{where}: frames {missing} are missing between {present[0]} and {present[-1]}; restrict scene.frames")
+    if len(present) < 2:
+        raise DataError(f"{where}: expected at least two frames, found {len(present)}")
+    return present
+
+
+def merge_time(times: dict[int, tuple[float, str]], frame: int, time: float, where: str) -> None:
+    """Note the time of a frame. Errors: DataError where another camera gave the same frame another time."""
+    known, first = times.setdefault(frame, (time, where))
+    if abs(known - time) > 1e-6:
+        raise DataError(
+            f"{where}: frame {frame} has time {time:.6f} s, but {known:.6f} s in {first}; the cameras of a scene must be synchronous"
+        )
+
+
+def stack_cameras(calibration: dict[str, tuple[np.ndarray, np.ndarray]], width: int, height: int) -> Cameras:
+    """Cameras from name -> (K, w2c)."""
+    K = torch.tensor(np.stack([k for k, _ in calibration.values()]), dtype=torch.float32)
+    w2c = torch.tensor(np.stack([w for _, w in calibration.values()]), dtype=torch.float32)
+    return Cameras(K, w2c, width, height, tuple(calibration))

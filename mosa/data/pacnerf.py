@@ -1,0 +1,137 @@
+"""PAC-NeRF's layout: all_data.json with one object per image, data/{a,m,r}_<camera>_<frame>.png (data_formats.md)."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mosa.data.footage import (
+    WHITE, Footage, frame_range, matrix, merge_time, number, read_json, same_camera, stack_cameras, world_to_camera,
+)  # fmt: skip
+from mosa.data.images import composite, expect_size, read_image, resize, scaled_size
+from mosa.data.scene import assemble
+from mosa.errors import DataError
+from mosa.rendering.cameras import scale_cameras
+from mosa.types import Scene
+
+NAME = re.compile(r"([a-z])_(-?\d+)_(-?\d+)\.png$")
+# a pixel of the m_ files belongs to the white background above this
+WHITE_LEVEL = 0.99
+PUBLISHED = {
+    "torus": {"E": 1e6, "nu": 0.3},
+    "bird": {"E": 3e5, "nu": 0.3},
+    "playdoh": {"E": 2e6, "nu": 0.3, "yield_stress": 1.54e4},
+    "cat": {"E": 1e6, "nu": 0.3, "yield_stress": 3.85e3},
+    "droplet": {"mu": 200.0, "kappa": 1e5},
+    "letter": {"mu": 100.0, "kappa": 1e5},
+    "cream": {"mu": 1e4, "kappa": 1e6, "yield_stress": 3e3, "viscosity": 10.0},
+    "toothpaste": {"mu": 5e3, "kappa": 1e5, "yield_stress": 200.0, "viscosity": 10.0},
+    "trophy": {"friction_angle": 40.0},
+}
+"""Published parameters by folder name (SI, degrees): compared with at the end, never read by learning, in no config."""
+
+
+def read_pacnerf(path: str | Path, *, frames=None, scale: float = 1.0) -> Footage:
+    """Footage of a folder in PAC-NeRF's layout; only all_data.json and data/ are opened.
+
+    frames: (first, last) or None for all that have a matte; scale: image scale in (0, 1].
+    Errors: DataError naming the file (missing, damaged, of another size, without a matte, with another time), ConfigError.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise DataError(f"{folder}: folder not found; set scene.path to a scene in PAC-NeRF's layout (all_data.json, data/)")
+    listing = folder / "all_data.json"
+    calibration, times = read_listing(listing)
+    prefix, present = usable_frames(folder, calibration)
+    numbers = frame_range([f for f in present if f in times], frames, str(folder / "data"))
+    images, mattes, full = [], [], None
+    for camera in calibration:
+        rows = []
+        for frame in numbers:
+            file = folder / "data" / f"{prefix}_{camera}_{frame}.png"
+            if not file.is_file():
+                raise DataError(
+                    f"{file}: image not found, though {listing.name} lists camera {camera} and other cameras have frame {frame}; "
+                    "restore it or restrict scene.frames"
+                )
+            pixels = read_image(file)
+            if full is None:
+                full, first = pixels.shape[1::-1], file.name
+                size = scaled_size(*full, scale)
+            expect_size(file, pixels, *full, reason=f"as {first}")
+            color, matte = split(file, pixels)
+            rows.append((resize(composite(color, matte, WHITE), *size), resize(matte, *size)))
+        images.append(np.stack([r[0] for r in rows]))
+        mattes.append(np.stack([r[1] for r in rows]))
+    cameras = stack_cameras(calibration, *full)
+    return Footage(
+        cameras if scale == 1 else scale_cameras(cameras, scale), tuple(numbers),
+        torch.tensor([times[f][0] for f in numbers], dtype=torch.float64).float(), torch.from_numpy(np.stack(images)),
+        torch.from_numpy(np.stack(mattes)), torch.ones(3),
+    )  # fmt: skip
+
+
+def read_listing(path: Path) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], dict[int, tuple[float, str]]]:
+    """Calibration (camera name -> K, w2c) in order of camera number, and frame -> (time, where it was read)."""
+    entries = read_json(path)
+    if not isinstance(entries, list) or not entries:
+        raise DataError(f"{path}: expected a list with one object per image, found {type(entries).__name__}")
+    calibration, times = {}, {}
+    for i, entry in enumerate(entries):
+        where = f"{path}, entry {i}"
+        for key in ("file_path", "time", "c2w", "intrinsic"):
+            if not isinstance(entry, dict) or key not in entry:
+                raise DataError(f"{where}: expected the keys file_path, time, c2w and intrinsic, found no {key}")
+        found = NAME.search(str(entry["file_path"]))
+        if found is None:
+            raise DataError(f"{where}: expected a file_path like ./data/r_<camera>_<frame>.png, found {entry['file_path']!r}")
+        camera, frame = found[2], int(found[3])
+        K = matrix(entry["intrinsic"], (3, 3), f"{where}, intrinsic")
+        w2c = world_to_camera(matrix(entry["c2w"], (3, 4), f"{where}, c2w"), f"{where}, c2w")
+        if not same_camera(calibration.setdefault(camera, (K, w2c)), K, w2c):
+            raise DataError(f"{where}: camera {camera} has another pose or intrinsics than before; cameras must not move")
+        if frame >= 0:
+            merge_time(times, frame, number(entry["time"], f"{where}, time"), where)
+    return dict(sorted(calibration.items(), key=lambda item: int(item[0]))), times
+
+
+def usable_frames(folder: Path, calibration: dict) -> tuple[str, list[int]]:
+    """The kind of file to read (a, else m) and the frame numbers any camera has it for.
+
+    Errors: DataError where there is nothing, or only raw images without mattes.
+    """
+    present: dict[str, set[int]] = {"a": set(), "m": set(), "r": set()}
+    if (folder / "data").is_dir():
+        for file in (folder / "data").iterdir():
+            found = NAME.match(file.name)
+            if found and found[1] in present and int(found[3]) >= 0 and found[2] in calibration:
+                present[found[1]].add(int(found[3]))
+    for kind in ("a", "m"):
+        if present[kind]:
+            return kind, sorted(present[kind])
+    if present["r"]:
+        raise DataError(
+            f"{folder / 'data'}: no mattes: expected a_<camera>_<frame>.png (RGBA) or m_<camera>_<frame>.png (background painted "
+            "white), found raw r_ images only; matte them first, with the background plate r_<camera>_-1.png"
+        )
+    raise DataError(f"{folder / 'data'}: expected images a_<camera>_<frame>.png, found none")
+
+
+def split(file: Path, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Colour (H, W, 3) and matte (H, W): the alpha channel of an a_ file, or what is not white in an m_ file."""
+    if file.name.startswith("a_"):
+        if pixels.shape[2] != 4:
+            raise DataError(f"{file}: expected RGBA with the matte as alpha, found {pixels.shape[2]} channels")
+        return pixels[..., :3], pixels[..., 3]
+    color = np.broadcast_to(pixels[..., :3], (*pixels.shape[:2], 3))
+    return color, (color.min(-1) < WHITE_LEVEL).astype(np.float32)
+
+
+def load_pacnerf(path: str | Path, *, frames=None, scale: float = 1.0, name: str | None = None, **world) -> Scene:
+    """Scene of a folder in PAC-NeRF's layout. `world`: the keyword arguments of `mosa.data.scene.assemble`."""
+    footage = read_pacnerf(path, frames=frames, scale=scale)
+    folder = Path(path).resolve().name
+    return assemble(footage, name=name or folder, known_parameters=PUBLISHED.get(folder, {}), **world)

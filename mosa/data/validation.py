@@ -1,0 +1,99 @@
+"""Checks that a scene makes sense before anything is learned from it, and the key under which results are cached."""
+
+from __future__ import annotations
+
+import hashlib
+
+import torch
+
+from mosa.errors import DataError
+from mosa.types import Scene
+
+# relative jitter of frame times that still counts as a constant frame rate
+TIME_JITTER = 1e-3
+
+
+def validate(scene: Scene) -> Scene:
+    """The scene itself. Errors: DataError naming camera and frame, what was expected and what was found."""
+    V, T = len(scene.cameras), scene.frames
+    H, W = scene.cameras.height, scene.cameras.width
+    label = f"scene {scene.name} ({scene.sequence})"
+    for name, found, expected in (
+        ("images", scene.images.shape, (V, T, H, W, 3)), ("mattes", scene.mattes.shape, (V, T, H, W)),
+        ("times", scene.times.shape, (T,)),
+    ):  # fmt: skip
+        if tuple(found) != expected:
+            raise DataError(f"{label}: {name}: expected shape {expected}, found {tuple(found)}")
+    for name in ("images", "mattes"):
+        value = getattr(scene, name)
+        for v in range(V):
+            for t in range(T):
+                if not bool(torch.isfinite(value[v, t]).all()):
+                    raise DataError(f"{label}: {name}: NaN or infinite pixels in camera {scene.cameras.names[v]}, frame {t}")
+    check_cameras(scene, label)
+    check_times(scene, label)
+    check_mattes(scene, label)
+    return scene
+
+
+def check_cameras(scene: Scene, label: str) -> None:
+    """Proper poses and positive focal lengths."""
+    cameras = scene.cameras
+    for v, name in enumerate(cameras.names):
+        if not bool(torch.isfinite(cameras.K[v]).all() and torch.isfinite(cameras.w2c[v]).all()):
+            raise DataError(f"{label}: camera {name}: NaN or infinite numbers in its calibration")
+        if not bool((cameras.K[v].diagonal()[:2] > 0).all()):
+            raise DataError(f"{label}: camera {name}: expected positive focal lengths, found {cameras.K[v].diagonal()[:2].tolist()}")
+        R = cameras.w2c[v, :3, :3].double()
+        if float((R @ R.T - torch.eye(3, dtype=R.dtype)).abs().max()) > 2e-3 or float(torch.linalg.det(R)) < 0:
+            raise DataError(f"{label}: camera {name}: expected a rotation in its pose, found {R.tolist()}")
+        cx, cy = cameras.K[v, 0, 2].item(), cameras.K[v, 1, 2].item()
+        if not (0 < cx < cameras.width and 0 < cy < cameras.height):
+            raise DataError(
+                f"{label}: camera {name}: the principal point ({cx:.1f}, {cy:.1f}) px lies outside of its {cameras.width}x"
+                f"{cameras.height} px images: intrinsics of another resolution?"
+            )
+
+
+def check_times(scene: Scene, label: str) -> None:
+    """Increasing times at one frame rate."""
+    steps = scene.times.double().diff()
+    if not bool(torch.isfinite(scene.times).all()) or not bool((steps > 0).all()):
+        raise DataError(f"{label}: expected increasing frame times, found {[round(t, 5) for t in scene.times.tolist()]}")
+    # float32 keeps 7 digits of the time itself, which is more than the jitter only for steps far smaller than the time
+    allowed = TIME_JITTER * float(steps.median()) + 2e-7 * float(scene.times.abs().max())
+    worst = int((steps - steps.median()).abs().argmax())
+    if abs(float(steps[worst] - steps.median())) > allowed:
+        raise DataError(
+            f"{label}: expected one frame rate, found {float(steps[worst]):.6f} s between frames {worst} and {worst + 1} and "
+            f"{float(steps.median()):.6f} s elsewhere; restrict scene.frames, or set scene.fps if the times are wrong"
+        )
+
+
+def check_mattes(scene: Scene, label: str) -> None:
+    """The object is seen by every camera at frame 0, and is not everything a camera sees."""
+    covered = scene.mattes.mean((2, 3))
+    for v, name in enumerate(scene.cameras.names):
+        if float(covered[v, 0]) == 0:
+            raise DataError(
+                f"{label}: camera {name}: the matte of the first frame is empty; expected the object in view of every camera there: "
+                "matte it, remove the camera, or start later with scene.frames"
+            )
+        if float(covered[v].min()) > 0.99:
+            raise DataError(
+                f"{label}: camera {name}: the matte covers {float(covered[v].min()):.0%} of every image; the footage has no matte "
+                "(an alpha channel that is opaque everywhere?)"
+            )
+
+
+def fingerprint(scene: Scene) -> str:
+    """Hash of everything that learning can depend on: images, mattes, cameras, times, world, and what is held out."""
+    digest = hashlib.sha256()
+    for tensor in (scene.images, scene.mattes, scene.cameras.K, scene.cameras.w2c, scene.times, scene.gravity, scene.up, scene.box,
+                   scene.background):
+        digest.update(str(tuple(tensor.shape)).encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    facts = (scene.cameras.width, scene.cameras.height, scene.ground, scene.density, scene.last_free_frame, scene.holdout_cameras,
+             scene.holdout_frames)
+    digest.update(repr(facts).encode())
+    return digest.hexdigest()[:16]

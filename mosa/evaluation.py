@@ -1,0 +1,162 @@
+"""Figures of a fitted body: every model variant on every sequence, as evaluation.md defines them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from mosa import metrics
+from mosa.modules.body import VARIANTS, Body, Start, World
+from mosa.modules.observer import deformed_covariances, observe
+from mosa.rendering.cameras import crop_boxes
+from mosa.types import Rollout, Scene
+
+PREFIX = {"adapted": "", "prior": "prior/", "prior_eta": "prior_eta/"}
+IMAGE_METRICS = ("psnr_crop", "ssim_crop", "psnr_full", "ssim_full")
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """A sequence to evaluate on. prefix: `train` or `test/<name>`; start: where the body starts; contact: first frame after
+    first contact."""
+
+    prefix: str
+    scene: Scene
+    start: Start
+    contact: int
+
+
+@torch.no_grad()
+def rollouts(body: Body, sequence: Sequence, world: World, variants=VARIANTS) -> dict[str, Rollout]:
+    """Every variant's rollout over all frames of `sequence`."""
+    scene = sequence.scene
+    frame_dt = float(scene.times[1] - scene.times[0])
+    return {v: body.simulate(sequence.start, world, scene.frames, frame_dt, variant=v) for v in variants}
+
+
+@torch.no_grad()
+def render(body: Body, rollout: Rollout, scene: Scene, cameras: list[int]) -> Tensor:
+    """(V, T, H, W, 3) images of a rollout from the given cameras, one camera at a time to bound memory."""
+    device = body.rest.device
+    views = [
+        observe(rollout.x, deformed_covariances(rollout.F_tot, body.covariances), body.opacities, body.colors,
+                scene.cameras.select([c]).to(device), scene.background.to(device)).images
+        for c in cameras
+    ]
+    return torch.cat(views).clamp(0, 1).cpu()
+
+
+def image_metrics(images: Tensor, scene: Scene, cameras: list[int], frames: list[int]) -> dict[str, float]:
+    """PSNR and SSIM, in full and in one box per camera: that of the true mattes over all frames plus 10 px."""
+    if not cameras or not frames:
+        return {}
+    x0, y0, width, height = crop_boxes(scene.mattes[cameras], margin=10)
+    real = scene.images[cameras]
+    pairs_full, pairs_crop = [], []
+    for v, (x, y) in enumerate(zip(x0.tolist(), y0.tolist())):
+        pairs_full.append((images[v][frames], real[v][frames]))
+        window = (slice(None), slice(y, y + height), slice(x, x + width))
+        pairs_crop.append((images[v][frames][window], real[v][frames][window]))
+    result = {}
+    for name, pairs in (("crop", pairs_crop), ("full", pairs_full)):
+        result[f"psnr_{name}"] = float(np.mean([metrics.psnr(a, b) for a, b in pairs]))
+        result[f"ssim_{name}"] = float(np.mean([metrics.ssim(a, b) for a, b in pairs]))
+    return result
+
+
+def motion_metrics(x: Tensor, body: Body, sequence: Sequence, frames: list[int], samples: int, assignment: int) -> dict[str, float]:
+    """rms_m, chamfer and earth mover's distance after first contact, where the true motion is known."""
+    truth = sequence.scene.truth
+    after = [t for t in frames if t >= sequence.contact]
+    if not after:
+        return {}
+    if truth is None:
+        clouds = sequence.scene.particles
+        if clouds is None:
+            return {}
+        pairs = [(x[t], clouds[t]) for t in after]
+        result = {}
+    else:
+        target = metrics.interpolate_motion(truth.rest, truth.positions, body.rest.cpu())
+        result = {"rms_m": metrics.rms(x[after], target[after])}
+        pairs = [(x[t], truth.positions[t]) for t in after]
+    result["cd_sq_m2"] = float(np.mean([metrics.chamfer_squared(a, b, samples=samples) for a, b in pairs]))
+    result["cd_m"] = float(np.mean([metrics.chamfer(a, b, samples=samples) for a, b in pairs]))
+    last = pairs[:: max(1, len(pairs) // 3)]
+    result["emd_m"] = float(np.mean([metrics.emd(a, b, samples=assignment) for a, b in last]))
+    return result
+
+
+@torch.no_grad()
+def evaluate(body: Body, sequences: list[Sequence], world: World, *, samples: int = 8192, assignment: int = 2048,
+             variants=VARIANTS) -> tuple[dict[str, float], dict[str, dict[str, Rollout]]]:
+    """All figures, flat, named as in evaluation.md, and the rollouts: result[sequence prefix][variant]."""
+    figures: dict[str, float] = {}
+    kept: dict[str, dict[str, Rollout]] = {}
+    bar = tqdm(total=len(sequences) * len(variants), desc="evaluate", unit="rollout", dynamic_ncols=True)
+    for sequence in sequences:
+        kept[sequence.prefix] = {}
+        for variant, rollout in rollouts(body, sequence, world, variants).items():
+            kept[sequence.prefix][variant] = rollout
+            figures |= sequence_metrics(body, sequence, rollout, PREFIX[variant], samples, assignment)
+            bar.update()
+    bar.close()
+    figures |= test_means(figures)
+    return figures, kept
+
+
+def sequence_metrics(body, sequence: Sequence, rollout: Rollout, model: str, samples: int, assignment: int) -> dict[str, float]:
+    """The figures of one rollout: training views and frames, held-out frames, held-out cameras."""
+    scene, x = sequence.scene, rollout.x.cpu()
+    training = sequence.prefix == "train"
+    frames = scene.training_frames if training else list(range(scene.frames))
+    cameras = scene.training_cameras if training else list(range(len(scene.cameras)))
+    figures: Mapping[str, float] = {
+        **motion_metrics(x, body, sequence, frames, samples, assignment),
+        **image_metrics(render(body, rollout, scene, cameras), scene, cameras, frames),
+    }
+    result = {f"{model}{sequence.prefix}/{k}": v for k, v in figures.items()}
+    if training and scene.holdout_frames:
+        held = list(scene.holdout_frames)
+        figures = {**motion_metrics(x, body, sequence, held, samples, assignment),
+                   **image_metrics(render(body, rollout, scene, cameras), scene, cameras, held)}
+        result |= {f"{model}frames/{k}": v for k, v in figures.items()}
+    if training and scene.holdout_cameras:
+        held = list(scene.holdout_cameras)
+        images = render(body, rollout, scene, held)
+        result |= {f"{model}camera/{k}": v for k, v in image_metrics(images, scene, held, frames).items()}
+        for t in frames:
+            per_frame = image_metrics(images, scene, held, [t])
+            result |= {f"{model}camera/frame_{t:02d}/{k}": per_frame[k] for k in ("psnr_crop", "ssim_crop")}
+    return result
+
+
+def test_means(figures: Mapping[str, float]) -> dict[str, float]:
+    """`test/<metric>`: mean over the held-out sequences, for each model."""
+    groups: dict[str, list[float]] = {}
+    for key, value in figures.items():
+        model, mark, rest = key.partition("test/")
+        if mark and "/" in rest:
+            groups.setdefault(f"{model}test/{rest.split('/', 1)[1]}", []).append(value)
+    return {key: float(np.mean(values)) for key, values in groups.items()}
+
+
+def identification(body: Body, scene: Scene) -> dict[str, float]:
+    """Identified parameters after calibration (`id_prior/`) and after the joint stage (`id/`), with errors where truth is known."""
+    figures = {}
+    for prefix, variant in (("id_prior", "prior"), ("id", "adapted")):
+        material, contact, heterogeneity, _ = body.parts(variant)
+        mean = float(body.factor(heterogeneity).mean())
+        for name, value in material.physical().items():
+            scale = mean if name == material.stiffness else 1.0
+            figures[f"{prefix}/{name}"] = float(value) * scale
+            if name in scene.known_parameters:
+                true = scene.known_parameters[name]
+                figures[f"{prefix}/{name}_relative_error"] = abs(figures[f"{prefix}/{name}"] - true) / abs(true)
+        figures[f"{prefix}/contact_offset_m"] = float(contact())
+    return figures

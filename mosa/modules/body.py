@@ -1,0 +1,233 @@
+"""The learned body: rest particles with appearance, a prior law with its parameters, heterogeneity, and the stress adapter.
+
+One module for fitting, evaluation and later use, so that what is learned is what is simulated.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor, nn
+
+from mosa.errors import ConfigError
+from mosa.modules.heterogeneity import HeterogeneityField
+from mosa.modules.material import Material
+from mosa.physics.rollout import Simulator
+from mosa.physics.time_step import required_substeps
+from mosa.types import Ground, ParticleState, Rollout
+
+VARIANTS = ("prior", "prior_eta", "adapted")
+ADAPTER_MARGIN = 1.85  # bound of the adapted modulus over the prior's at alpha = 0.1 (method.md, section 6)
+
+
+@dataclass(frozen=True)
+class Start:
+    """Initial state of a sequence. rotation: (3, 3) pose Q relative to the rest shape; center: (3,) position of the rest
+    centre [m]; velocity: (3,) [m/s]; angular_velocity: (3,) [rad/s]."""
+
+    rotation: Tensor
+    center: Tensor
+    velocity: Tensor
+    angular_velocity: Tensor
+
+
+@dataclass(frozen=True)
+class World:
+    """What a body falls in. gravity, up: (3,); box: (2, 3) [m]."""
+
+    ground: Ground | None
+    gravity: Tensor
+    up: Tensor
+    box: Tensor
+
+
+@dataclass(frozen=True)
+class SimulationSettings:
+    """dx [m]; `stride`: substeps between evaluations of the networks; `max_substeps` per frame; `precision`: 32 | 64."""
+
+    dx: float
+    stride: int = 8
+    max_substeps: int = 400
+    courant: float = 0.6
+    precision: int = 32
+    contact_offset: bool = True
+
+
+def skew(w: Tensor) -> Tensor:
+    """Matrix [w]_x (3, 3) with [w]_x r = w x r."""
+    zero = torch.zeros_like(w[0])
+    return torch.stack([zero, -w[2], w[1], w[2], zero, -w[0], -w[1], w[0], zero]).reshape(3, 3)
+
+
+class ContactOffset(nn.Module):
+    """Height [m] by which the grid's contact lies above the ground, learned in units of dx.
+
+    A B-spline grid stops a body a fraction of dx before it touches a wall, by an amount that depends on dx and on the stencil's
+    place; without this one number the stiffness absorbs it, differently on every grid.
+    """
+
+    def __init__(self, dx: float, enabled: bool = True) -> None:
+        super().__init__()
+        self.dx, self.enabled = dx, enabled
+        self.cells = nn.Parameter(torch.zeros(()), requires_grad=enabled)
+
+    def forward(self) -> Tensor:
+        return self.dx * self.cells
+
+
+class Body(nn.Module):
+    """N particles with a law. Buffers: rest (N, 3) [m], volume (N,) [m^3], colors (N, 3), opacities (N,), covariances (N, 3, 3).
+    """
+
+    def __init__(
+        self,
+        *,
+        rest: Tensor,
+        volume: Tensor,
+        colors: Tensor,
+        opacities: Tensor,
+        covariances: Tensor,
+        density: float,
+        material: Material,
+        heterogeneity: HeterogeneityField | None,
+        adapter: nn.Module | None,
+        settings: SimulationSettings,
+        law_options: dict | None = None,
+    ) -> None:
+        super().__init__()
+        for name, value in (
+            ("rest", rest), ("volume", volume), ("colors", colors), ("opacities", opacities), ("covariances", covariances),
+        ):
+            self.register_buffer(name, value.detach().clone())
+        self.density, self.settings, self.law_options = float(density), settings, law_options or {}
+        self.material, self.heterogeneity, self.adapter = material, heterogeneity, adapter
+        # the calibrated backbones that every later figure is compared with; filled when their stage ends
+        self.contact = ContactOffset(settings.dx, settings.contact_offset)
+        backbone = nn.ModuleDict({"material": material, "contact": self.contact})
+        self.frozen = nn.ModuleDict({"prior": copy.deepcopy(backbone), "prior_eta": copy.deepcopy(backbone)})
+        if heterogeneity is not None:
+            self.frozen["prior_eta"]["heterogeneity"] = copy.deepcopy(heterogeneity)
+        self.frozen.requires_grad_(False)
+
+    @property
+    def center(self) -> Tensor:
+        """(3,) centre of mass of the rest shape [m]."""
+        return (self.rest * self.volume[:, None]).sum(0) / self.volume.sum()
+
+    @property
+    def size(self) -> float:
+        """Largest extent of the rest shape [m]."""
+        return float((self.rest.amax(0) - self.rest.amin(0)).max())
+
+    def factor(self, heterogeneity: nn.Module | None) -> Tensor:
+        """(N,) stiffness factor 1 + amplitude tanh eta(X) (method.md, section 5)."""
+        if heterogeneity is None:
+            return torch.ones_like(self.volume)
+        return heterogeneity.factor(self.rest)
+
+    def parts(self, variant: str) -> tuple[Material, ContactOffset, nn.Module | None, nn.Module | None]:
+        """(material, contact, heterogeneity, adapter) of `variant`: the live modules (adapted), or those of an ended stage."""
+        if variant == "adapted":
+            return self.material, self.contact, self.heterogeneity, self.adapter
+        if variant not in self.frozen:
+            raise ConfigError(f"variant: expected one of {', '.join(VARIANTS)}, found {variant!r}")
+        frozen = self.frozen[variant]
+        return frozen["material"], frozen["contact"], frozen["heterogeneity"] if "heterogeneity" in frozen else None, None
+
+    def freeze(self, variant: str) -> None:
+        """Keep the live parameters as the calibrated backbone `variant` (prior | prior_eta)."""
+        for name, module in self.frozen[variant].items():
+            module.load_state_dict(getattr(self, name).state_dict())
+
+    def thaw(self, variant: str) -> None:
+        """Set the live parameters back to those of the backbone `variant`."""
+        for name, module in self.frozen[variant].items():
+            getattr(self, name).load_state_dict(module.state_dict())
+
+    def initial_state(self, start: Start, dt: float, gravity: Tensor) -> ParticleState:
+        """Particles at `start`: x = Q (X - X_c) + x_c, F = F_tot = Q, C_affine = [omega]_x (method.md, sections 6 and 10).
+
+        The velocity is taken half a substep of gravity early: symplectic Euler then follows the parabola exactly at any dt.
+        """
+        Q = start.rotation.to(self.rest)
+        arm = (self.rest - self.center) @ Q.T
+        velocity = start.velocity - 0.5 * dt * gravity
+        v = velocity + torch.linalg.cross(start.angular_velocity.expand_as(arm), arm)
+        n = len(arm)
+        F = Q.expand(n, 3, 3).contiguous()
+        return ParticleState(arm + start.center, v, skew(start.angular_velocity).expand(n, 3, 3).contiguous(), F, F)
+
+    def substeps(self, parameters_modulus: float, frame_dt: float, speed: float, adapted: bool) -> int:
+        """Substeps per frame that the time step bound asks for, rounded up to whole strides of the adapter."""
+        settings = self.settings
+        count = required_substeps(
+            modulus_max=parameters_modulus, density=self.density, frame_dt=frame_dt, dx=settings.dx, v_max=speed,
+            factor=ADAPTER_MARGIN if adapted else 1.0, courant=settings.courant, limit=settings.max_substeps,
+        )
+        return -(-count // settings.stride) * settings.stride
+
+    def simulate(
+        self,
+        start: Start,
+        world: World,
+        frames: int,
+        frame_dt: float,
+        *,
+        variant: str = "adapted",
+        with_adapter: bool = True,
+        with_heterogeneity: bool = True,
+        collect: Callable | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> Rollout:
+        """Roll `frames` frames out (frame 0 is the start). Differentiable in every parameter and in `start`.
+
+        collect: called with every adapter operator (penalties, mean |C|). Errors: SimulationDiverged, ConfigError (time step).
+        """
+        material, contact, heterogeneity, adapter = self.parts(variant)
+        if not with_heterogeneity:
+            heterogeneity = None
+        if not with_adapter:
+            adapter = None
+        dtype = torch.float64 if self.settings.precision == 64 else torch.float32
+        factor = self.factor(heterogeneity)
+        parameters = material.per_particle(factor)
+        gravity, up = world.gravity.to(self.rest), world.up.to(self.rest)
+        fall = float(gravity.norm()) * frames * frame_dt
+        speed = float(start.velocity.detach().norm()) + fall
+        speed += float(start.angular_velocity.detach().norm()) * self.size
+        # one time step for all variants of a body: their difference is then the law's, not the integrator's
+        substeps = self.substeps(float(material.max_modulus(factor.detach())), frame_dt, speed, self.adapter is not None)
+        simulator = self.simulator(material.law, substeps, frame_dt, world)
+        state = self.initial_state(start, frame_dt / substeps, gravity)
+        lift = contact() * up
+        state = replace(state, x=state.x + lift)
+        state = ParticleState(*(getattr(state, name).to(dtype) for name in ("x", "v", "C_affine", "F", "F_tot")))
+        operator = None
+        if adapter is not None:
+            def operator(material_state):
+                result = adapter(material_state)
+                if collect is not None:
+                    collect(adapter)
+                return result
+        rollout = simulator.rollout(
+            state, {k: p.to(dtype) for k, p in parameters.items()}, self.volume.to(dtype), self.density, frames,
+            adapter=operator, stride=self.settings.stride, progress=progress,
+        )
+        fields = {name: getattr(rollout, name).to(self.rest.dtype) for name in ("x", "v", "F", "F_tot")}
+        return replace(rollout, **{**fields, "x": fields["x"] - lift})
+
+    def simulator(self, law: str, substeps: int, frame_dt: float, world: World) -> Simulator:
+        """The simulator of `law` in `world`, one per time step (kernels are compiled once per law and precision)."""
+        key = (law, substeps, frame_dt, str(self.rest.device), id(world))
+        if getattr(self, "_simulator_key", None) != key:
+            dtype = torch.float64 if self.settings.precision == 64 else torch.float32
+            self._simulator = Simulator(
+                law, dx=self.settings.dx, substeps=substeps, frame_dt=frame_dt, gravity=world.gravity, up=world.up,
+                ground=world.ground, box=world.box, dtype=dtype, device=self.rest.device, **self.law_options,
+            )
+            self._simulator_key = key
+        return self._simulator
+

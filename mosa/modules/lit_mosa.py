@@ -1,0 +1,223 @@
+"""LightningModule of the fit: wires body, simulation, rendering and losses; logs; steps. The mathematics lives elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import lightning as L
+import torch
+from torch import Tensor
+
+from mosa import losses
+from mosa.data.datamodule import Observations
+from mosa.errors import ConfigError, SimulationDiverged
+from mosa.modules.body import Body, Start, World
+from mosa.modules.observer import deformed_covariances, observe
+from mosa.modules.stages import Stage
+from mosa.types import MotionCues, Rollout
+
+TERMS = ("image", "mask", "flow", "rotation", "stretch", "heterogeneity", "position", "operator", "operator_variance")
+
+
+class LitMosa(L.LightningModule):
+    """Fits a body to one training sequence in stages.
+
+    observations: targets (datamodule.py); cues: reconstruction cues of the training frames; weights: per loss term (method.md,
+    section 8); config: plain containers from which `eval.py` rebuilds the run.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        *,
+        start: Start,
+        world: World,
+        observations: Observations,
+        cues: MotionCues,
+        background: Tensor,
+        frame_dt: float,
+        first_contact: int,
+        stages: Sequence[Stage],
+        weights: Mapping[str, float],
+        clip: float = 1.0,
+        config: dict | None = None,
+    ) -> None:
+        super().__init__()
+        unknown = sorted(set(weights) - set(TERMS))
+        if unknown:
+            raise ConfigError(f"losses: unknown terms {unknown}; known are {', '.join(TERMS)}")
+        self.automatic_optimization = False
+        self.body, self.world, self.start = body, world, start
+        self.observations, self.cues, self.background = observations, cues, background
+        self.frame_dt, self.first_contact, self.stages = frame_dt, first_contact, list(stages)
+        self.weights, self.clip, self.config = dict(weights), clip, config or {}
+        self.stage_index, self.losses, self.steps_done = 0, [], 0
+        self.last: dict[str, float] = {}
+
+    # ---------------------------------------------------------------- state
+    @property
+    def stage(self) -> Stage | None:
+        """The running stage; None when all have ended."""
+        return self.stages[self.stage_index] if self.stage_index < len(self.stages) else None
+
+    def on_save_checkpoint(self, checkpoint: dict) -> None:
+        checkpoint["mosa"] = {"config": self.config, "stage": self.stage_index, "losses": list(self.losses),
+                              "steps_done": self.steps_done, "particles": len(self.body.rest)}
+        checkpoint["mosa"]["start"] = {k: getattr(self.start, k).tolist() for k in
+                                       ("rotation", "center", "velocity", "angular_velocity")}
+
+    def on_load_checkpoint(self, checkpoint: dict) -> None:
+        if "mosa" not in checkpoint:
+            raise ConfigError("ckpt_path: the checkpoint was not written by this program (no entry 'mosa')")
+        saved = checkpoint["mosa"]
+        if saved["particles"] != len(self.body.rest):
+            raise ConfigError(f"ckpt_path: expected a body of {len(self.body.rest)} particles, found {saved['particles']}: the "
+                              "checkpoint belongs to another scene, reconstruction or simulation.particles")
+        self.stage_index, self.losses, self.steps_done = saved["stage"], list(saved["losses"]), saved["steps_done"]
+
+    def configure_optimizers(self) -> list[torch.optim.Optimizer]:
+        return [torch.optim.Adam(self.groups(stage), betas=(0.9, 0.95)) for stage in self.stages]
+
+    def groups(self, stage: Stage) -> list[dict]:
+        """Parameter groups of a stage; `rate` keeps the learning rate before decay."""
+        body = self.body
+        groups = [{"params": [p for p in body.material.parameters() if p.requires_grad], "rate": stage.lr, "name": "material"}]
+        if body.contact.enabled:
+            groups.append({"params": list(body.contact.parameters()), "rate": stage.lr_contact, "name": "contact"})
+        if stage.name != "prior" and body.heterogeneity is not None:
+            groups.append({"params": list(body.heterogeneity.parameters()), "rate": stage.lr_networks, "name": "heterogeneity"})
+        if stage.name == "joint" and body.adapter is not None:
+            params = [p for p in body.adapter.parameters() if p.requires_grad]
+            groups.append({"params": params, "rate": stage.lr_networks, "name": "adapter"})
+        return [{**g, "lr": g["rate"]} for g in groups if g["params"]]
+
+    # ---------------------------------------------------------------- one step
+    def training_step(self, batch, _index: int) -> None:
+        views = batch
+        stage = self.stage
+        iteration = len(self.losses)
+        if iteration == 0:
+            self.begin(stage)
+        total = len(self.cues.positions)
+        frames = stage.active_frames(iteration, min(self.first_contact + 3, total), total)
+        optimizer = self.optimizers()
+        optimizer = optimizer[self.stage_index] if isinstance(optimizer, list) else optimizer
+        for group in optimizer.param_groups:
+            group["lr"] = group["rate"] * stage.decay(iteration)
+        optimizer.zero_grad()
+        terms, rollout = self.terms(stage, views, frames)
+        loss = sum(self.weights.get(name, 0.0) * value for name, value in terms.items())
+        if not torch.isfinite(loss):
+            bad = [name for name, value in terms.items() if not torch.isfinite(value)]
+            raise SimulationDiverged(f"stage {stage.name}, iteration {iteration}: loss terms {bad} are not finite; "
+                                     "lower fit.*.lr or simulation.courant")
+        self.manual_backward(loss)
+        norms = self.gradient_norms(optimizer, stage, iteration)
+        optimizer.step()
+        self.losses.append(float(loss.detach()))
+        self.steps_done += 1
+        self.report(stage, iteration, frames, terms, loss, norms, views, rollout)
+        if stage.ended(self.losses):
+            self.finish(stage)
+
+    def terms(self, stage: Stage, views: list[int], frames: int) -> tuple[dict[str, Tensor], Rollout]:
+        """Every loss term that has a weight (raw), and the rollout they were computed on."""
+        body, weights, cues = self.body, self.weights, self.cues
+        adapted = stage.name == "joint" and body.adapter is not None
+        collected: list = []
+        rollout = body.simulate(
+            self.start, self.world, frames, self.frame_dt, with_adapter=adapted, with_heterogeneity=stage.name != "prior",
+            collect=(lambda adapter: collected.append(adapter.statistics())) if adapted else None,
+        )
+        def on(name: str) -> bool:
+            return weights.get(name, 0.0) != 0
+
+        terms: dict[str, Tensor] = {}
+        targets = self.observations.select(views, frames)
+        if on("image") or on("mask") or on("flow"):
+            seen = observe(rollout.x, deformed_covariances(rollout.F_tot, body.covariances), body.opacities, body.colors,
+                           targets.cameras, self.background, flow=on("flow"))
+            if on("image"):
+                terms["image"] = losses.image_loss(seen.images, targets.images)
+            if on("mask"):
+                terms["mask"] = losses.mask_loss(seen.mattes, targets.mattes)
+            if on("flow"):
+                terms["flow"] = losses.flow_loss(seen.flow, targets.flow, targets.image_width)
+        if on("rotation"):
+            terms["rotation"] = losses.rotation_loss(rollout.F_tot, cues.rotation[:frames], cues.weight[:frames],
+                                                     self.start.rotation)
+        if on("stretch"):
+            terms["stretch"] = losses.stretch_loss(rollout.F_tot, cues.stretch[:frames], cues.weight[:frames])
+        if on("position"):
+            terms["position"] = losses.position_loss(rollout.x, cues.positions[:frames], body.size)
+        if stage.name != "prior" and body.heterogeneity is not None and on("heterogeneity"):
+            terms["heterogeneity"] = losses.heterogeneity_loss(body.heterogeneity(body.rest))
+        if collected:
+            if on("operator"):
+                terms["operator"] = torch.stack([s.mean_square for s in collected]).mean()
+            if on("operator_variance"):
+                terms["operator_variance"] = torch.stack([s.variance for s in collected]).mean()
+            self.last["mean_abs_C"] = float(torch.stack([s.mean_abs_C.detach() for s in collected]).mean())
+        return terms, rollout
+
+    def gradient_norms(self, optimizer, stage: Stage, iteration: int) -> dict[str, float]:
+        """Norm per parameter group; the networks' are clipped. A non-finite one stops the run: it is never zeroed."""
+        norms = {}
+        for group in optimizer.param_groups:
+            bound = self.clip if group["name"] in ("heterogeneity", "adapter") else float("inf")
+            norm = float(torch.nn.utils.clip_grad_norm_(group["params"], bound))
+            if norm != norm or norm == float("inf"):
+                raise SimulationDiverged(f"stage {stage.name}, iteration {iteration}: the gradient of {group['name']} is not "
+                                         "finite; lower simulation.courant or the learning rate of the stage")
+            norms[group["name"]] = norm
+        return norms
+
+    # ---------------------------------------------------------------- stages
+    def begin(self, stage: Stage) -> None:
+        """What a stage starts from."""
+        if stage.start is not None:
+            self.body.thaw(stage.start)
+        if stage.name == "joint" and self.body.adapter is not None:
+            physical = self.body.material.physical()
+            self.body.adapter.switch_on(self.body.material.reference_modulus(), physical.get("nu", 0.3))
+
+    def finish(self, stage: Stage) -> None:
+        """Keep the stage's result as a backbone and go on to the next; stop the trainer after the last."""
+        if stage.name == "prior":  # also what prior_eta and joint go on from, should the stage between them be left out
+            self.body.freeze("prior_eta")
+        if stage.name != "joint":
+            self.body.freeze(stage.name)
+        self.stage_index, self.losses = self.stage_index + 1, []
+        if self.stage is None:
+            self.trainer.should_stop = True
+
+    # ---------------------------------------------------------------- logs
+    def report(self, stage, iteration, frames, terms, loss, norms, views, rollout) -> None:
+        """Scalars of one step: every term raw and weighted, parameters, mean |C|, gradient norms."""
+        values = {"loss/total": loss.detach(), "fit/frames": float(frames), "fit/stage": float(self.stage_index)}
+        for name, value in terms.items():
+            values[f"loss_raw/{name}"] = value.detach()
+            values[f"loss_weighted/{name}"] = self.weights[name] * value.detach()
+        for name, value in self.body.material.physical().items():
+            values[f"id/{name}"] = value.detach()
+        values["id/contact_offset"] = self.body.contact().detach()
+        for name, value in norms.items():
+            values[f"gradient_norm/{name}"] = value
+        if "mean_abs_C" in self.last:
+            values["adapter/mean_abs_C"] = self.last["mean_abs_C"]
+        values["fit/inverted"] = float(rollout.inverted)
+        self.log_dict({k: torch.as_tensor(v, dtype=torch.float32) for k, v in values.items()}, on_step=True, on_epoch=False)
+        self.last |= {k: float(v) for k, v in values.items()}
+
+    @torch.no_grad()
+    def strip(self, view: int = 0) -> Tensor:
+        """(3, 2 h, T w) strip of one view: real above, rendered below, every frame from left to right."""
+        frames = len(self.cues.positions)
+        body = self.body
+        joint = self.stage is None or self.stage.name == "joint"
+        rollout = body.simulate(self.start, self.world, frames, self.frame_dt, with_adapter=joint and body.adapter is not None)
+        targets = self.observations.select([view], frames)
+        seen = observe(rollout.x, deformed_covariances(rollout.F_tot, body.covariances), body.opacities, body.colors,
+                       targets.cameras, self.background)
+        rows = [torch.cat(list(images[0]), 1) for images in (targets.images, seen.images)]
+        return torch.cat(rows, 0).clamp(0, 1).permute(2, 0, 1)

@@ -1,0 +1,56 @@
+"""The staged schedule of method.md, section 9: what is optimised when, and when a stage ends."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from mosa.errors import ConfigError
+
+STAGES = ("prior", "prior_eta", "joint")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of the fit.
+
+    lr: global parameters; lr_networks: heterogeneity field and adapter; lr_contact [cells]: contact offset;
+    converged: relative change of the mean loss of 10 iterations below which the stage ends (0: run all iterations);
+    start: backbone whose parameters the stage starts from (joint: prior | prior_eta).
+    """
+
+    name: str
+    iterations: int
+    lr: float
+    lr_networks: float = 0.0
+    lr_contact: float = 0.0
+    converged: float = 0.0
+    start: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.name not in STAGES:
+            raise ConfigError(f"fit: expected a stage among {', '.join(STAGES)}, found {self.name!r}")
+        if self.iterations < 0:
+            raise ConfigError(f"fit.{self.name}.iterations: expected a number >= 0, found {self.iterations}")
+
+    def decay(self, iteration: int) -> float:
+        """Factor of the learning rates: constant for the first half, then a cosine down to a tenth."""
+        progress = max(0.0, 2 * iteration / max(self.iterations, 1) - 1)
+        return 0.55 + 0.45 * math.cos(math.pi * min(progress, 1.0))
+
+    def active_frames(self, iteration: int, first: int, total: int) -> int:
+        """Frames that enter progressively in the first stage: from `first` to all over the first third of its iterations."""
+        if self.name != "prior":
+            return total
+        ramp = max(1, self.iterations // 3)
+        return min(total, max(2, first + math.ceil((total - first) * iteration / ramp)))
+
+    def ended(self, losses: list[float]) -> bool:
+        """Whether the stage is over after iterations with these losses."""
+        if len(losses) >= self.iterations:
+            return True
+        ramp = max(1, self.iterations // 3)
+        if self.converged <= 0 or len(losses) < ramp + 20:
+            return False
+        last, before = sum(losses[-10:]) / 10, sum(losses[-20:-10]) / 10
+        return abs(last - before) < self.converged * abs(before)

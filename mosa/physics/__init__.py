@@ -1,0 +1,6 @@
+"""Differentiable MLS-MPM in NVIDIA Warp behind torch operations; `reference` is its pure-torch float64 twin."""
+
+import warp as wp
+
+wp.config.log_level = wp.LOG_WARNING  # lines on every small module compiled would drown the program's own
+wp.init()

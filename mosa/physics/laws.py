@@ -1,0 +1,90 @@
+"""Registry of constitutive laws: a law is one Warp function for the stress and, where it yields, one for the return mapping.
+
+Elastic laws are in `elasticity`, return mappings in `plasticity`; another module adds its own with `register_law`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import warp as wp
+
+from mosa.errors import ConfigError
+
+SLOTS = 12
+"""Numbers a law can take per particle."""
+
+LawParameters = wp.types.vector(length=SLOTS, dtype=wp.float64)
+
+
+@dataclass(frozen=True)
+class Law:
+    """A constitutive law.
+
+    stress: `wp.func (F: mat33d, R: mat33d, C_affine: mat33d, p: LawParameters) -> mat33d`, the Kirchhoff stress [Pa]. R is the
+    polar rotation of F with its differential if `uses_rotation`, else unspecified; everything is float64.
+    parameters: name -> how many numbers (1 for a scalar, 3 for a vector, ...); p holds them in this order.
+    return_map: `wp.func (F, R, U, S, V, H, n2, norm_eps, p, dt) -> (F, yielded: int)` or None, see `plasticity`.
+    reference: name of a 9-number parameter that the simulator fills with the rotation of the start's F, or None.
+    needs_positive_J: the law has no value at det F <= 0, which is then an error.
+    energy: torch function (F (..., 3, 3), **parameters) -> energy per rest volume [J/m^3], or None.
+    """
+
+    name: str
+    stress: Callable
+    parameters: dict[str, int]
+    return_map: Callable | None = None
+    uses_rotation: bool = False
+    reference: str | None = None
+    needs_positive_J: bool = False
+    energy: Callable | None = None
+    offsets: dict[str, int] = field(init=False)
+
+    def __post_init__(self) -> None:
+        offsets, total = {}, 0
+        for name, size in self.parameters.items():
+            offsets[name] = total
+            total += size
+        if total > SLOTS:
+            raise ConfigError(f"law {self.name!r}: expected at most {SLOTS} numbers per particle, found {total}")
+        object.__setattr__(self, "offsets", offsets)
+
+    @property
+    def plastic(self) -> bool:
+        """Whether the law has a return mapping, so that F and F_tot differ."""
+        return self.return_map is not None
+
+
+_LAWS: dict[str, Law] = {}
+
+
+def register_law(name: str, stress: Callable, parameters: dict[str, int] | tuple[str, ...], **options) -> Law:
+    """Make a law known to `Simulator` by `name`; see `Law` for the arguments. Registering the same functions again is a no-op.
+
+    Example: a fibre family a (rest direction), tau = mu (F F^T - I) + lam log(J) I + 2 kf (I4 - 1) (F a)(F a)^T, takes
+    `parameters={"mu": 1, "lam": 1, "kf": 1, "a": 3}` and reads `wp.vec3d(p[3], p[4], p[5])`.
+    Errors: ConfigError if `name` is taken by another law.
+    """
+    if not isinstance(parameters, dict):
+        parameters = dict.fromkeys(parameters, 1)
+    law = Law(name, stress, dict(parameters), **options)
+    known = _LAWS.get(name)
+    if known is not None and known != law:
+        raise ConfigError(f"law {name!r} is registered already with other functions or parameters; choose another name")
+    _LAWS[name] = law
+    return law
+
+
+def law_named(name: str) -> Law:
+    """The law of that name. Errors: ConfigError naming the known ones."""
+    # the built-in laws register themselves on import
+    from mosa.physics import elasticity, plasticity  # noqa: F401
+
+    if name not in _LAWS:
+        raise ConfigError(f"law: expected one of {', '.join(sorted(_LAWS))}, found {name!r}")
+    return _LAWS[name]
+
+
+def law_names() -> list[str]:
+    """Names of all registered laws."""
+    law_named("neo_hookean")
+    return sorted(_LAWS)

@@ -1,0 +1,129 @@
+"""Per-particle kernels of a law: stress, return mapping, and the state an adapter reads. Warp generates their adjoints.
+
+Fields may be float32; everything between load and store is float64 (see `kinematics`).
+vech order: xx, yy, zz, yz, zx, xy, plain components.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from mosa.physics.kinematics import contract, hencky_material, rotation, rotation_of, svd
+from mosa.physics.laws import SLOTS, Law, LawParameters
+
+vec6 = wp.types.vector(length=6, dtype=wp.float64)
+mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float64)
+
+
+@wp.func
+def vech(A: wp.mat33d):
+    return vec6(A[0, 0], A[1, 1], A[2, 2], A[1, 2], A[2, 0], A[0, 1])
+
+
+@wp.func
+def unvech(a: vec6):
+    return wp.mat33d(a[0], a[5], a[4], a[5], a[1], a[3], a[4], a[3], a[2])
+
+
+@wp.func
+def deviator(A: wp.mat33d):
+    return A - (wp.trace(A) / wp.float64(3.0)) * wp.identity(n=3, dtype=wp.float64)
+
+
+def field_types(scalar):
+    """(mat33, vec6, mat66, parameter vector) of a field precision."""
+    return (
+        wp.types.matrix(shape=(3, 3), dtype=scalar),
+        wp.types.vector(length=6, dtype=scalar),
+        wp.types.matrix(shape=(6, 6), dtype=scalar),
+        wp.types.vector(length=SLOTS, dtype=scalar),
+    )
+
+
+@cache
+def stress_kernel(stress, uses_rotation: bool, scalar, adapted: bool):
+    """tau(F) [Pa]; adapted: + R mat(G vech(R^T tau R) + h) R^T with the operator held in the material frame."""
+    field33, field6, field66, fieldp = field_types(scalar)
+    needs_rotation = uses_rotation or adapted
+
+    @wp.kernel(module="unique")
+    def stress_of_particles(
+        F: wp.array(dtype=field33), C_affine: wp.array(dtype=field33), parameters: wp.array(dtype=fieldp),
+        G: wp.array(dtype=field66), h: wp.array(dtype=field6), tau: wp.array(dtype=field33),
+    ):  # fmt: skip
+        i = wp.tid()
+        Fi = wp.mat33d(F[i])
+        R = Fi
+        if wp.static(needs_rotation):
+            R = rotation(Fi, rotation_of(Fi))
+        T = stress(Fi, R, wp.mat33d(C_affine[i]), LawParameters(parameters[i]))
+        if wp.static(adapted):
+            s = vech(wp.transpose(R) * T * R)
+            T = T + R * unvech(mat66(G[i]) * s + vec6(h[i])) * wp.transpose(R)
+        tau[i] = field33(T)
+
+    return stress_of_particles
+
+
+@cache
+def return_kernel(return_map, scalar, adapted: bool):
+    """F of the next substep: the return mapping of (I + dt C_affine) F.
+
+    adapted: |E'| of the yield function is that of dev(mat((I + G) vech(E) + h)), E = dev(log W) of the trial.
+    """
+    field33, field6, field66, fieldp = field_types(scalar)
+
+    @wp.kernel(module="unique")
+    def mapped_gradient(
+        F: wp.array(dtype=field33), C_affine: wp.array(dtype=field33), parameters: wp.array(dtype=fieldp),
+        G: wp.array(dtype=field66), h: wp.array(dtype=field6), dt: wp.float64, norm_eps: wp.float64, rebuild: int,
+        F_new: wp.array(dtype=field33),
+    ):  # fmt: skip
+        i = wp.tid()
+        Fi = wp.mat33d(F[i])
+        trial = Fi + dt * (wp.mat33d(C_affine[i]) * Fi)
+        U, S, V = svd(trial)
+        R = rotation(trial, U * wp.transpose(V))
+        H = hencky_material(trial, U, S, V)
+        E = deviator(H)
+        if wp.static(adapted):
+            # as an increment, so that a zero operator leaves the plain map bit for bit
+            E = E + deviator(unvech(mat66(G[i]) * vech(E) + vec6(h[i])))
+        mapped, yielded = return_map(
+            trial, R, U, S, V, H, wp.ddot(E, E), norm_eps, LawParameters(parameters[i]), dt
+        )
+        if yielded == 0 and rebuild == 1:
+            mapped = contract(trial, U, S, V, wp.float64(1.0))
+        F_new[i] = field33(mapped)
+
+    return mapped_gradient
+
+
+@cache
+def state_kernel(stress, uses_rotation: bool, scalar, plastic: bool):
+    """w = vech(W - I), s = vech(R^T tau R) [Pa] of the prior, e = vech(dev log W) if plastic."""
+    field33, field6, _, fieldp = field_types(scalar)
+
+    @wp.kernel(module="unique")
+    def material_state(
+        F: wp.array(dtype=field33), C_affine: wp.array(dtype=field33), parameters: wp.array(dtype=fieldp),
+        w: wp.array(dtype=field6), s: wp.array(dtype=field6), e: wp.array(dtype=field6),
+    ):  # fmt: skip
+        i = wp.tid()
+        Fi = wp.mat33d(F[i])
+        R = rotation(Fi, rotation_of(Fi))
+        T = stress(Fi, R, wp.mat33d(C_affine[i]), LawParameters(parameters[i]))
+        Rt = wp.transpose(R)
+        w[i] = field6(vech(Rt * Fi - wp.identity(n=3, dtype=wp.float64)))
+        s[i] = field6(vech(Rt * T * R))
+        if wp.static(plastic):
+            U, S, V = svd(Fi)
+            e[i] = field6(vech(deviator(hencky_material(Fi, U, S, V))))
+
+    return material_state
+
+
+def kernels_of(law: Law, scalar, adapted: bool, plastic_adapted: bool):
+    """(stress kernel, return-mapping kernel or None) of a law."""
+    stress = stress_kernel(law.stress, law.uses_rotation, scalar, adapted)
+    return stress, return_kernel(law.return_map, scalar, plastic_adapted) if law.plastic else None

@@ -1,0 +1,172 @@
+"""Pure torch float64 twin of the simulator: slow and obvious, for tests. Same state convention as `rollout`.
+
+Plain autograd goes through all of it: the rotation by unrolled Newton steps, Hencky strains by an eigendecomposition (whose
+backward pass is only right where the singular values differ).
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from mosa.errors import ConfigError
+from mosa.physics.boundary import Plane
+from mosa.types import ParticleState
+
+EYE = torch.eye(3, dtype=torch.float64)
+VECH = ((0, 0), (1, 1), (2, 2), (1, 2), (2, 0), (0, 1))
+
+
+def vech(A: Tensor) -> Tensor:
+    """(N, 6) entries xx, yy, zz, yz, zx, xy of (N, 3, 3)."""
+    return torch.stack([A[:, i, j] for i, j in VECH], 1)
+
+
+def unvech(a: Tensor) -> Tensor:
+    """Symmetric (N, 3, 3) of (N, 6)."""
+    rows = [[0, 5, 4], [5, 1, 3], [4, 3, 2]]
+    return torch.stack([torch.stack([a[:, k] for k in row], 1) for row in rows], 1)
+
+
+def deviator(A: Tensor) -> Tensor:
+    return A - trace(A)[:, None, None] / 3 * EYE
+
+
+def trace(A: Tensor) -> Tensor:
+    return A.diagonal(dim1=-2, dim2=-1).sum(-1)
+
+
+def polar(F: Tensor, steps: int = 30) -> Tensor:
+    """Rotation of F (N, 3, 3) with det F > 0: Newton's iteration."""
+    X = F
+    for _ in range(steps):
+        X = 0.5 * (X + torch.linalg.inv(X).mT)
+    return X
+
+
+def hencky_material(F: Tensor) -> Tensor:
+    """log W (N, 3, 3), singular values clamped at 0.05; det F > 0."""
+    values, V = torch.linalg.eigh(F.mT @ F)
+    return V @ torch.diag_embed(torch.log(values.clamp_min(0.05**2)) / 2) @ V.mT
+
+
+def stress(law: str, F: Tensor, p: dict[str, Tensor]) -> Tensor:
+    """Kirchhoff stress (N, 3, 3) [Pa]; p: (N,) or () tensors, `reference` (N, 3, 3) for `linear`."""
+    mu, lam = (torch.as_tensor(p[k], dtype=torch.float64).expand(len(F))[:, None, None] for k in ("mu", "lam"))
+    J = torch.linalg.det(F)[:, None, None]
+    if law == "neo_hookean":
+        return mu * (F @ F.mT - EYE) + lam * torch.log(J) * EYE
+    if law == "linear":
+        G = F @ p["reference"].mT
+        P = mu * (G + G.mT - 2 * EYE) + lam * (trace(G) - 3)[:, None, None] * EYE
+        return 0.5 * (P @ G.mT + G @ P.mT)
+    R = polar(F)
+    if law == "corotated":
+        return 2 * mu * (F - R) @ F.mT + lam * (J - 1) * J * EYE
+    if law in ("stvk", "stvk_paper", "von_mises", "drucker_prager"):
+        H = hencky_material(F)
+        T = R @ (2 * mu * H + lam * trace(H)[:, None, None] * EYE) @ R.mT
+        return T @ R @ F.mT if law == "stvk_paper" else T
+    raise ConfigError(f"reference law: found {law!r}, which the torch twin does not have")
+
+
+def return_map(law: str, F: Tensor, p: dict[str, Tensor], operator=None, norm_eps: float = 0.0) -> Tensor:
+    """Mapped F (N, 3, 3) of a trial F; operator: (plastic_G, plastic_h) or None."""
+    if law not in ("von_mises", "drucker_prager"):
+        return F
+    p = {k: torch.as_tensor(v, dtype=torch.float64).expand(len(F)) for k, v in p.items()}
+    H = hencky_material(F)
+    E = deviator(H)
+    corrected = E
+    if operator is not None:
+        e = vech(E)
+        corrected = deviator(unvech(e + (operator[0] @ e[..., None])[..., 0] + operator[1]))
+    n = torch.sqrt((corrected**2).sum((1, 2)) + norm_eps + 1e-300)
+    if law == "von_mises":
+        dgamma = n - p["yield_stress"] / (2 * p["mu"])
+        tip = torch.zeros(len(F), dtype=torch.bool)
+    else:
+        t = trace(H) - 3 * p["cohesion"]
+        dgamma = n + p["friction_alpha"] * (3 * p["lam"] + 2 * p["mu"]) / (2 * p["mu"]) * t
+        tip = t >= 0
+    keep = (1 - dgamma / n).clamp_min(0)
+    R = polar(F)
+    flowed = R @ torch.linalg.matrix_exp(keep[:, None, None] * E + trace(H)[:, None, None] / 3 * EYE)
+    mapped = torch.where((dgamma > 0)[:, None, None], flowed, F)
+    if law == "drucker_prager":
+        mapped = torch.where(tip[:, None, None], torch.exp(p["cohesion"])[:, None, None] * R, mapped)
+    return mapped
+
+
+def adapted_stress(law: str, F: Tensor, p: dict[str, Tensor], operator=None) -> Tensor:
+    """tau + R mat(G vech(R^T tau R) + h) R^T; operator: (G, h) or None."""
+    tau = stress(law, F, p)
+    if operator is None:
+        return tau
+    R = polar(F)
+    s = vech(R.mT @ tau @ R)
+    return tau + R @ unvech((operator[0] @ s[..., None])[..., 0] + operator[1]) @ R.mT
+
+
+def collide(v: Tensor, y: Tensor, planes: Sequence[Plane]) -> Tensor:
+    """Node velocities (M, 3) after contact; y: (M, 3) node positions [m]."""
+    for plane in planes:
+        n = torch.tensor(plane.normal, dtype=torch.float64)
+        n = n / n.norm()
+        inside = (y - torch.tensor(plane.point, dtype=torch.float64)) @ n <= 1e-6
+        un = v @ n
+        tangential = v - un[:, None] * n
+        if plane.mode == "sticky":
+            after = torch.zeros_like(v)
+        elif plane.mode == "slip":
+            after = tangential
+        else:
+            length = tangential.norm(dim=1)
+            keep = (length + plane.friction * un).clamp_min(0) / torch.where(length > 0, length, torch.ones_like(length))
+            sliding = keep[:, None] * tangential if plane.friction > 0 else tangential
+            after = torch.where((un < 0)[:, None], sliding, v)
+        v = torch.where(inside[:, None], after, v)
+    return v
+
+
+def substep(law: str, state: ParticleState, p: dict[str, Tensor], volume: Tensor, density: float, *, dx: float, dt: float,
+            gravity: Sequence[float], planes: Sequence[Plane] = (), operator=None, plastic_operator=None, norm_eps: float = 0.0,
+            cutoff: float = 0.0) -> ParticleState:  # fmt: skip
+    """One substep of `rollout`'s algorithm (method.md, section 6)."""
+    x, v, C, F = state.x, state.v, state.C_affine, state.F
+    tau = adapted_stress(law, F, p, operator)
+    mass = density * volume
+    base = torch.floor(x.detach() / dx - 0.5)
+    f = x / dx - base
+    weights = torch.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2])
+    low = base.amin(0).long()
+    size = (base.amax(0).long() - low + 3).tolist()
+    B = mass[:, None, None] * C - dt * volume[:, None, None] * 4 / dx**2 * tau
+    momentum, node_mass = torch.zeros(size[0] * size[1] * size[2], 3).double(), torch.zeros(size[0] * size[1] * size[2]).double()
+    stencil = []
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                node = base.long() + torch.tensor([i, j, k])
+                w = weights[i, :, 0] * weights[j, :, 1] * weights[k, :, 2]
+                arm = node.double() * dx - x
+                local = node - low
+                index = (local[:, 0] * size[1] + local[:, 1]) * size[2] + local[:, 2]
+                stencil.append((index, w, arm))
+                momentum = momentum.index_add(0, index, w[:, None] * (mass[:, None] * v + (B @ arm[..., None])[..., 0]))
+                node_mass = node_mass.index_add(0, index, w * mass)
+    occupied = node_mass > cutoff
+    grid_v = momentum / torch.where(occupied, node_mass, torch.ones_like(node_mass))[:, None]
+    grid_v = grid_v + dt * torch.as_tensor(gravity, dtype=torch.float64)
+    axes = torch.meshgrid(*(torch.arange(s) for s in size), indexing="ij")
+    y = dx * (torch.stack(axes, -1).reshape(-1, 3) + low).double()
+    grid_v = torch.where(occupied[:, None], collide(grid_v, y, planes), torch.zeros_like(grid_v))
+    new_v, new_C = torch.zeros_like(v), torch.zeros_like(C)
+    for index, w, arm in stencil:
+        u = w[:, None] * grid_v[index]
+        new_v = new_v + u
+        new_C = new_C + 4 / dx**2 * u[:, :, None] * arm[:, None, :]
+    trial = F + dt * new_C @ F
+    total = state.F_tot + dt * new_C @ state.F_tot
+    mapped = return_map(law, trial, p, plastic_operator, norm_eps)
+    return ParticleState(x + dt * new_v, new_v, new_C, mapped, mapped if mapped is trial else total)

@@ -1,0 +1,254 @@
+"""The simulator: frames of MLS-MPM from a start, a law and its parameters, with or without an adapter.
+
+State convention: after n substeps a state holds (x^n, v^n, C_affine^n, F^{n+1}, F_tot^{n+1}); F is advanced right after its
+C_affine is known, so that F belongs to x and is known when a substep starts. One substep is then stress(F) -> P2G -> grid -> G2P
+-> x += dt v -> F <- map((I + dt C_affine) F), and a rollout starts with one advance of F by the initial C_affine. This is the
+order of method.md, section 6, cut at another place.
+"""
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from mosa.errors import ConfigError
+from mosa.physics.boundary import Plane, ground_plane, pack_planes
+from mosa.physics.laws import SLOTS, law_named
+from mosa.physics.mpm import SegmentSolver, advance_segment, first_advance, material_state
+from mosa.physics.plasticity import yield_factor
+from mosa.physics.workspace import SCALARS, Numerics
+from mosa.types import Ground, ParticleState, Rollout
+
+SEGMENT = 32
+"""Most substeps in a segment when no adapter cuts it: what the backward pass stores at once."""
+
+_UNBOUNDED = 1e30
+
+
+class MaterialState(NamedTuple):
+    """What an adapter reads, in the material frame. w: (N, 6) vech(W - I); stress: (N, 6) vech(R^T tau R) [Pa] of the prior;
+    plastic_strain: (N, 6) vech(dev log W), None for laws that do not yield. vech order: xx, yy, zz, yz, zx, xy."""
+
+    w: Tensor
+    stress: Tensor
+    plastic_strain: Tensor | None = None
+
+
+class AdapterOperator(NamedTuple):
+    """What an adapter answers, held in the material frame until it is asked again.
+
+    G: (N, 6, 6), h: (N, 6) [Pa]: tau_hat = tau + R mat(G vech(R^T tau R) + h) R^T. plastic_G: (N, 6, 6), plastic_h: (N, 6) or
+    None: the yield function takes |dev(mat((I + plastic_G) vech(E) + plastic_h))| for |E|.
+    """
+
+    G: Tensor
+    h: Tensor
+    plastic_G: Tensor | None = None
+    plastic_h: Tensor | None = None
+
+
+class Simulator:
+    """MLS-MPM of one law on one grid and time step. Rollouts are differentiable in state, parameters and adapter outputs.
+
+    dx: grid spacing [m]; substeps per frame of frame_dt [s]; gravity (3,) [m/s^2]; ground: plane below `up` ((3,), against
+    gravity by default), then `planes` in order; box: (2, 3) [m] corners a particle may not leave, None for no limit.
+    mass_cutoff: node mass [kg] above which a node has a velocity (None: 0 in float64, 1e-12 of a particle's in float32).
+    init_affine: `spin` takes the state's C_affine, `zero` replaces it by 0. norm_eps: under the root of yield norms.
+    yield_convention: paper | sqrt23. rebuild: write U S V^T back also where nothing yielded (PAC-NeRF does).
+    on_inversion: warn | ignore | error for det F <= 0 where the law has a value there; it is an error where it has none.
+    Errors: ConfigError naming the argument. Not safe for use by two threads: buffers are shared between rollouts.
+    """
+
+    def __init__(
+        self,
+        law: str,
+        *,
+        dx: float,
+        substeps: int,
+        frame_dt: float,
+        gravity: Sequence[float] | Tensor = (0.0, -9.8, 0.0),
+        ground: Ground | None = None,
+        up: Sequence[float] | Tensor | None = None,
+        planes: Sequence[Plane] = (),
+        box: Tensor | None = None,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+        mass_cutoff: float | None = None,
+        init_affine: str = "spin",
+        norm_eps: float = 0.0,
+        yield_convention: str = "paper",
+        rebuild: bool = False,
+        on_inversion: str = "warn",
+    ) -> None:
+        self.law = law_named(law)
+        for name, value in (("dx", dx), ("frame_dt", frame_dt), ("substeps", substeps)):
+            if not (math.isfinite(value) and value > 0):
+                raise ConfigError(f"{name}: expected a positive number, found {value}")
+        if dtype not in SCALARS:
+            raise ConfigError(f"dtype: expected torch.float32 or torch.float64, found {dtype}")
+        if init_affine not in ("spin", "zero"):
+            raise ConfigError(f"init_affine: expected spin or zero, found {init_affine!r}")
+        if on_inversion not in ("warn", "ignore", "error"):
+            raise ConfigError(f"on_inversion: expected warn, ignore or error, found {on_inversion!r}")
+        self.substeps, self.frame_dt, self.dt = int(substeps), float(frame_dt), float(frame_dt) / int(substeps)
+        self.dtype, self.device = dtype, torch.device(device)
+        self.init_affine, self.on_inversion, self.mass_cutoff = init_affine, on_inversion, mass_cutoff
+        self.yield_factor = yield_factor(yield_convention)
+        gravity = torch.as_tensor(gravity, dtype=torch.float64).cpu()
+        if up is None:
+            up = -gravity / gravity.norm() if gravity.norm() > 0 else torch.tensor([0.0, 1.0, 0.0])
+        all_planes = ([ground_plane(ground, up)] if ground is not None else []) + list(planes)
+        values, modes = pack_planes(all_planes, dtype, self.device)
+        if box is None:
+            low, high = (-_UNBOUNDED,) * 3, (_UNBOUNDED,) * 3
+        else:
+            low, high = (tuple(corner) for corner in torch.as_tensor(box).double().tolist())
+            if not all(a < b for a, b in zip(low, high)):
+                raise ConfigError(f"box: expected min < max on every axis, found {low} and {high}")
+        self.numerics = Numerics(
+            law=self.law, dtype=dtype, device=self.device, dx=float(dx), dt=self.dt, gravity=tuple(gravity.tolist()),
+            planes=values, modes=modes, plane_count=len(all_planes), low=low, high=high, norm_eps=float(norm_eps),
+            rebuild=rebuild, check_J=self.law.needs_positive_J or on_inversion == "error",
+        )  # fmt: skip
+        self._workspaces: dict = {}
+
+    def pack(self, parameters: dict[str, Tensor], particles: int, rotation: Tensor | None = None) -> Tensor:
+        """(N, SLOTS) parameters in the law's order. Values: numbers, (N,), () or, for vectors of k numbers, (N, k) or (k,).
+
+        rotation: (N, 3, 3), fills the law's reference rotation. Errors: ConfigError naming a missing, unknown or misshapen one.
+        """
+        expected = [name for name in self.law.parameters if name != self.law.reference]
+        if missing := [name for name in expected if name not in parameters]:
+            raise ConfigError(f"law {self.law.name!r} needs {', '.join(expected)}; missing: {', '.join(missing)}")
+        if unknown := [name for name in parameters if name not in expected]:
+            raise ConfigError(f"law {self.law.name!r} takes {', '.join(expected)}; unknown: {', '.join(unknown)}")
+        columns = []
+        for name, size in self.law.parameters.items():
+            if name == self.law.reference:
+                columns.append(rotation.detach().reshape(particles, 9))
+                continue
+            value = torch.as_tensor(parameters[name], dtype=self.dtype, device=self.device)
+            if name == "yield_stress":
+                value = value * self.yield_factor
+            try:
+                columns.append((value[..., None] if size == 1 else value).expand(particles, size))
+            except RuntimeError:
+                raise ConfigError(
+                    f"parameter {name!r}: expected shape {'()' if size == 1 else f'({size},)'} or ({particles}"
+                    f"{',' if size == 1 else f', {size}'}), found {tuple(value.shape)}"
+                ) from None
+        used = sum(self.law.parameters.values())
+        columns.append(torch.zeros(particles, SLOTS - used, dtype=self.dtype, device=self.device))
+        return torch.cat(columns, 1)
+
+    def rollout(
+        self,
+        state: ParticleState,
+        parameters: dict[str, Tensor],
+        volume: Tensor,
+        density: float,
+        frames: int,
+        adapter: Callable[[MaterialState], AdapterOperator] | None = None,
+        stride: int = 1,
+        progress: Callable[[int], None] | None = None,
+        started: bool = False,
+    ) -> Rollout:
+        """`frames` frames, the start being frame 0 (so frames - 1 intervals are simulated).
+
+        state: particles at frame 0, its F and F_tot not yet advanced by C_affine, unless `started` (the `final` of an earlier
+        rollout). parameters: physical values the law names, per particle (N,) or scalar; volume: (N,) [m^3]; density [kg/m^3].
+        adapter: asked every `stride` substeps from the start of each frame. progress: called with the number of each frame.
+        Frame 0 of the result holds the state as given. Errors: SimulationDiverged naming substep and particle; ConfigError.
+        """
+        if frames < 1 or stride < 1:
+            raise ConfigError(f"frames and stride: expected at least 1, found {frames} and {stride}")
+        n = len(state.x)
+        self._check(state, volume)
+        C = state.C_affine if started or self.init_affine == "spin" else torch.zeros_like(state.C_affine)
+        F, F_tot = state.F, state.F_tot if self.law.plastic else state.F
+        rotation = _polar(F) if self.law.reference is not None else None
+        packed = self.pack(parameters, n, rotation)
+        volume = volume.detach().contiguous()
+        cutoff = self.mass_cutoff
+        if cutoff is None:
+            cutoff = 0.0 if self.dtype == torch.float64 else 1e-12 * density * float(volume.mean())
+        solver = SegmentSolver(self.numerics, volume, density, cutoff, self._workspaces)
+        held = {"parameters": packed, "G": None, "h": None, "plastic_G": None, "plastic_h": None}
+        recorded = {"x": [state.x], "v": [state.v], "F": [F], "F_tot": [F_tot]}
+        if not started:
+            if self.law.plastic:
+                F_tot = F_tot + self.dt * (C @ F_tot)
+                operator = self._ask(adapter, F, C, packed) if adapter is not None else held
+                F = first_advance(self.numerics, F, C, packed, operator["plastic_G"], operator["plastic_h"])
+            else:
+                F = F_tot = first_advance(self.numerics, F, C, packed)
+        current = (state.x, state.v, C, F, F_tot)
+        lengths = _segments(self.substeps, stride if adapter is not None else None)
+        for frame in range(1, frames):
+            first = (frame - 1) * self.substeps
+            for length in lengths:
+                if adapter is not None:
+                    held.update(self._ask(adapter, current[3], current[2], packed))
+                current = advance_segment(solver, current, held, length, first)
+                first += length
+            for name, value in zip(recorded, (current[0], current[1], current[3], current[4])):
+                recorded[name].append(value)
+            if progress is not None:
+                progress(frame)
+        stacked = {name: torch.stack(values) for name, values in recorded.items() if name != "F_tot"}
+        stacked["F_tot"] = torch.stack(recorded["F_tot"]) if self.law.plastic else stacked["F"]
+        times = self.frame_dt * torch.arange(frames, dtype=self.dtype, device=self.device)
+        inverted = int((torch.linalg.det(stacked["F"].detach()) <= 0).sum())
+        if inverted and self.on_inversion == "warn":
+            warnings.warn(f"{inverted} particle states with det F <= 0 in {frames} frames", stacklevel=2)
+        return Rollout(**stacked, times=times, final=ParticleState(*current), inverted=inverted)
+
+    def material_state(self, F: Tensor, C_affine: Tensor, parameters: dict[str, Tensor]) -> MaterialState:
+        """What an adapter would read at deformation gradients F (N, 3, 3); differentiable. For analysis and tests."""
+        rotation = torch.eye(3, dtype=self.dtype, device=self.device).expand(len(F), 3, 3)
+        return MaterialState(*material_state(self.law, F, C_affine, self.pack(parameters, len(F), rotation)))
+
+    def _ask(self, adapter: Callable, F: Tensor, C: Tensor, packed: Tensor) -> dict[str, Tensor | None]:
+        n = len(F)
+        answer = AdapterOperator(*adapter(MaterialState(*material_state(self.law, F, C, packed))))
+        plastic = answer.plastic_G if self.law.plastic else None
+        result = {"G": answer.G, "h": answer.h, "plastic_G": plastic, "plastic_h": None if plastic is None else answer.plastic_h}
+        for name, value in result.items():
+            shape = (n, 6, 6) if name.endswith("G") else (n, 6)
+            if value is not None and (tuple(value.shape) != shape or value.dtype != self.dtype):
+                raise ConfigError(
+                    f"adapter output {name}: expected shape {shape} of {self.dtype}, found {tuple(value.shape)} of {value.dtype}"
+                )
+        return result
+
+    def _check(self, state: ParticleState, volume: Tensor) -> None:
+        n = len(state.x)
+        shapes = {"x": (n, 3), "v": (n, 3), "C_affine": (n, 3, 3), "F": (n, 3, 3), "F_tot": (n, 3, 3)}
+        values = {name: (getattr(state, name), shape) for name, shape in shapes.items()} | {"volume": (volume, (n,))}
+        for name, (value, shape) in values.items():
+            if tuple(value.shape) != shape or value.dtype != self.dtype or value.device.type != self.device.type:
+                raise ConfigError(
+                    f"{name}: expected shape {shape} of {self.dtype} on {self.device}, found {tuple(value.shape)} of "
+                    f"{value.dtype} on {value.device}"
+                )
+        if not bool((volume > 0).all()):
+            raise ConfigError("volume: expected positive numbers [m^3] for all particles")
+
+
+def _segments(substeps: int, stride: int | None) -> list[int]:
+    """Lengths of a frame's segments: `stride` each (the last may be shorter), or nearly equal ones of at most SEGMENT."""
+    if stride is None:
+        count = -(-substeps // SEGMENT)
+        return [substeps // count + (i < substeps % count) for i in range(count)]
+    return [min(stride, substeps - i) for i in range(0, substeps, stride)]
+
+
+def _polar(F: Tensor) -> Tensor:
+    """Polar rotation of F (N, 3, 3), without gradient."""
+    U, S, Vh = torch.linalg.svd(F.detach().double())
+    sign = torch.ones_like(S)
+    sign[..., 2] = torch.linalg.det(U @ Vh)
+    return ((U * sign[..., None, :]) @ Vh).to(F.dtype)

@@ -1,0 +1,243 @@
+"""Device buffers of a segment of substeps, and the launches that advance it and run its adjoint.
+
+Everything is allocated once per (particles, slots, grid window); nothing allocates inside the substep loop. On CUDA the launches
+of a segment are captured as one graph the second time they are asked for.
+"""
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from mosa.physics.laws import SLOTS, Law
+from mosa.physics.material_kernels import kernels_of
+from mosa.physics.mpm_kernels import NO_EVENT, transfer_kernels
+
+SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
+
+
+@dataclass(frozen=True)
+class Numerics:
+    """What is constant over a rollout. dx [m], dt [s], gravity (3,) [m/s^2], planes (P, 5) and modes (P,) from `pack_planes`,
+    low and high (3,) [m] corners of the admissible domain, norm_eps under the root of yield norms."""
+
+    law: Law
+    dtype: torch.dtype
+    device: torch.device
+    dx: float
+    dt: float
+    gravity: tuple[float, float, float]
+    planes: Tensor
+    modes: Tensor
+    plane_count: int
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    norm_eps: float
+    rebuild: bool
+    check_J: bool
+
+
+class Workspace:
+    """Buffers for N particles and `slots` stored substeps (2 states and 1 grid when nothing is stored).
+
+    adapted, plastic_adapted: whether a stress operator and a plastic operator act; with_adjoint: also buffers for the adjoint.
+    """
+
+    def __init__(
+        self, numerics: Numerics, particles: int, substeps: int, *, adapted: bool, plastic_adapted: bool, with_adjoint: bool
+    ) -> None:
+        self.numerics, self.particles, self.substeps, self.with_adjoint = numerics, particles, substeps, with_adjoint
+        self.scalar = SCALARS[numerics.dtype]
+        self.kernels = transfer_kernels(self.scalar)
+        self.stress, self.mapping = kernels_of(numerics.law, self.scalar, adapted, plastic_adapted)
+        self.plastic = numerics.law.plastic
+        n = particles
+        states = substeps + 1 if with_adjoint else 2
+        self.x, self.x_wp = self._per_slot(states, (n, 3), self.kernels.vec3)
+        self.v, self.v_wp = self._per_slot(states, (n, 3), self.kernels.vec3)
+        self.C, self.C_wp = self._per_slot(states, (n, 3, 3), self.kernels.mat33)
+        self.F, self.F_wp = self._per_slot(states, (n, 3, 3), self.kernels.mat33)
+        # the deformation gradient that is never mapped: F itself where the law does not yield
+        self.A, self.A_wp = self._per_slot(states, (n, 3, 3), self.kernels.mat33) if self.plastic else (self.F, self.F_wp)
+        self.tau, self.tau_wp = self._per_slot(substeps if with_adjoint else 1, (n, 3, 3), self.kernels.mat33)
+        self.mass, self.mass_wp = self._array((n,), self.scalar)
+        self.volume, self.volume_wp = self._array((n,), self.scalar)
+        vec6, mat66 = wp.types.vector(6, self.scalar), wp.types.matrix((6, 6), self.scalar)
+        shapes = {
+            "parameters": ((n, SLOTS), wp.types.vector(SLOTS, self.scalar)),
+            "G": ((n if adapted else 1, 6, 6), mat66), "h": ((n if adapted else 1, 6), vec6),
+            "plastic_G": ((n if plastic_adapted else 1, 6, 6), mat66), "plastic_h": ((n if plastic_adapted else 1, 6), vec6),
+        }  # fmt: skip
+        self.held, self.held_wp = {}, {}
+        for name, (shape, kind) in shapes.items():
+            self.held[name], self.held_wp[name] = self._array(shape, kind)
+        if with_adjoint:
+            self.adj_x, self.adj_x_wp = self._per_slot(2, (n, 3), self.kernels.vec3)
+            self.adj_v, self.adj_v_wp = self._per_slot(2, (n, 3), self.kernels.vec3)
+            self.adj_C, self.adj_C_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
+            self.adj_F, self.adj_F_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
+            self.adj_A, self.adj_A_wp = self.adj_F, self.adj_F_wp
+            if self.plastic:
+                self.adj_A, self.adj_A_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
+            self.adj_tau, self.adj_tau_wp = self._array((n, 3, 3), self.kernels.mat33)
+            self.adj_held, self.adj_held_wp = {}, {}
+            for name, (shape, kind) in shapes.items():
+                self.adj_held[name], self.adj_held_wp[name] = self._array(shape, kind)
+        self.flags, self.flags_wp = self._array((4,), wp.int64, torch.int64)
+        self.origin, self.origin_wp = self._array((1, 3), wp.vec3i, torch.int32)
+        self.planes_wp = wp.from_torch(numerics.planes, dtype=self.scalar)
+        self.modes_wp = wp.from_torch(numerics.modes, dtype=wp.int32)
+        self.cutoff = 0.0
+        self.dims = (0, 0, 0)
+        self._graphs: dict[str, object] = {}
+
+    def _array(self, shape: tuple[int, ...], kind, dtype: torch.dtype | None = None):
+        tensor = torch.zeros(shape, dtype=dtype or self.numerics.dtype, device=self.numerics.device)
+        return tensor, wp.from_torch(tensor, dtype=kind)
+
+    def _per_slot(self, slots: int, shape: tuple[int, ...], kind):
+        tensor = torch.zeros((slots, *shape), dtype=self.numerics.dtype, device=self.numerics.device)
+        return list(tensor), [wp.from_torch(t, dtype=kind) for t in tensor]
+
+    def set_window(self, origin: tuple[int, int, int], dims: tuple[int, int, int]) -> None:
+        """Place the grid: lowest node and number of nodes per axis. Reallocates (and forgets graphs) when dims change."""
+        self.origin.copy_(torch.tensor([origin], dtype=torch.int32))
+        if dims == self.dims:
+            return
+        self.dims, nodes = dims, dims[0] * dims[1] * dims[2]
+        grids = self.substeps if self.with_adjoint else 1
+        self.grid, self.grid_wp = self._per_slot(grids, (nodes, 4), self.kernels.vec4)
+        self.velocity, self.velocity_wp = self._per_slot(grids, (nodes, 3), self.kernels.vec3)
+        if self.with_adjoint:
+            self.adj_grid, self.adj_grid_wp = self._array((nodes, 4), self.kernels.vec4)
+            self.adj_velocity, self.adj_velocity_wp = self._array((nodes, 3), self.kernels.vec3)
+        self._graphs.clear()
+
+    def load(self, state: tuple[Tensor, ...], held: dict[str, Tensor | None], volume: Tensor, mass: Tensor, cutoff: float) -> None:
+        """Copy the start of a segment in: (x, v, C_affine, F, F_tot), the parameters and the adapter's operator."""
+        for slots, value in zip((self.x, self.v, self.C, self.F), state[:4], strict=True):
+            slots[0].copy_(value)
+        if self.plastic:
+            self.A[0].copy_(state[4])
+        for name, value in held.items():
+            if value is not None:
+                self.held[name].copy_(value)
+        self.volume.copy_(volume)
+        self.mass.copy_(mass)
+        if cutoff != self.cutoff:
+            self.cutoff = cutoff
+            self._graphs.clear()
+
+    def final(self) -> tuple[Tensor, ...]:
+        """Copies of (x, v, C_affine, F, F_tot) after the segment; F_tot is F itself where the law does not yield."""
+        last = self.substeps % len(self.x)
+        F = self.F[last].clone()
+        return (
+            self.x[last].clone(), self.v[last].clone(), self.C[last].clone(), F, self.A[last].clone() if self.plastic else F
+        )  # fmt: skip
+
+    def advance(self) -> None:
+        """All substeps of the segment; events are left in `flags` for the caller to read."""
+        self.flags.fill_(NO_EVENT)
+        self._launch("advance", self._advance)
+
+    def adjoint(self) -> None:
+        """Adjoint of all substeps, last to first, after `advance`. Seeds are in adj_* slot `substeps` % 2, results in slot 0."""
+        self._launch("adjoint", self._adjoint)
+
+    def _launch(self, name: str, body) -> None:
+        if self.numerics.device.type != "cuda":
+            body()
+            return
+        stream = wp.stream_from_torch(torch.cuda.current_stream(self.numerics.device))
+        with wp.ScopedStream(stream):
+            graph = self._graphs.get(name)
+            if graph is None:
+                body()  # the first pass compiles and loads the kernels, which a capture must not do
+                self._graphs[name] = "loaded"
+            elif graph == "loaded":
+                with wp.ScopedCapture(stream=stream) as capture:
+                    body()
+                self._graphs[name] = capture.graph
+                wp.capture_launch(capture.graph)
+            else:
+                wp.capture_launch(graph)
+
+    def _run(self, kernel, dim: int, inputs: list, adj_inputs: list | None = None) -> None:
+        device = self.origin_wp.device
+        if adj_inputs is None:
+            wp.launch(kernel, dim, inputs=inputs, device=device)
+        else:
+            wp.launch(kernel, dim, inputs=inputs, adj_inputs=adj_inputs, adjoint=True, device=device)
+
+    def _geometry(self) -> list:
+        return [self.origin_wp, wp.vec3i(*self.dims), self.numerics.dx, 1.0 / self.numerics.dx, self.numerics.dt]
+
+    def _grid_arguments(self, slot: int) -> list:
+        numerics = self.numerics
+        impulse = self.kernels.vec3(*(numerics.dt * g for g in numerics.gravity))
+        return [
+            self.grid_wp[slot], impulse, self.cutoff, self.origin_wp, wp.vec3i(*self.dims), numerics.dx, self.planes_wp,
+            self.modes_wp, numerics.plane_count,
+        ]  # fmt: skip
+
+    def _stress_arguments(self, state: int, slot: int) -> list:
+        held = self.held_wp
+        return [self.F_wp[state], self.C_wp[state], held["parameters"], held["G"], held["h"], self.tau_wp[slot]]
+
+    def _mapping_arguments(self, state: int, new: int) -> list:
+        held, numerics = self.held_wp, self.numerics
+        return [
+            self.F_wp[state], self.C_wp[new], held["parameters"], held["plastic_G"], held["plastic_h"], numerics.dt,
+            numerics.norm_eps, int(numerics.rebuild), self.F_wp[new],
+        ]  # fmt: skip
+
+    def _advance(self) -> None:
+        kernels, numerics, n = self.kernels, self.numerics, self.particles
+        states, grids = len(self.x), len(self.grid)
+        geometry = self._geometry()
+        low, high = kernels.vec3(*numerics.low), kernels.vec3(*numerics.high)
+        for step in range(self.substeps):
+            a, b, g = step % states, (step + 1) % states, step % grids
+            self.grid_wp[g].zero_()
+            self._run(self.stress, n, self._stress_arguments(a, g))
+            self._run(kernels.p2g, n, [
+                self.x_wp[a], self.v_wp[a], self.C_wp[a], self.F_wp[a], self.tau_wp[g], self.mass_wp, self.volume_wp,
+                *geometry, int(numerics.check_J), step, self.flags_wp, self.grid_wp[g],
+            ])  # fmt: skip
+            self._run(kernels.grid_update, len(self.grid[g]), [*self._grid_arguments(g), self.velocity_wp[g]])
+            self._run(kernels.g2p, n, [
+                self.x_wp[a], self.A_wp[a], self.velocity_wp[g], *geometry, low, high, step, self.flags_wp,
+                self.x_wp[b], self.v_wp[b], self.C_wp[b], self.A_wp[b],
+            ])  # fmt: skip
+            if self.plastic:
+                self._run(self.mapping, n, self._mapping_arguments(a, b))
+
+    def _adjoint(self) -> None:
+        kernels, n, held = self.kernels, self.particles, self.adj_held_wp
+        geometry = self._geometry()
+        for array in held.values():
+            array.zero_()
+        for step in reversed(range(self.substeps)):
+            a, b = step % 2, (step + 1) % 2  # adjoint slots; the states of all substeps are stored
+            if self.plastic:
+                self.adj_F_wp[a].zero_()
+                self._run(self.mapping, n, self._mapping_arguments(step, step + 1), [
+                    self.adj_F_wp[a], self.adj_C_wp[b], held["parameters"], held["plastic_G"], held["plastic_h"], 0.0, 0.0, 0,
+                    self.adj_F_wp[b],
+                ])  # fmt: skip
+            self.adj_velocity_wp.zero_()
+            self._run(kernels.adj_g2p, n, [
+                self.x_wp[step], self.A_wp[step], self.velocity_wp[step], self.C_wp[step + 1], *geometry,
+                self.adj_x_wp[b], self.adj_v_wp[b], self.adj_C_wp[b], self.adj_A_wp[b],
+                self.adj_x_wp[a], self.adj_A_wp[a], self.adj_velocity_wp,
+            ])  # fmt: skip
+            self._run(kernels.adj_grid, len(self.grid[step]),
+                      [*self._grid_arguments(step), self.adj_velocity_wp, self.adj_grid_wp])  # fmt: skip
+            self._run(kernels.adj_p2g, n, [
+                self.x_wp[step], self.v_wp[step], self.C_wp[step], self.tau_wp[step], self.mass_wp, self.volume_wp, *geometry,
+                self.adj_grid_wp, self.adj_x_wp[a], self.adj_v_wp[a], self.adj_C_wp[a], self.adj_tau_wp,
+            ])  # fmt: skip
+            self._run(self.stress, n, self._stress_arguments(step, step),
+                      [self.adj_F_wp[a], self.adj_C_wp[a], held["parameters"], held["G"], held["h"], self.adj_tau_wp])  # fmt: skip

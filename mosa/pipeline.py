@@ -1,0 +1,255 @@
+"""The way of a run: scene -> reconstruction -> starts -> fit -> figures, rollouts, video. Each stage is cached or resumable."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import time
+import warnings
+from contextlib import contextmanager
+from pathlib import Path
+
+import lightning as L
+import torch
+from hydra.core.hydra_config import HydraConfig
+from lightning.pytorch.loggers import TensorBoardLogger
+from omegaconf import DictConfig, OmegaConf
+
+from mosa.analysis.figures import side_by_side, write_strip, write_video
+from mosa.analysis.tables import parameter_table, results_table
+from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLast
+from mosa.config import build_body, build_stages, build_world, plain, run_config
+from mosa.data.datamodule import MultiViewDataModule, training_observations
+from mosa.errors import ConfigError
+from mosa.evaluation import Sequence, evaluate, identification, render
+from mosa.modules.body import Body, Start
+from mosa.modules.lit_mosa import LitMosa
+from mosa.rendering.covariance import covariance_from
+from mosa.reconstruction.starts import first_contact, sequence_start
+from mosa.types import MotionCues, Reconstruction, Scene
+from mosa.twin import Twin, save_rollout
+
+
+class Clock:
+    """Wall time per stage, into `time/<stage>_s`."""
+
+    def __init__(self) -> None:
+        self.figures: dict[str, float] = {}
+
+    @contextmanager
+    def measure(self, stage: str):
+        began = time.perf_counter()
+        yield
+        self.figures[f"time/{stage}_s"] = self.figures.get(f"time/{stage}_s", 0.0) + time.perf_counter() - began
+
+
+def run_folder() -> Path:
+    return Path(HydraConfig.get().runtime.output_dir)
+
+
+def reconstruct_scene(cfg: DictConfig, scene: Scene, device: str) -> tuple[Reconstruction, float]:
+    """Reconstruction of the training sequence and the grid spacing that goes with it [m]."""
+    from mosa.reconstruction.pipeline import build_settings, reconstruct, spacing_for
+
+    settings = build_settings(**plain(cfg.reconstruction))
+    dx = cfg.simulation.dx
+    spacing = dx / 2 if dx is not None else spacing_for(scene, cfg.simulation.particles)
+    reconstruction = reconstruct(scene, settings=settings, spacing=spacing, cache_dir=cache_folder(cfg), seed=cfg.seed, device=device)
+    return reconstruction, 2 * spacing
+
+
+def cache_folder(cfg: DictConfig) -> Path:
+    """Folder of cached reconstructions: scene.cache, or mosa/ in the user's cache folder."""
+    if cfg.scene.get("cache"):
+        return Path(cfg.scene.cache)
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "mosa"
+
+
+def scenes(cfg: DictConfig) -> tuple[Scene, list[Scene]]:
+    """The training sequence and the held-out ones of the same object."""
+    from mosa.data.scene import held_out_sequences, load_scene
+
+    keys = plain(cfg.scene)
+    return load_scene(**keys), held_out_sequences(**keys)
+
+
+def starts(body: Body, reconstruction: Reconstruction, training: Scene, held_out: list[Scene]) -> dict[str, Start]:
+    """Initial states of all sequences, from images alone: pose of frame 0, velocity of the frames before contact."""
+    found = {"train": sequence_start(body, reconstruction.splats, training, register=False)}
+    for scene in held_out:
+        found[f"test/{scene.sequence}"] = sequence_start(body, reconstruction.splats, scene, register=True)
+    return found
+
+
+def sequences(body: Body, training: Scene, held_out: list[Scene], found: dict[str, Start]) -> list[Sequence]:
+    prefixes = ["train", *(f"test/{s.sequence}" for s in held_out)]
+    return [Sequence(p, s, found[p], first_contact(body, found[p], s)) for p, s in zip(prefixes, [training, *held_out])]
+
+
+def train(cfg: DictConfig) -> float | None:
+    """Run everything `cfg` asks for; returns the figure a sweep optimises. Errors: MosaError of whatever was wrong."""
+    quiet()
+    L.seed_everything(cfg.seed, verbose=False)
+    clock, folder = Clock(), run_folder()
+    device = "cuda" if cfg.trainer.accelerator in ("gpu", "cuda") else "cpu"
+    with clock.measure("data"):
+        scene, held_out = scenes(cfg)
+    if scene.synthetic:
+        print(f"scene {scene.name}: synthetic, made by this program; not a capture")
+    with clock.measure("reconstruction"):
+        reconstruction, dx = reconstruct_scene(cfg, scene, device)
+    config = run_config(plain(cfg), scene, dx)
+    body = body_of(reconstruction, config).to(device)
+    with clock.measure("starts"):
+        found = starts(body, reconstruction, scene, held_out)
+    contact = first_contact(body, found["train"], scene)
+    config["starts"] = {k: {n: getattr(s, n).tolist() for n in ("rotation", "center", "velocity", "angular_velocity")}
+                        for k, s in found.items()}
+    world = build_world(config["world"])
+    with clock.measure("fit"):
+        fit(cfg, scene, reconstruction, body, found["train"], world, contact, config, folder, device)
+    with clock.measure("evaluation"):
+        figures, kept = evaluate(body, sequences(body, scene, held_out, found), world,
+                                 samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
+    figures |= identification(body, scene) | start_figures(found["train"])
+    if cfg.evaluation.floor:
+        figures |= floor_figures(body, sequences(body, scene, held_out, found), world)
+    figures |= clock.figures | {"time/peak_memory_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+                                "seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
+    write_outputs(folder, cfg, body, sequences(body, scene, held_out, found), figures, kept)
+    return optimized(figures, cfg.optimized_metric)
+
+
+def body_of(reconstruction: Reconstruction, config: dict) -> Body:
+    """The body of a reconstruction, with the law and settings of the run."""
+    splats = reconstruction.splats
+    return build_body(config, {"rest": splats.means, "volume": reconstruction.volume, "colors": splats.colors,
+                               "opacities": splats.opacities, "covariances": covariance_from(splats.scales, splats.rotations)})
+
+
+def fit(cfg, scene, reconstruction, body, start, world, contact, config, folder, device) -> None:
+    """The staged optimisation under Lightning; resumes from cfg.ckpt_path."""
+    frames = scene.training_frames
+    observations = training_observations(scene, reconstruction, margin=cfg.rendering.margin, device=device)
+    cues = reconstruction.cues
+    cues = MotionCues(*(getattr(cues, n)[: len(frames)].to(device) for n in ("positions", "rotation", "stretch", "weight", "covariances")))
+    plain_fit = plain(cfg.fit)
+    stages = build_stages(plain_fit, heterogeneity=body.heterogeneity is not None, adapter=body.adapter is not None)
+    module = LitMosa(body, start=start, world=world, observations=observations, cues=cues,
+                     background=scene.background.to(device), frame_dt=config["frame_dt"], first_contact=contact, stages=stages,
+                     weights=plain(cfg.losses), clip=plain_fit["clip"], config=config)
+    steps = sum(s.iterations for s in stages)
+    data = MultiViewDataModule(observations, views_per_step=plain_fit["views"], steps=steps, seed=cfg.seed)
+    logger = TensorBoardLogger(folder, name="tensorboard", version="") if cfg.logger.enabled else False
+    callbacks = [KeepLast(folder / "checkpoints"), FitProgress()]
+    if cfg.logger.enabled and cfg.logger.images_every:
+        callbacks.append(ImageStrips(cfg.logger.images_every))
+    trainer = L.Trainer(accelerator=cfg.trainer.accelerator, devices=cfg.trainer.devices, max_epochs=-1, logger=logger,
+                        callbacks=callbacks, plugins=[AtomicCheckpointIO()], enable_checkpointing=False,
+                        enable_progress_bar=False, enable_model_summary=False, log_every_n_steps=1,
+                        reload_dataloaders_every_n_epochs=1, default_root_dir=folder)
+    if cfg.ckpt_path is not None and not Path(cfg.ckpt_path).is_file():
+        raise ConfigError(f"ckpt_path: no file {cfg.ckpt_path}; a run writes <run folder>/checkpoints/last.ckpt")
+    trainer.fit(module, datamodule=data, ckpt_path=cfg.ckpt_path, weights_only=True)
+    if module.stage is not None:
+        raise KeyboardInterrupt
+    body.to(device)
+
+
+def start_figures(start: Start) -> dict[str, float]:
+    names = ("x", "y", "z")
+    return {f"id/v0_{n}": float(v) for n, v in zip(names, start.velocity)} | {
+        f"id/omega0_{n}": float(v) for n, v in zip(names, start.angular_velocity)}
+
+
+def floor_figures(body: Body, evaluated: list[Sequence], world) -> dict[str, float]:
+    """What the true law reaches on the learner's own grid and particles: differences below it mean nothing. Synthetic scenes only."""
+    from mosa.data.builtin.floor import floor_rollout
+    from mosa.evaluation import motion_metrics, test_means
+
+    figures = {}
+    for sequence in evaluated:
+        if sequence.scene.truth is None:
+            continue
+        x = floor_rollout(body, sequence.scene, world)
+        frames = list(range(sequence.scene.frames))
+        result = motion_metrics(x, body, sequence, frames, 4096, 512)
+        figures |= {f"floor/{sequence.prefix}/{k}": v for k, v in result.items()}
+    return figures | test_means(figures)
+
+
+def write_outputs(folder: Path, cfg: DictConfig, body: Body, evaluated: list[Sequence], figures: dict, kept: dict) -> None:
+    """metrics.json, rollout.npz, video.mp4 and a strip of it; the tables on the screen and in results.md."""
+    (folder / "metrics.json").write_text(json.dumps(dict(sorted(figures.items())), indent=1))
+    save_rollout(folder / "rollout.npz", {prefix: variants["adapted"] for prefix, variants in kept.items()})
+    if cfg.evaluation.video:
+        shown = evaluated[-1]
+        camera = [(shown.scene.training_cameras or [0])[0]]
+        columns = {"real": shown.scene.images[camera[0]]}
+        for variant, title in (("prior", "prior"), ("adapted", "adapted (MoSA)")):
+            columns[title] = render(body, kept[shown.prefix][variant], shown.scene, camera)[0]
+        frames = side_by_side(columns, enlarge=max(1, round(320 / columns["real"].shape[1])))
+        write_video(folder / "video.mp4", frames, fps=6)
+        write_strip(folder / "strip.png", frames, every=max(1, len(frames) // 5))
+    table = results_table(figures) + "\n\n" + parameter_table(figures)
+    (folder / "results.md").write_text(table + "\n")
+    print(f"\n{table}\n\nrun folder: {folder}")
+
+
+def optimized(figures: dict[str, float], wanted: str) -> float | None:
+    """The figure a sweep minimises: `wanted`, or the first that exists of its fallbacks."""
+    for key in (wanted, "test/rms_m", "train/rms_m"):
+        if key in figures:
+            return figures[key]
+    return -figures["train/psnr_crop"] if "train/psnr_crop" in figures else None
+
+
+def evaluate_checkpoint(cfg: DictConfig) -> float | None:
+    """`eval.py`: reproduce the figures of a run, evaluate on another scene, or simulate from a new start."""
+    quiet()
+    folder = run_folder()
+    twin = Twin.load(cfg.ckpt_path, cfg.device)
+    simulate = plain(cfg.simulate)
+    if any(simulate[k] is not None for k in ("velocity", "rotation", "height", "angular_velocity")):
+        rollout = twin.simulate(**simulate, progress=True)
+        print(f"simulated {len(rollout.x)} frames into {twin.export(rollout, folder)}")
+        return None
+    run = OmegaConf.create(twin.config["cfg"])
+    if cfg.get("scene"):
+        run.scene = cfg.scene
+    scene, held_out = scenes(run)
+    known = {k: Start(**{n: torch.tensor(v) for n, v in s.items()}) for k, s in twin.config["starts"].items()}
+    if cfg.get("scene"):
+        splats = twin_splats(twin.body)
+        known = {f"test/{s.sequence}": sequence_start(twin.body, splats, s, register=True) for s in (scene, *held_out)}
+        evaluated = [Sequence(p, s, known[p], first_contact(twin.body, known[p], s)) for p, s in
+                     zip(known, (scene, *held_out))]
+    else:
+        evaluated = sequences(twin.body, scene, held_out, known)
+    figures, kept = evaluate(twin.body, evaluated, twin.world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
+    figures |= identification(twin.body, scene)
+    if cfg.evaluation.floor:
+        figures |= floor_figures(twin.body, evaluated, twin.world)
+    write_outputs(folder, cfg, twin.body, evaluated, figures, kept)
+    return optimized(figures, "test/rms_m")
+
+
+def twin_splats(body: Body):
+    """The body's appearance as splats, for registration in another scene."""
+    from mosa.rendering.covariance import covariance_from
+from mosa.reconstruction.starts import splats_of
+
+    return splats_of(body)
+
+
+def quiet() -> None:
+    """Keep library chatter off the screen; errors and our own output stay."""
+    import logging
+
+    import warp
+
+    warp.config.quiet = True
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", module="lightning.*")

@@ -1,0 +1,116 @@
+"""Motion cues: deformation of each particle's rest neighbourhood by weighted least squares, and rotation and stretch from it.
+
+Source: method.md, section 7. With isotropic Gaussians their rotation is not identifiable from images (only F F^T is), so beside the
+paper's cue (`gaussian`) there is `neighbourhood`, which fits F to the reconstructed displacements of the nearest rest neighbours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from mosa.errors import DataError
+from mosa.types import MotionCues, Splats
+
+CONDITION_LIMIT = 1e4
+
+
+@dataclass(frozen=True)
+class Neighbourhood:
+    """Linear estimate of the deformation gradient from positions: F_i = sum_k (x_j - x_i) (x) gradient_ik, j = index_ik.
+
+    index: (N, k) long; gradient: (N, k, 3) [1/m]; weight: (N,) 1 where the moment matrix is well conditioned, else 0;
+    kernel: (N, k) the least-squares weights; offset: (N, k, 3) [m] rest vectors to the neighbours.
+    """
+
+    index: Tensor
+    gradient: Tensor
+    weight: Tensor
+    kernel: Tensor
+    offset: Tensor
+
+    def deformation(self, positions: Tensor) -> Tensor:
+        """Deformation gradients (..., N, 3, 3) of positions (..., N, 3) [m]; exact for affine motions where weight is 1."""
+        difference = positions[..., self.index, :] - positions[..., None, :]
+        return torch.einsum("...nki,nkj->...nij", difference, self.gradient)
+
+    def to(self, device: torch.device | str) -> Neighbourhood:
+        return Neighbourhood(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+
+
+def neighbourhood(rest: Tensor, *, neighbours: int = 20, condition_limit: float = CONDITION_LIMIT) -> Neighbourhood:
+    """Weighted least squares over the `neighbours` nearest rest particles. rest: (N, 3) [m].
+
+    Minimises sum_k w_k |d_k - F D_k|^2, D rest vector, d deformed vector, w = (1 - r^2/r_max^2)^2 with r_max 1.2 times the
+    distance of the farthest neighbour. Where the moment matrix has a condition number above `condition_limit` (neighbours in a
+    plane or on a line) the weight is 0 and the gradient that of F = 0: such particles must not be used.
+    Raises DataError for fewer than 5 particles.
+    """
+    points = rest.detach().cpu().double().numpy()
+    if len(points) < 5:
+        raise DataError(f"neighbourhood: expected at least 5 particles, found {len(points)}; choose a smaller spacing")
+    count = min(neighbours, len(points) - 1)
+    distance, index = cKDTree(points).query(points, k=count + 1)
+    # a particle is its own nearest neighbour unless two coincide: then drop whichever comes first
+    distance, index = distance[:, 1:], index[:, 1:]
+    offset = points[index] - points[:, None]
+    radius = 1.2 * distance[:, -1:].clip(1e-12)
+    kernel = np.clip(1 - (distance / radius) ** 2, 0, None) ** 2
+    scale = radius[..., None] ** 2
+    moment = np.einsum("nk,nki,nkj->nij", kernel, offset, offset) / scale
+    values = np.linalg.eigvalsh(moment)
+    good = values[:, 0] * condition_limit > values[:, 2].clip(1e-300)
+    safe = np.where(good[:, None, None], moment, np.eye(3))
+    gradient = np.einsum("nk,nki,nij->nkj", kernel, offset, np.linalg.inv(safe)) / scale
+    gradient = np.where(good[:, None, None], gradient, 0.0)
+    as_tensor = lambda a: torch.as_tensor(a, dtype=rest.dtype, device=rest.device)  # noqa: E731
+    return Neighbourhood(torch.as_tensor(index, device=rest.device), as_tensor(gradient), as_tensor(good.astype(float)),
+                         as_tensor(kernel), as_tensor(offset))
+
+
+def polar(deformation: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotation (..., 3, 3) with det +1 and descending singular values (..., 3) of deformation gradients, not differentiable.
+
+    The smallest singular value carries the sign of the determinant (method.md, section 1). Computed in float64.
+    """
+    U, S, Vh = torch.linalg.svd(deformation.detach().double())
+    sign = torch.ones_like(S)
+    sign[..., 2] = torch.where(torch.linalg.det(U) * torch.linalg.det(Vh) < 0, -1.0, 1.0)
+    rotation = (U * sign[..., None, :]) @ Vh
+    return rotation.to(deformation.dtype), (S * sign).to(deformation.dtype)
+
+
+def quaternion_rotation(quaternions: Tensor) -> Tensor:
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) wxyz, normalised here."""
+    w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)
+    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def neighbourhood_cues(positions: Tensor, covariances: Tensor, around: Neighbourhood) -> MotionCues:
+    """Cues from displacements alone. positions: (T, N, 3) [m], frame 0 at rest; covariances: (T, N, 3, 3) [m^2]."""
+    rotation, stretch = polar(around.deformation(positions))
+    weight = around.weight.expand(len(positions), -1) * (stretch[..., 2] > 0.05)
+    identity = torch.eye(3, dtype=positions.dtype, device=positions.device)
+    known = weight > 0
+    rotation = torch.where(known[..., None, None], rotation, identity)
+    stretch = torch.where(known[..., None], stretch, torch.ones_like(stretch))
+    return MotionCues(positions.contiguous(), rotation, stretch, weight.contiguous(), covariances.contiguous())
+
+
+def gaussian_cues(positions: Tensor, covariances: Tensor, splats: Splats, scales: Tensor, rotations: Tensor) -> MotionCues:
+    """The paper's cues: change of each Gaussian's own scale and rotation since frame 0.
+
+    scales: (T, N, 3) [m] after activation; rotations: (T, N, 4) wxyz. stretch = S_t / S_0 per axis, sorted; weight 1 everywhere.
+    """
+    rest = quaternion_rotation(splats.rotations)
+    rotation = quaternion_rotation(rotations) @ rest.transpose(-1, -2)
+    stretch = (scales / splats.scales).sort(-1, descending=True).values
+    weight = torch.ones(positions.shape[:2], dtype=positions.dtype, device=positions.device)
+    return MotionCues(positions.contiguous(), rotation.contiguous(), stretch, weight, covariances.contiguous())

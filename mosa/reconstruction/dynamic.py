@@ -1,0 +1,183 @@
+"""Dynamic stage: the motion of the filled scaffold through all frames, fitted to the images by rendering (method.md, section 7).
+
+First every frame is tracked from the one before it at half resolution, starting from the displacement of the visual hulls'
+centres; then all frames are refined together at full resolution. The interior, which no camera sees, follows the surface through
+the smooth modes and a weak elastic energy.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mosa.errors import ConfigError
+from mosa.reconstruction.cues import Neighbourhood
+from mosa.reconstruction.modes import Modes
+from mosa.reconstruction.motion import ModalMotion, MotionBasisNetwork, MotionSample
+from mosa.reconstruction.observed import Windows
+from mosa.reconstruction.static import image_loss
+from mosa.reconstruction.uniform_adam import UniformAdam
+from mosa.rendering.rasterizer import rasterize
+from mosa.types import Splats
+
+
+Motion = ModalMotion | MotionBasisNetwork
+
+
+@dataclass(frozen=True)
+class Scaffold:
+    """Gaussians at rest with the modes at their positions and, where they are the particles, their neighbourhoods."""
+
+    splats: Splats
+    modes: Modes
+    around: Neighbourhood | None = None
+
+
+@dataclass(frozen=True)
+class DynamicSettings:
+    """model: `modes` (amplitudes of smooth modes per frame) or `network` (motion bases, GIC).
+
+    carriers: Gaussians that are compared with the images, `static` (those of the static stage, moved by the same motion: finer,
+    3 times less motion error than coarse particles) or `particles` (the paper); modes: number of modes; free_shape: Gaussians' scale and rotation are free instead of following the deformation (always so for
+    the network); track_iterations: per frame and for the first fit at half resolution; track_views: images per such step;
+    iterations: steps of the joint refinement, each sees `views` images of every frame; lr: Adam step of an amplitude in units of
+    the object's radius; elastic, bending: weights of the regularisers; poisson: Poisson ratio of the elastic energy; hidden,
+    basis_layers, coefficient_layers, bases: size of the network, lr_network its Adam step.
+    """
+
+    model: str = "modes"
+    carriers: str = "static"
+    modes: int = 120
+    free_shape: bool = False
+    track_iterations: int = 40
+    track_views: int = 4
+    iterations: int = 200
+    views: int = 1
+    lr_track: float = 0.03
+    lr: float = 0.01
+    ssim: float = 0.0
+    matte: float = 1.0
+    elastic: float = 1e-3
+    bending: float = 1e-3
+    poisson: float = 0.3
+    bases: int = 10
+    hidden: int = 256
+    basis_layers: int = 8
+    coefficient_layers: int = 3
+    lr_network: float = 5e-4
+
+    def __post_init__(self) -> None:
+        if self.carriers not in ("static", "particles"):
+            raise ConfigError(f"reconstruction.dynamic.carriers: expected static or particles, found {self.carriers!r}")
+        if self.model not in ("modes", "network"):
+            raise ConfigError(f"reconstruction.dynamic.model: expected modes or network, found {self.model!r}")
+
+
+def elastic_energy(deformation: Tensor, poisson: float) -> Tensor:
+    """Mean St. Venant-Kirchhoff energy per unit shear modulus: E:E + poisson/(1 - 2 poisson) tr(E)^2, E = (F^T F - I)/2."""
+    identity = torch.eye(3, dtype=deformation.dtype, device=deformation.device)
+    strain = 0.5 * (deformation.transpose(-1, -2) @ deformation - identity)
+    trace = strain.diagonal(dim1=-2, dim2=-1).sum(-1)
+    return (strain**2).sum((-1, -2)).mean() + poisson / (1 - 2 * poisson) * (trace**2).mean()
+
+
+def _round_robin(windows: Windows, frames: list[int], generator: torch.Generator) -> Callable[[int], Tensor]:
+    """draw(n): indices of n windows of every frame in `frames`; all views of a frame are seen before one repeats."""
+    by_frame = {t: (windows.frame == t).nonzero()[:, 0].cpu() for t in frames}
+    queue = {t: torch.empty(0, dtype=torch.long) for t in frames}
+
+    def draw(count: int) -> Tensor:
+        chosen = []
+        for t in frames:
+            while len(queue[t]) < count:
+                queue[t] = torch.cat([queue[t], by_frame[t][torch.randperm(len(by_frame[t]), generator=generator)]])
+            chosen.append(queue[t][:count])
+            queue[t] = queue[t][count:]
+        return torch.cat(chosen)
+
+    return draw
+
+
+class _Objective:
+    """Loss of a batch: images of the carriers, elastic energy of the scaffold, bending energy of the amplitudes."""
+
+    def __init__(self, motion: Motion, carried: Scaffold, scaffold: Scaffold, background: Tensor, settings: DynamicSettings):
+        self.motion, self.carried, self.scaffold = motion, carried, scaffold
+        self.background, self.settings = background, settings
+
+    def __call__(self, frames: Tensor, batch: Windows, state: Tensor) -> Tensor:
+        """frames: (S,) long; state: (B,) which of them each window shows."""
+        carried, settings = self.carried, self.settings
+        sample = self.motion(frames, carried.splats, carried.modes, carried.around)
+        image, alpha = rasterize(sample.positions, sample.covariances, carried.splats.opacities, carried.splats.colors[None],
+                                 batch.cameras, state, self.background)
+        loss = image_loss(image, alpha, batch, ssim_weight=settings.ssim, matte_weight=settings.matte)
+        if settings.elastic > 0:
+            loss = loss + settings.elastic * elastic_energy(self._deformation(frames, sample), settings.poisson)
+        if settings.bending > 0 and isinstance(self.motion, ModalMotion):
+            c = self.motion.coefficients(frames) / self.motion.reach
+            loss = loss + settings.bending * (self.scaffold.modes.energy[:, None] * c**2).sum() / len(frames)
+        return loss
+
+    def _deformation(self, frames: Tensor, sample: MotionSample) -> Tensor:
+        if self.carried is self.scaffold:
+            return sample.deformation
+        if isinstance(self.motion, ModalMotion):
+            return self.motion.displacement(frames, self.scaffold.modes)[1]
+        return self.motion(frames, self.scaffold.splats, None, self.scaffold.around).deformation
+
+
+def _minimise(objective: _Objective, optimizer: torch.optim.Optimizer, frames: list[int], windows: Windows, steps: int, views: int,
+              rate: float, generator: torch.Generator, progress: Callable[[int], None] | None) -> None:
+    """`steps` steps, each on `views` random windows of every frame in `frames`."""
+    draw = _round_robin(windows, frames, generator)
+    device = windows.images.device
+    every = torch.tensor(frames, device=device)
+    state = torch.arange(len(frames), device=device).repeat_interleave(views)
+    for step in range(steps):
+        optimizer.param_groups[0]["lr"] = rate * (0.51 + 0.49 * math.cos(math.pi * step / steps))
+        loss = objective(every, windows.select(draw(views)), state)
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+        if progress is not None:
+            progress(1)
+
+
+def fit_motion(scaffold: Scaffold, carried: Scaffold, windows: Windows, offsets: Tensor, background: Tensor,
+               settings: DynamicSettings, *, reach: float, seed: int, progress: Callable[[int], None] | None = None) -> Motion:
+    """Motion through all frames of `windows`.
+
+    scaffold: the N filled particles; carried: the Gaussians that are rendered, the particles themselves or the static Gaussians,
+    which show more detail; offsets: (T, 3) [m] first guess of the object's centre per frame; reach [m]: radius of the object, the
+    unit of displacements.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    moving = list(range(1, len(offsets)))
+    if settings.model == "modes":
+        motion = ModalMotion(offsets, scaffold.modes.energy, reach=reach, free_shape=settings.free_shape)
+        objective = _Objective(motion, carried, scaffold, background, settings)
+        half = windows.halved()
+        for t in moving:
+            with torch.no_grad():
+                motion.amplitude[t] = motion.amplitude[t - 1]
+            # a fresh optimiser per frame: frames without a gradient and without momentum stay where they are
+            optimizer = UniformAdam(motion.parameters(), lr=settings.lr_track, betas=(0.8, 0.95))
+            _minimise(objective, optimizer, [t], half, settings.track_iterations, settings.track_views, settings.lr_track, generator,
+                      progress)
+        rate, optimizer = settings.lr, UniformAdam(motion.parameters(), lr=settings.lr)
+    else:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            motion = MotionBasisNetwork(offsets, centre=scaffold.splats.means.mean(0), reach=reach, bases=settings.bases,
+                                        hidden=settings.hidden, basis_layers=settings.basis_layers,
+                                        coefficient_layers=settings.coefficient_layers).to(background.device)
+        objective = _Objective(motion, carried, scaffold, background, settings)
+        rate = settings.lr_network
+        optimizer = torch.optim.Adam(motion.parameters(), lr=rate, betas=(0.9, 0.99), eps=1e-12)
+    _minimise(objective, optimizer, moving, windows, settings.iterations, settings.views, rate, generator, progress)
+    return motion

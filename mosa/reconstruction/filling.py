@@ -1,0 +1,119 @@
+"""Filling: from a fine occupancy volume to simulation particles of a given spacing, with their volumes and shell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import ndimage
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from mosa.errors import DataError
+from mosa.reconstruction.hull import Volume
+from mosa.types import Cameras
+
+SMALLEST_PIECE = 0.02
+"""Connected pieces below this part of the largest one are debris of the hull (ghosts seen by every matte) and are dropped."""
+
+
+@dataclass(frozen=True)
+class Particles:
+    """positions: (N, 3) [m]; volume: (N,) [m^3]; surface: (N,) bool, True in the outermost layer of cells; spacing [m]."""
+
+    positions: Tensor
+    volume: Tensor
+    surface: Tensor
+    spacing: float
+
+
+def smooth_occupancy(volume: Volume, passes: int) -> Volume:
+    """Repeated 3x3x3 mean: rounds the ridges where the cones of two views meet; the 0.5 level of flat faces stays in place."""
+    values = volume.values.cpu().numpy()
+    for _ in range(passes):
+        values = ndimage.uniform_filter(values, size=3, mode="constant")
+    return Volume(torch.as_tensor(values, device=volume.values.device), volume.origin, volume.pitch)
+
+
+def carve(volume: Volume, depth: Tensor, alpha: Tensor, cameras: Cameras, *, tolerance: float, votes: int = 2) -> Volume:
+    """Empties voxels that at least `votes` views see in front of the rendered surface by more than `tolerance` [m].
+
+    depth: (V, H, W) [m] along the optical axis; alpha: (V, H, W), pixels below 0.9 are not trusted.
+    """
+    points = volume.points().reshape(-1, 3)
+    against = torch.zeros(len(points), device=points.device)
+    for v in range(len(cameras)):
+        seen = points @ cameras.w2c[v, :3, :3].T + cameras.w2c[v, :3, 3]
+        pixel = seen @ cameras.K[v].T
+        column = (pixel[:, 0] / seen[:, 2]).floor().long()
+        row = (pixel[:, 1] / seen[:, 2]).floor().long()
+        inside = (column >= 0) & (column < cameras.width) & (row >= 0) & (row < cameras.height) & (seen[:, 2] > 0)
+        column, row = column.clamp(0, cameras.width - 1), row.clamp(0, cameras.height - 1)
+        trusted = inside & (alpha[v, row, column] > 0.9)
+        against += trusted & (seen[:, 2] < depth[v, row, column] - tolerance)
+    keep = (against < votes).reshape(volume.values.shape)
+    return Volume(torch.where(keep, volume.values, torch.zeros_like(volume.values)), volume.origin, volume.pitch)
+
+
+def _body(volume: Volume, threshold: float) -> np.ndarray:
+    """Boolean grid of the body: above the threshold, cavities closed (nothing can see into them), debris dropped."""
+    inside = ndimage.binary_fill_holes((volume.values > threshold).cpu().numpy())
+    labels, pieces = ndimage.label(inside)
+    if pieces == 0:
+        raise DataError("filling: the occupancy volume is empty; check the mattes and scene.box")
+    sizes = np.bincount(labels.ravel())[1:]
+    return np.isin(labels, 1 + np.flatnonzero(sizes >= SMALLEST_PIECE * sizes.max()))
+
+
+def body_volume(volume: Volume, *, threshold: float = 0.5) -> float:
+    """Volume of the body [m^3], debris dropped and cavities closed."""
+    return float(_body(volume, threshold).sum()) * volume.pitch**3
+
+
+def fill(volume: Volume, *, spacing: float, threshold: float = 0.5, smallest_part: float = 0.5) -> Particles:
+    """Particles on a lattice of `spacing` [m] inside the 0.5 level of an occupancy volume (pitch well below the spacing).
+
+    A lattice cell filled by at least `smallest_part` holds a particle. Each voxel of the body belongs to the particle of its
+    cell or, where that has none, to the nearest one; a particle's volume is that of its voxels and it sits at their centroid: so
+    total volume, centre of mass and, nearly, moments of inertia are those of the body, and the interior is a regular lattice.
+    Cells of features thinner than the lattice keep a particle of their own. Raises DataError for an empty volume.
+    """
+    body = _body(volume, threshold)
+    origin = volume.origin.double().cpu().numpy()
+    voxels = np.argwhere(body) * volume.pitch + origin
+    centre = voxels.mean(0)
+    cell = np.floor((voxels - centre) / spacing).astype(np.int64)
+    low = cell.min(0)
+    shape = cell.max(0) - low + 1
+    flat = np.ravel_multi_index((cell - low).T, shape)
+    count = np.bincount(flat, minlength=int(shape.prod()))
+    full = (spacing / volume.pitch) ** 3
+    kept = count >= smallest_part * full
+    if not kept.any():
+        kept = count == count.max()
+    thin = np.flatnonzero((count >= 0.2 * full) & ~kept)
+    to_cell = lambda i: np.stack(np.unravel_index(i, shape), -1)  # noqa: E731
+    if len(thin):
+        far = cKDTree(to_cell(np.flatnonzero(kept))).query(to_cell(thin))[0] > 1.8
+        kept[thin[far]] = True
+    names = np.flatnonzero(kept)
+    owner = np.full(len(count), -1)
+    owner[names] = np.arange(len(names))
+    owner = owner[flat]
+    stray = owner < 0
+    corner = (to_cell(names) + low + 0.5) * spacing + centre
+    if stray.any():
+        owner[stray] = cKDTree(corner).query(voxels[stray])[1]
+    held = np.bincount(owner, minlength=len(names))
+    positions = np.stack([np.bincount(owner, voxels[:, a], len(names)) for a in range(3)], -1) / held[:, None]
+    solid = np.zeros(shape + 2, bool)
+    solid[1:-1, 1:-1, 1:-1] = kept.reshape(shape)
+    inner = ndimage.binary_erosion(solid, np.ones((3, 3, 3), bool))[1:-1, 1:-1, 1:-1].ravel()
+    device = volume.values.device
+    return Particles(
+        torch.as_tensor(positions, dtype=torch.float32, device=device),
+        torch.as_tensor(held * volume.pitch**3, dtype=torch.float32, device=device),
+        torch.as_tensor(~inner[names], device=device),
+        spacing,
+    )

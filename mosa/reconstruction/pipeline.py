@@ -1,0 +1,256 @@
+"""Reconstruction of a sequence: hull -> static Gaussians -> filling -> appearance -> motion -> cues; each stage cached on disk."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from mosa.errors import ConfigError, DataError
+from mosa.reconstruction.cues import gaussian_cues, neighbourhood, neighbourhood_cues
+from mosa.reconstruction.dynamic import DynamicSettings, Scaffold, fit_motion
+from mosa.reconstruction.filling import Particles, body_volume, carve, fill
+from mosa.reconstruction.hull import Volume, hull_bounds, hull_centroid, shave_ridges, visual_hull
+from mosa.reconstruction.modes import deformation_modes
+from mosa.reconstruction.observed import Windows, object_windows
+from mosa.reconstruction.static import FitSettings, fit_splats, inherited_colors, initial_splats, isotropic_covariances
+from mosa.rendering.rasterizer import expected_depth, rasterize
+from mosa.types import Reconstruction, Scene, Splats
+
+CACHE_VERSION = 1
+"""Raised when a stage computes something else from the same settings."""
+
+
+@dataclass(frozen=True)
+class ReconstructionSettings:
+    """resolution: voxels along the object's longest side in the hull; ridge_passes: hull.shave_ridges; carve: empty what lies in
+    front of the static Gaussians' depth by more than carve_tolerance [spacings]; points: static Gaussians; neighbours: of the
+    least-squares deformation; cue: neighbourhood | gaussian (method.md, section 7); margin: px of the windows around mattes."""
+
+    resolution: int = 64
+    ridge_passes: int = 16
+    carve: bool = False
+    carve_tolerance: float = 0.75
+    points: int = 3000
+    neighbours: int = 20
+    cue: str = "neighbourhood"
+    margin: int = 6
+    static: FitSettings = field(default_factory=FitSettings)
+    appearance: FitSettings = field(default_factory=FitSettings)
+    dynamic: DynamicSettings = field(default_factory=DynamicSettings)
+
+    def __post_init__(self) -> None:
+        if self.cue not in ("neighbourhood", "gaussian"):
+            raise ConfigError(f"reconstruction.cue: expected neighbourhood or gaussian, found {self.cue!r}")
+        free = self.dynamic.free_shape or self.dynamic.model == "network"
+        if self.cue == "gaussian" and not free:
+            raise ConfigError("reconstruction.cue=gaussian reads the Gaussians' own scale and rotation: set "
+                              "reconstruction.dynamic.free_shape=true or reconstruction.dynamic.model=network")
+
+
+def _section(cls: type, values: Mapping[str, Any], where: str) -> Any:
+    known = {f.name for f in fields(cls)}
+    unknown = sorted(set(values) - known)
+    if unknown:
+        raise ConfigError(f"{where}: unknown key {unknown[0]!r}, expected one of {', '.join(sorted(known))}")
+    return cls(**values)
+
+
+def build_settings(**keys: Any) -> ReconstructionSettings:
+    """Settings from the plain keys of conf/reconstruction; ConfigError names an unknown key."""
+    keys = dict(keys)
+    sections = {"static": FitSettings, "appearance": FitSettings, "dynamic": DynamicSettings}
+    for name, cls in sections.items():
+        if name in keys:
+            keys[name] = _section(cls, keys[name] or {}, f"reconstruction.{name}")
+    return _section(ReconstructionSettings, keys, "reconstruction")
+
+
+def _first_frame(scene: Scene) -> tuple[Tensor, Any]:
+    if not scene.training_cameras or scene.training_frames[:1] != [0]:
+        raise DataError(f"scene {scene.name}: reconstruction needs frame 0 and at least one training camera")
+    return scene.mattes[scene.training_cameras, 0], scene.cameras.select(scene.training_cameras)
+
+
+def object_hull(scene: Scene, settings: ReconstructionSettings) -> Volume:
+    """Visual hull of the first frame with its ridges rounded; training cameras only."""
+    mattes, cameras = _first_frame(scene)
+    bounds = hull_bounds(mattes, cameras, scene.box)
+    pitch = float((bounds[1] - bounds[0]).max()) / settings.resolution
+    hull = visual_hull(mattes, cameras, scene.box, pitch=pitch)
+    return shave_ridges(hull, cameras, passes=settings.ridge_passes) if settings.ridge_passes else hull
+
+
+def spacing_for(scene: Scene, particles: int, settings: ReconstructionSettings | None = None) -> float:
+    """Particle spacing [m] that fills the object of `scene` with about `particles` particles."""
+    if particles < 8:
+        raise ConfigError(f"simulation.particles: expected at least 8, found {particles}")
+    return (body_volume(object_hull(scene, settings or ReconstructionSettings())) / particles) ** (1 / 3)
+
+
+class _Cache:
+    """Stage results in one folder per (data, settings, spacing, seed); files appear complete or not at all."""
+
+    def __init__(self, root: Path | None, key: Mapping[str, Any]) -> None:
+        self.folder = None
+        if root is not None:
+            digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]
+            self.folder = Path(root) / "reconstruction" / f"{key['scene']}-{digest}"
+            self.folder.mkdir(parents=True, exist_ok=True)
+            (self.folder / "key.json").write_text(json.dumps(key, indent=1, sort_keys=True))
+
+    def stage(self, name: str, compute: Callable[[], Any]) -> Any:
+        """The stored result of a stage, or `compute()` stored. A damaged file is computed again."""
+        if self.folder is None:
+            return compute()
+        path = self.folder / f"{name}.pt"
+        if path.exists():
+            try:
+                return torch.load(path, map_location="cpu", weights_only=True)
+            except Exception as error:
+                print(f"{path}: cannot be read ({error}); this stage is computed again")
+        result = compute()
+        partial = path.with_suffix(f".{os.getpid()}.tmp")
+        torch.save(result, partial)
+        os.replace(partial, path)
+        return result
+
+    def strip(self, name: str, windows: Windows, rendered: Tensor, columns: int = 8) -> None:
+        """Real above rendered, one picture per stage."""
+        if self.folder is None:
+            return
+        import imageio.v3 as imageio
+
+        chosen = np.unique(np.linspace(0, len(windows) - 1, columns).astype(int))
+        rows = [torch.cat(list(images[chosen].cpu()), 1) for images in (windows.images, rendered)]
+        imageio.imwrite(self.folder / f"{name}.png", (torch.cat(rows).clamp(0, 1).numpy() * 255).round().astype(np.uint8))
+
+
+def _tensors(splats: Splats) -> dict[str, Tensor]:
+    return {f.name: getattr(splats, f.name).cpu() for f in fields(Splats)}
+
+
+def _render_still(splats: Splats, windows: Windows, background: Tensor) -> Tensor:
+    state = torch.zeros(len(windows), dtype=torch.long, device=background.device)
+    with torch.no_grad():
+        return rasterize(splats.means[None], isotropic_covariances(splats.scales.mean(1))[None], splats.opacities,
+                         splats.colors[None], windows.cameras, state, background)[0]
+
+
+def fill_body(hull: Volume, static: Splats, windows: Windows, settings: ReconstructionSettings, spacing: float) -> Particles:
+    """Particles inside the hull, after carving by the static Gaussians' depth where asked for."""
+    if settings.carve:
+        state = torch.zeros(len(windows), dtype=torch.long, device=static.means.device)
+        depth, alpha = expected_depth(static.means[None], isotropic_covariances(static.scales.mean(1))[None], static.opacities,
+                                      windows.cameras, state)
+        hull = carve(hull, depth, alpha, windows.cameras, tolerance=settings.carve_tolerance * spacing)
+    return fill(hull, spacing=spacing)
+
+
+def reconstruct(scene: Scene, *, settings: ReconstructionSettings, spacing: float, cache_dir: str | Path | None, seed: int = 0,
+                device: torch.device | str = "cpu", progress: bool = True) -> Reconstruction:
+    """Particles at frame 0 with their appearance, and their motion through the training frames, from images alone.
+
+    scene: only its training cameras and training frames are read, never its truth. spacing [m] of the particles; cache_dir: root
+    of the cache, None for no cache. A stopped run goes on with the first stage that is not stored. Returns tensors on the CPU;
+    cues cover the training frames, in order. Errors: DataError (empty mattes, empty hull), ConfigError.
+    """
+    if spacing <= 0:
+        raise ConfigError(f"reconstruct: spacing must be positive, found {spacing}")
+    views, frames = scene.training_cameras, scene.training_frames
+    key = {"version": CACHE_VERSION, "scene": f"{scene.name}-{scene.sequence}", "data": scene.fingerprint, "views": views,
+           "frames": frames, "spacing": spacing, "seed": seed, "settings": asdict(settings), "box": scene.box.tolist()}
+    cache = _Cache(Path(cache_dir) if cache_dir is not None else None, key)
+    hull = Volume(**cache.stage("hull", lambda: _volume_tensors(object_hull(scene, settings))))
+    windows = object_windows(scene, views, frames, margin=settings.margin).to(device)
+    still, background = windows.of_frame(0), scene.background.to(device)
+
+    def bar(name: str, total: int) -> tqdm:
+        return tqdm(total=total, desc=f"reconstruction: {name}", disable=not progress, leave=False)
+
+    def static_stage() -> dict[str, Tensor]:
+        start = initial_splats(hull, still, count=settings.points, seed=seed)
+        with bar("static Gaussians", settings.static.iterations) as steps:
+            fitted = fit_splats(start, still, background, settings.static, move=True, seed=seed, progress=steps.update)
+        cache.strip("static", still, _render_still(fitted, still, background))
+        return _tensors(fitted)
+
+    def appearance_stage() -> dict[str, Tensor]:
+        static = _on(Splats(**cache.stage("static", static_stage)), device)
+        particles = fill_body(hull, static, still, settings, spacing)
+        start = scaffold_splats(particles, static, device)
+        with bar("appearance of the particles", settings.appearance.iterations) as steps:
+            fitted = fit_splats(start, still, background, settings.appearance, move=False, seed=seed, progress=steps.update)
+        cache.strip("particles", still, _render_still(fitted, still, background))
+        return _tensors(fitted) | {"volume": particles.volume}
+
+    particles = cache.stage("particles", appearance_stage)
+    volume = particles.pop("volume")
+    splats = Splats(**particles)
+
+    def motion_stage() -> dict[str, Tensor]:
+        static = _on(Splats(**cache.stage("static", static_stage)), device)
+        return _motion(scene, _on(splats, device), static, windows, background, settings, seed, bar, cache)
+
+    motion = cache.stage("motion", motion_stage)
+    around = neighbourhood(splats.means, neighbours=settings.neighbours)
+    if settings.cue == "gaussian":
+        cues = gaussian_cues(motion["positions"], motion["covariances"], splats, motion["scales"], motion["rotations"])
+    else:
+        cues = neighbourhood_cues(motion["positions"], motion["covariances"], around)
+    return Reconstruction(splats, spacing, volume, cues)
+
+
+def _volume_tensors(volume: Volume) -> dict[str, Any]:
+    return {"values": volume.values.cpu(), "origin": volume.origin.cpu(), "pitch": volume.pitch}
+
+
+def _on(splats: Splats, device: torch.device | str) -> Splats:
+    return Splats(*(getattr(splats, f.name).to(device) for f in fields(Splats)))
+
+
+def scaffold_splats(particles: Particles, static: Splats, device: torch.device | str) -> Splats:
+    """First guess of the particles' appearance: isotropic, 0.35 spacings wide (half a cell below the surface the alpha of an
+    opaque one is then about one half at the surface), coloured by the static Gaussians nearby."""
+    n = len(particles.positions)
+    positions = particles.positions.to(device)
+    rotations = torch.zeros(n, 4, device=device)
+    rotations[:, 0] = 1
+    return Splats(positions, torch.full((n, 3), 0.35 * particles.spacing, device=device), rotations,
+                  torch.full((n,), 0.8, device=device), inherited_colors(positions, static))
+
+
+def _motion(scene: Scene, splats: Splats, static: Splats, windows: Windows, background: Tensor, settings: ReconstructionSettings, seed: int,
+            bar: Callable[[str, int], tqdm], cache: _Cache) -> dict[str, Tensor]:
+    """Positions, covariances and, where free, shapes of the particles in every training frame."""
+    views, frames = scene.training_cameras, scene.training_frames
+    cameras, dynamic = scene.cameras.select(views), settings.dynamic
+    centres = torch.stack([hull_centroid(scene.mattes[views, t], cameras, scene.box) for t in frames]).to(splats.means)
+    around = neighbourhood(splats.means, neighbours=settings.neighbours)
+    modes = deformation_modes(splats.means, around, count=dynamic.modes)
+    reach = float((splats.means - splats.means.mean(0)).norm(dim=1).max())
+    total = dynamic.iterations + (dynamic.track_iterations * (len(frames) - 1) if dynamic.model == "modes" else 0)
+    scaffold = carried = Scaffold(splats, modes, around)
+    if dynamic.carriers == "static":
+        carried = Scaffold(static, modes.at(static.means, splats.means))
+    with bar("motion", total) as steps:
+        motion = fit_motion(scaffold, carried, windows, centres, background, dynamic, reach=reach, seed=seed,
+                            progress=steps.update)
+    with torch.no_grad():
+        sample = motion(torch.arange(len(frames), device=splats.means.device), splats, modes, around)
+        rendered = rasterize(sample.positions, sample.covariances, splats.opacities, splats.colors[None], windows.cameras,
+                             windows.frame, background)[0]
+    cache.strip("motion", windows, rendered, columns=12)
+    result = {"positions": sample.positions, "covariances": sample.covariances}
+    if sample.scales is not None:
+        result |= {"scales": sample.scales, "rotations": sample.rotations}
+    return {name: value.cpu() for name, value in result.items()}

@@ -1,0 +1,73 @@
+"""Where a sequence starts: pose of frame 0 and velocity of the frames before first contact, from images alone.
+
+Stage 1 of method.md, section 9, and the held-out starts of section 10.
+"""
+
+from __future__ import annotations
+
+import torch
+from scipy.spatial.transform import Rotation
+
+from mosa.errors import DataError
+from mosa.modules.body import Body, Start
+from mosa.reconstruction.registration import initial_velocity, register_pose
+from mosa.types import Scene, Splats
+
+
+def splats_of(body: Body) -> Splats:
+    """The body's particles as (isotropic or not) splats with axes from their covariances."""
+    values, vectors = torch.linalg.eigh(body.covariances.double())
+    vectors = vectors * torch.linalg.det(vectors)[:, None, None]
+    quaternions = torch.as_tensor(Rotation.from_matrix(vectors.cpu().numpy()).as_quat(scalar_first=True))
+    return Splats(body.rest, values.clamp(min=0).sqrt().to(body.rest), quaternions.to(body.rest), body.opacities, body.colors)
+
+
+def lowest(body: Body, start: Start, scene: Scene, time: float) -> float:
+    """Height [m] above the ground of the lowest rest particle after `time` [s] of free flight."""
+    up, gravity = scene.up.to(body.rest), scene.gravity.to(body.rest)
+    spin = Rotation.from_rotvec((start.angular_velocity * time).cpu().numpy()).as_matrix()
+    R = torch.as_tensor(spin).to(body.rest) @ start.rotation.to(body.rest)
+    arm = (body.rest - body.center) @ R.T
+    center = start.center + start.velocity * time + 0.5 * gravity * time**2
+    return float(((arm + center) @ up).min()) - (scene.ground.height if scene.ground is not None else -torch.inf)
+
+
+def first_contact(body: Body, start: Start, scene: Scene) -> int:
+    """Index of the first frame after first contact: given by the scene, or where free flight would have touched the ground."""
+    if scene.last_free_frame is not None:
+        return min(scene.last_free_frame + 1, scene.frames - 1)
+    surface = 0.5 * float(body.volume.mean()) ** (1 / 3)  # particles lie half a spacing below the surface
+    for t, time in enumerate((scene.times - scene.times[0]).tolist()):
+        if t > 0 and lowest(body, start, scene, time) < surface:
+            return t
+    return scene.frames - 1
+
+
+def sequence_start(body: Body, splats: Splats, scene: Scene, *, register: bool) -> Start:
+    """Pose and velocity of `scene`. register: find the pose by rendering (held-out sequences); else the rest shape's own.
+
+    The free frames are found on the way: a velocity from the first two frames predicts the contact, the frames before it give
+    the final one. Errors: DataError where contact comes before the second frame.
+    """
+    cameras = scene.training_cameras
+    images, mattes = scene.images[cameras], scene.mattes[cameras]
+    views = scene.cameras.select(cameras)
+    rotation, center = torch.eye(3), body.center.cpu()
+    if register:
+        rotation, center = register_pose(splats, images[:, 0], mattes[:, 0], views, background=scene.background, rest_center=body.center)
+    start = Start(rotation.to(body.rest), center.to(body.rest), torch.zeros(3).to(body.rest), torch.zeros(3).to(body.rest))
+    count = 2
+    while True:
+        velocity, spin = initial_velocity(splats, (rotation, center), images[:, :count], mattes[:, :count], views,
+                                          times=scene.times[:count], gravity=scene.gravity, background=scene.background,
+                                          rest_center=body.center)
+        start = Start(start.rotation, start.center, velocity.to(body.rest), spin.to(body.rest))
+        free = first_contact(body, start, scene)
+        if free < 2:
+            raise DataError(f"{scene.name}/{scene.sequence}: the object touches the ground before the second frame; at least two "
+                            "frames of free flight are needed (scene.frames, scene.last_free_frame)")
+        if free <= count or count >= 6:
+            return start
+        count = min(free, 6)
+
+

@@ -1,0 +1,126 @@
+"""Pinhole cameras: projection, rays, cropping, scaling and placing. OpenCV axes, pixel centres at half integers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from mosa.errors import ConfigError, DataError
+from mosa.rendering.covariance import covariance_from as covariance_from
+from mosa.rendering.covariance import quaternion_to_matrix as quaternion_to_matrix
+from mosa.types import Cameras
+
+
+def project(points: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """Pixels (V, N, 2) and depths (V, N) [m] of world points (N, 3) or, one set a camera, (V, N, 3).
+
+    A point at depth 0 or behind the camera has a pixel without meaning: look at the depth first.
+    """
+    w2c, K = cameras.w2c.to(points), cameras.K.to(points)
+    seen = points @ w2c[:, :3, :3].transpose(1, 2) + w2c[:, None, :3, 3]
+    pixels = seen @ K.transpose(1, 2)
+    return pixels[..., :2] / pixels[..., 2:], seen[..., 2]
+
+
+def rays(cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """Origins (V, 3) [m] and unit directions (V, H, W, 3), in world axes, of the rays through all pixel centres."""
+    x = torch.arange(cameras.width, dtype=cameras.K.dtype, device=cameras.K.device) + 0.5
+    y = torch.arange(cameras.height, dtype=cameras.K.dtype, device=cameras.K.device) + 0.5
+    v, u = torch.meshgrid(y, x, indexing="ij")
+    pixels = torch.stack((u, v, torch.ones_like(u)), -1).view(1, -1, 3)
+    R = cameras.w2c[:, :3, :3]
+    directions = pixels @ torch.linalg.inv(cameras.K).transpose(1, 2) @ R  # rows: R^T K^-1 u
+    directions = directions / directions.norm(dim=-1, keepdim=True)
+    origins = -(R.transpose(1, 2) @ cameras.w2c[:, :3, 3:])[..., 0]
+    return origins, directions.view(-1, cameras.height, cameras.width, 3)
+
+
+def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
+    """World-to-camera matrices (..., 4, 4) of cameras at `eye` looking at `target`, all (..., 3); image y points
+    against `up`.
+
+    Raises ConfigError where the line of sight is zero or parallel to `up`.
+    """
+    forward = target - eye
+    right = torch.linalg.cross(forward, up.to(forward).expand_as(forward))
+    if bool((right.norm(dim=-1) <= 1e-9 * forward.norm(dim=-1)).any()) or bool((forward.norm(dim=-1) == 0).any()):
+        raise ConfigError(
+            "look_at: eye and target coincide or the line of sight is parallel to up; choose another eye or up"
+        )
+    forward = forward / forward.norm(dim=-1, keepdim=True)
+    right = right / right.norm(dim=-1, keepdim=True)
+    R = torch.stack((right, torch.linalg.cross(forward, right), forward), -2)
+    w2c = torch.zeros(*R.shape[:-2], 4, 4, dtype=R.dtype, device=R.device)
+    w2c[..., :3, :3] = R
+    w2c[..., :3, 3] = -(R @ eye[..., None])[..., 0]
+    w2c[..., 3, 3] = 1
+    return w2c
+
+
+def scale_cameras(cameras: Cameras, factor: float) -> Cameras:
+    """The same views with images `factor` times as large, sizes rounded to whole pixels. ConfigError below one
+    pixel."""
+    width, height = round(cameras.width * factor), round(cameras.height * factor)
+    if width < 1 or height < 1:
+        raise ConfigError(f"scale_cameras: factor {factor} makes images of {cameras.width}x{cameras.height} px vanish")
+    K = cameras.K.clone()
+    K[:, 0] *= width / cameras.width
+    K[:, 1] *= height / cameras.height
+    return replace(cameras, K=K, width=width, height=height)
+
+
+def crop_cameras(cameras: Cameras, x0: Tensor, y0: Tensor, width: int, height: int) -> Cameras:
+    """Cameras of the windows that start at pixel (x0, y0), both (V,), and are width x height large."""
+    K = cameras.K.clone()
+    K[:, 0, 2] -= x0.to(K)
+    K[:, 1, 2] -= y0.to(K)
+    return replace(cameras, K=K, width=width, height=height)
+
+
+def crop_images(images: Tensor, x0: Tensor, y0: Tensor, width: int, height: int, *, axis: int = 1) -> Tensor:
+    """The windows of `crop_cameras` cut from images (V, ..., H, W, ...) whose rows are dimension `axis` and columns
+    the next."""
+    return torch.stack(
+        [
+            image.narrow(axis - 1, y, height).narrow(axis, x, width)
+            for image, x, y in zip(images, x0.tolist(), y0.tolist())
+        ]
+    )
+
+
+def crop_boxes(
+    mattes: Tensor, margin: int = 8, multiple: int = 1, *, threshold: float = 0.0
+) -> tuple[Tensor, Tensor, int, int]:
+    """Windows around the object: x0, y0 (V,) and one width and height [px] for all views.
+
+    mattes: (V, T, H, W). The size is the largest over the views of the box of all pixels above `threshold` in any
+    frame, plus `margin` on each side, rounded up to `multiple`, at most the image; windows are centred on their box
+    and moved inside the image. A view that never sees the object gets a window in the middle.
+    Raises DataError where no view sees it.
+    """
+    views, _, H, W = mattes.shape
+    seen = (mattes > threshold).any(1)
+    lows, highs = [], []
+    for axis, size in ((1, W), (2, H)):  # columns are occupied where any row is, and the other way round
+        occupied = seen.any(axis)
+        index = torch.arange(size, device=mattes.device)
+        low = torch.where(occupied, index, size).amin(1)
+        high = torch.where(occupied, index + 1, 0).amax(1)
+        lows.append(low)
+        highs.append(high)
+    empty = highs[0] <= lows[0]
+    if bool(empty.all()):
+        raise DataError(
+            f"crop_boxes: none of the {views} mattes has a pixel above {threshold}; the object is not seen at all"
+        )
+    starts, sizes = [], []
+    for low, high, limit in zip(lows, highs, (W, H)):
+        size = int((high - low)[~empty].max()) + 2 * margin
+        size = min(multiple * math.ceil(size / multiple), limit)
+        middle = torch.where(empty, torch.full_like(low, limit), low + high)
+        starts.append(((middle - size) // 2).clamp(0, limit - size))
+        sizes.append(size)
+    return starts[0], starts[1], sizes[0], sizes[1]

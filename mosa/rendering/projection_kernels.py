@@ -1,0 +1,217 @@
+"""Warp kernels that project 3D Gaussians into images and carry gradients back, one thread per Gaussian (and image).
+
+Local affine approximation of the perspective map (EWA splatting, Zwicker et al. 2001; 3D Gaussian Splatting, Kerbl
+et al. 2023): Sigma_2D = J R Sigma R^T J^T + 0.3 I. The conventions are those of rendering.md; the adjoint is
+written by hand.
+"""
+
+import functools
+
+import warp as wp
+
+TILE = 16
+"""Side of a tile [px]."""
+
+LOW_PASS = 0.3
+"""Added to the diagonal of every projected covariance [px^2]."""
+
+ALPHA_MIN = 1.0 / 255.0
+"""Contributions below are skipped."""
+
+
+@functools.cache
+def projection_kernels(dtype: type):
+    """(project, project_backward) for one Warp scalar type.
+
+    Arrays are flat: `means`, `covariances` over S * N, everything per image over B * N. `settings` holds near
+    plane, clamp margin (0.3), largest extent in standard deviations and 1 for the square INRIA extent.
+    """
+    vec2 = wp.types.vector(length=2, dtype=dtype)
+    vec3 = wp.types.vector(length=3, dtype=dtype)
+    vec4 = wp.types.vector(length=4, dtype=dtype)
+    mat22 = wp.types.matrix(shape=(2, 2), dtype=dtype)
+    mat23 = wp.types.matrix(shape=(2, 3), dtype=dtype)
+    mat33 = wp.types.matrix(shape=(3, 3), dtype=dtype)
+    mat44 = wp.types.matrix(shape=(4, 4), dtype=dtype)
+
+    @wp.func
+    def rotation(w2c: mat44):
+        return mat33(w2c[0, 0], w2c[0, 1], w2c[0, 2], w2c[1, 0], w2c[1, 1], w2c[1, 2], w2c[2, 0], w2c[2, 1], w2c[2, 2])
+
+    @wp.func
+    def to_camera(w2c: mat44, m: vec3):
+        return rotation(w2c) * m + vec3(w2c[0, 3], w2c[1, 3], w2c[2, 3])
+
+    @wp.func
+    def slope_limits(K: mat33, width: int, height: int, margin: dtype):
+        """Smallest and largest x/z, then y/z, at which J is evaluated: the image plus `margin` half fields of
+        view."""
+        w = dtype(width)
+        h = dtype(height)
+        half_x = dtype(0.5) * w / K[0, 0]
+        half_y = dtype(0.5) * h / K[1, 1]
+        return vec4(
+            -K[0, 2] / K[0, 0] - margin * half_x,
+            (w - K[0, 2]) / K[0, 0] + margin * half_x,
+            -K[1, 2] / K[1, 1] - margin * half_y,
+            (h - K[1, 2]) / K[1, 1] + margin * half_y,
+        )
+
+    @wp.func
+    def jacobian(K: mat33, p: vec3, limits: vec4):
+        z = p[2]
+        tx = z * wp.clamp(p[0] / z, limits[0], limits[1])
+        ty = z * wp.clamp(p[1] / z, limits[2], limits[3])
+        return mat23(
+            K[0, 0] / z,
+            K[0, 1] / z,
+            -(K[0, 0] * tx + K[0, 1] * ty) / (z * z),
+            dtype(0.0),
+            K[1, 1] / z,
+            -K[1, 1] * ty / (z * z),
+        )
+
+    @wp.func
+    def symmetric(A: mat33):
+        return dtype(0.5) * (A + wp.transpose(A))
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def project(
+        means: wp.array(dtype=vec3),
+        covariances: wp.array(dtype=mat33),
+        opacities: wp.array(dtype=dtype),
+        opacity_stride: int,
+        K: wp.array(dtype=mat33),
+        w2c: wp.array(dtype=mat44),
+        state_index: wp.array(dtype=wp.int32),
+        settings: vec4,
+        count: int,
+        width: int,
+        height: int,
+        # out
+        centers: wp.array(dtype=vec2),
+        conics: wp.array(dtype=vec3),
+        weights: wp.array(dtype=dtype),
+        depths: wp.array(dtype=dtype),
+        rects: wp.array(dtype=wp.vec4i),
+    ):
+        b, n = wp.tid()
+        i = b * count + n
+        s = state_index[b] * count + n
+        p = to_camera(w2c[b], means[s])
+        o = opacities[state_index[b] * opacity_stride + n]
+        weights[i] = o
+        depths[i] = dtype(wp.inf)
+        rects[i] = wp.vec4i(0, 0, 0, 0)
+        if p[2] > settings[0] and o >= dtype(ALPHA_MIN):
+            limits = slope_limits(K[b], width, height, settings[1])
+            T = jacobian(K[b], p, limits) * rotation(w2c[b])
+            S = T * symmetric(covariances[s]) * wp.transpose(T)
+            sxx = S[0, 0] + dtype(LOW_PASS)
+            syy = S[1, 1] + dtype(LOW_PASS)
+            sxy = S[0, 1]
+            det = sxx * syy - sxy * sxy
+            if det > dtype(0.0):
+                u = (K[b][0, 0] * p[0] + K[b][0, 1] * p[1]) / p[2] + K[b][0, 2]
+                v = K[b][1, 1] * p[1] / p[2] + K[b][1, 2]
+                centers[i] = vec2(u, v)
+                conics[i] = vec3(syy / det, -sxy / det, sxx / det)
+                depths[i] = p[2]
+                w = dtype(width)
+                h = dtype(height)
+                zero = dtype(0.0)
+                if settings[3] > zero:
+                    # INRIA: square extent, and every pixel of a touched tile sees the Gaussian
+                    mid = dtype(0.5) * (sxx + syy)
+                    top = mid + wp.sqrt(wp.max(dtype(0.1), mid * mid - det))
+                    r = wp.ceil(settings[2] * wp.sqrt(top))
+                    t = dtype(TILE)
+                    half = dtype(0.5)
+                    x0 = t * wp.floor((wp.clamp(u - half - r, zero, w + t)) / t)
+                    x1 = t * wp.floor((wp.clamp(u - half + r + t - dtype(1.0), zero, w + t)) / t)
+                    y0 = t * wp.floor((wp.clamp(v - half - r, zero, h + t)) / t)
+                    y1 = t * wp.floor((wp.clamp(v - half + r + t - dtype(1.0), zero, h + t)) / t)
+                    rects[i] = wp.vec4i(int(x0), wp.min(int(x1), width), int(y0), wp.min(int(y1), height))
+                else:
+                    e = wp.min(settings[2], wp.sqrt(dtype(2.0) * wp.log(dtype(255.0) * o)))
+                    rx = wp.ceil(e * wp.sqrt(sxx))
+                    ry = wp.ceil(e * wp.sqrt(syy))
+                    x0 = wp.clamp(wp.floor(u - rx), zero, w)
+                    x1 = wp.clamp(wp.ceil(u + rx), zero, w)
+                    y0 = wp.clamp(wp.floor(v - ry), zero, h)
+                    y1 = wp.clamp(wp.ceil(v + ry), zero, h)
+                    rects[i] = wp.vec4i(int(x0), int(x1), int(y0), int(y1))
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def project_backward(
+        means: wp.array(dtype=vec3),
+        covariances: wp.array(dtype=mat33),
+        opacity_stride: int,
+        K: wp.array(dtype=mat33),
+        w2c: wp.array(dtype=mat44),
+        state_index: wp.array(dtype=wp.int32),
+        settings: vec4,
+        count: int,
+        width: int,
+        height: int,
+        images: int,
+        conics: wp.array(dtype=vec3),
+        rects: wp.array(dtype=wp.vec4i),
+        grad_centers: wp.array(dtype=vec2),
+        grad_conics: wp.array(dtype=vec3),
+        grad_weights: wp.array(dtype=dtype),
+        # out, zero at first
+        grad_means: wp.array(dtype=vec3),
+        grad_covariances: wp.array(dtype=mat33),
+        grad_opacities: wp.array(dtype=dtype),
+    ):
+        # one thread per Gaussian goes through all images: sums over images without atomics, the same at every run
+        n = wp.tid()
+        for b in range(images):
+            i = b * count + n
+            rect = rects[i]
+            if rect[1] > rect[0] and rect[3] > rect[2]:
+                s = state_index[b] * count + n
+                R = rotation(w2c[b])
+                p = to_camera(w2c[b], means[s])
+                limits = slope_limits(K[b], width, height, settings[1])
+                T = jacobian(K[b], p, limits) * R
+                A = symmetric(covariances[s])
+                c = conics[i]
+                g = grad_conics[i]
+                half = dtype(0.5)
+                two = dtype(2.0)
+                P = mat22(c[0], c[1], c[1], c[2])
+                # dL/dSigma_2D = -P (dL/dP) P; the conic's off-diagonal entry stands for two
+                G = -P * mat22(g[0], half * g[1], half * g[1], g[2]) * P
+                grad_covariances[s] = grad_covariances[s] + wp.transpose(T) * G * T
+                gJ = two * G * T * A * wp.transpose(R)
+                gu = grad_centers[i][0]
+                gv = grad_centers[i][1]
+                fx = K[b][0, 0]
+                sk = K[b][0, 1]
+                fy = K[b][1, 1]
+                z = p[2]
+                z2 = z * z
+                sx = wp.clamp(p[0] / z, limits[0], limits[1])
+                sy = wp.clamp(p[1] / z, limits[2], limits[3])
+                gx = fx / z * gu
+                gy = sk / z * gu + fy / z * gv
+                gz = -(fx * p[0] + sk * p[1]) / z2 * gu - fy * p[1] / z2 * gv
+                gz -= fx / z2 * gJ[0, 0] + sk / z2 * gJ[0, 1] + fy / z2 * gJ[1, 1]
+                gz += two * (fx * sx + sk * sy) / z2 * gJ[0, 2] + two * fy * sy / z2 * gJ[1, 2]
+                gtx = -fx / z2 * gJ[0, 2]
+                gty = -sk / z2 * gJ[0, 2] - fy / z2 * gJ[1, 2]
+                if p[0] / z == sx:
+                    gx += gtx
+                else:
+                    gz += sx * gtx
+                if p[1] / z == sy:
+                    gy += gty
+                else:
+                    gz += sy * gty
+                grad_means[s] = grad_means[s] + wp.transpose(R) * vec3(gx, gy, gz)
+                k = state_index[b] * opacity_stride + n
+                grad_opacities[k] = grad_opacities[k] + grad_weights[i]
+
+    return project, project_backward

@@ -1,0 +1,169 @@
+"""What travels between the stages: frozen containers with shapes and units. SI throughout, images in [0, 1]."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """V pinhole cameras of one image size. `w2c` maps world metres to OpenCV camera axes (x right, y down, z forward).
+
+    K: (V, 3, 3) [px], pixel centres at half integers; w2c: (V, 4, 4); names: V strings.
+    """
+
+    K: Tensor
+    w2c: Tensor
+    width: int
+    height: int
+    names: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return self.K.shape[0]
+
+    def select(self, indices: list[int]) -> Cameras:
+        """The cameras at `indices`, in that order."""
+        return replace(self, K=self.K[indices], w2c=self.w2c[indices], names=tuple(self.names[i] for i in indices))
+
+    def to(self, device: torch.device | str) -> Cameras:
+        return replace(self, K=self.K.to(device), w2c=self.w2c.to(device))
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The half space below `height` [m] along the up axis. mode: sticky | slip | separate; friction: Coulomb, separate only."""
+
+    height: float
+    mode: str = "sticky"
+    friction: float = 0.0
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is known about a synthetic sequence and must never enter the learning path: evaluation only.
+
+    rest: (M, 3) [m] rest positions in the *training* rest frame; positions: (T, M, 3) [m]; rotation: (3, 3) pose Q of the
+    sequence relative to the training rest shape; velocity: (3,) [m/s]; parameters: name -> value of the hidden material.
+    """
+
+    rest: Tensor
+    positions: Tensor
+    rotation: Tensor
+    velocity: Tensor
+    parameters: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One sequence of multi-view images of one object; the same for every data format.
+
+    images: (V, T, H, W, 3) float32 in [0, 1], composited on `background`; mattes: (V, T, H, W) in [0, 1]; times: (T,) [s];
+    gravity, up: (3,) [m/s^2], unit; box: (2, 3) [m] min and max of the world that may be used; density [kg/m^3].
+    `last_free_frame`: index of the last frame before first contact, None = find it from the data.
+    `holdout_cameras`, `holdout_frames`: indices that no stage of learning may read.
+    """
+
+    name: str
+    sequence: str
+    images: Tensor
+    mattes: Tensor
+    cameras: Cameras
+    times: Tensor
+    gravity: Tensor
+    up: Tensor
+    ground: Ground
+    box: Tensor
+    density: float
+    background: Tensor
+    synthetic: bool
+    last_free_frame: int | None = None
+    holdout_cameras: tuple[int, ...] = ()
+    holdout_frames: tuple[int, ...] = ()
+    truth: Truth | None = None
+    particles: tuple[Tensor, ...] | None = None
+    known_parameters: dict[str, float] = field(default_factory=dict)
+    fingerprint: str = ""
+
+    @property
+    def frames(self) -> int:
+        return self.images.shape[1]
+
+    @property
+    def training_cameras(self) -> list[int]:
+        return [i for i in range(len(self.cameras)) if i not in self.holdout_cameras]
+
+    @property
+    def training_frames(self) -> list[int]:
+        """Frames that learning may read: always a prefix of the sequence (held-out frames are its last ones)."""
+        return [t for t in range(self.frames) if t not in self.holdout_frames]
+
+
+@dataclass(frozen=True)
+class Splats:
+    """N Gaussians at rest: means (N, 3) [m], scales (N, 3) standard deviations [m], rotations (N, 4) unit quaternions wxyz,
+    opacities (N,) in (0, 1), colors (N, 3) in [0, 1]."""
+
+    means: Tensor
+    scales: Tensor
+    rotations: Tensor
+    opacities: Tensor
+    colors: Tensor
+
+
+@dataclass(frozen=True)
+class MotionCues:
+    """What the dynamic reconstruction saw, per particle and frame, frame 0 first.
+
+    positions: (T, N, 3) [m]; rotation: (T, N, 3, 3), stretch: (T, N, 3) descending singular values, both relative to frame 0;
+    weight: (T, N) in [0, 1], 0 where rotation and stretch are not determined; covariances: (T, N, 3, 3) [m^2] of the dynamic
+    Gaussians, from which cue flow maps are rendered.
+    """
+
+    positions: Tensor
+    rotation: Tensor
+    stretch: Tensor
+    weight: Tensor
+    covariances: Tensor
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Particles P_0 with their appearance at frame 0 and the motion cues. spacing [m]; volume: (N,) [m^3] initial volume."""
+
+    splats: Splats
+    spacing: float
+    volume: Tensor
+    cues: MotionCues
+
+
+@dataclass(frozen=True)
+class ParticleState:
+    """State between substeps. x, v: (N, 3) [m], [m/s]; C_affine: (N, 3, 3) [1/s]; F, F_tot: (N, 3, 3).
+
+    For laws without return mapping F_tot is the same tensor as F.
+    """
+
+    x: Tensor
+    v: Tensor
+    C_affine: Tensor
+    F: Tensor
+    F_tot: Tensor
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """Simulated frames, frame 0 first. x, v: (T, N, 3); F, F_tot: (T, N, 3, 3); times: (T,) [s]; final: state to go on from.
+
+    inverted: number of (particle, frame) pairs with det F <= 0.
+    """
+
+    x: Tensor
+    v: Tensor
+    F: Tensor
+    F_tot: Tensor
+    times: Tensor
+    final: ParticleState
+    inverted: int = 0

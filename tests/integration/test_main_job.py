@@ -1,0 +1,107 @@
+"""The commands of the README on a tiny scene: train, kill and resume, evaluate, simulate, and what they say on a mistake."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+def command(script: str, folder: Path, cache: Path, *overrides: str) -> list[str]:
+    common = [f"hydra.run.dir={folder}"]
+    if script == "train.py":
+        common += ["debug=default", f"scene.cache={cache}"]
+    return [sys.executable, script, *common, *overrides]
+
+
+def call(script: str, folder: Path, cache: Path, *overrides: str) -> subprocess.CompletedProcess:
+    return subprocess.run(command(script, folder, cache, *overrides), cwd=ROOT, capture_output=True, text=True, timeout=400)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, cache):
+    folder = tmp_path_factory.mktemp("run")
+    result = call("train.py", folder, cache)
+    assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
+    return folder
+
+
+def test_a_run_leaves_its_outputs(run):
+    figures = json.loads((run / "metrics.json").read_text())
+    for key in ("train/rms_m", "prior/test/rms_m", "prior_eta/test/rms_m", "test/rms_m", "floor/test/rms_m", "test/psnr_crop",
+                "id_prior/E", "id/E"):
+        assert np.isfinite(figures[key]), key
+    rollout = np.load(run / "rollout.npz")
+    assert rollout["train/x"].shape[2] == 3 and rollout["train/F"].shape[2:] == (3, 3)
+    assert (run / "video.mp4").stat().st_size > 1000
+    assert list((run / "tensorboard").rglob("events*"))
+
+
+def test_eval_reproduces_the_figures_from_the_checkpoint_alone(run, cache, tmp_path):
+    result = call("eval.py", tmp_path, cache, f"ckpt_path={run}/checkpoints/last.ckpt")
+    assert result.returncode == 0, result.stderr[-3000:]
+    first, second = (json.loads((f / "metrics.json").read_text()) for f in (run, tmp_path))
+    shared = [k for k in second if not k.startswith("time/")]
+    assert len(shared) > 20
+    for key in shared:
+        assert second[key] == pytest.approx(first[key], rel=1e-6, abs=1e-9), key
+
+
+def test_the_twin_simulates_from_a_new_start(run, cache, tmp_path):
+    result = call("eval.py", tmp_path, cache, f"ckpt_path={run}/checkpoints/last.ckpt", "simulate.velocity=[0.1,-1.5,0]",
+                  "simulate.rotation=[0,0,1,30]", "simulate.frames=4")
+    assert result.returncode == 0, result.stderr[-3000:]
+    assert len(list((tmp_path / "ply").glob("*.ply"))) == 4
+    assert (tmp_path / "simulation.mp4").stat().st_size > 1000
+
+
+def test_a_killed_run_resumes_bit_for_bit(run, cache, tmp_path):
+    process = subprocess.Popen(command("train.py", tmp_path / "killed", cache), cwd=ROOT, stdout=subprocess.DEVNULL,
+                               stderr=subprocess.DEVNULL)
+    checkpoint = tmp_path / "killed" / "checkpoints" / "last.ckpt"
+    try:
+        deadline = time.monotonic() + 300
+        while time.monotonic() < deadline:
+            time.sleep(0.02)
+            if checkpoint.exists() and torch.load(checkpoint, weights_only=True)["mosa"]["steps_done"] >= 2:
+                break
+        assert process.poll() is None, "the run ended before it could be killed: make the scene's fit longer"
+    finally:
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    result = call("train.py", tmp_path / "resumed", cache, f"ckpt_path={checkpoint}")
+    assert result.returncode == 0, result.stderr[-3000:]
+    whole = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
+    resumed = torch.load(tmp_path / "resumed" / "checkpoints" / "last.ckpt", weights_only=True)
+    assert whole["mosa"]["steps_done"] == resumed["mosa"]["steps_done"]
+    for key, value in whole["state_dict"].items():
+        assert torch.equal(value, resumed["state_dict"][key]), key
+
+
+@pytest.mark.parametrize(
+    ("overrides", "expected"),
+    [
+        (["prior=jelly"], "Could not find 'prior/jelly'"),
+        (["ckpt_path=nowhere.ckpt"], "ckpt_path: no file nowhere.ckpt"),
+        (["losses.colour=1"], "colour"),
+        (["scene=pacnerf", "scene.path=/nonexistent"], "/nonexistent"),
+    ],
+)
+def test_a_mistake_ends_in_one_message(overrides, expected, cache, tmp_path):
+    result = call("train.py", tmp_path, cache, *overrides)
+    assert result.returncode != 0
+    assert expected in result.stderr
+    assert "Traceback" not in result.stderr

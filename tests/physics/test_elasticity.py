@@ -1,0 +1,141 @@
+"""Laws: stress from energy, frame indifference, rest, small strain."""
+
+import pytest
+import torch
+
+from mosa.errors import ConfigError
+from mosa.physics.elasticity import lame, wave_modulus
+from mosa.physics.laws import law_named, law_names
+from mosa.physics.reference import unvech
+from mosa.physics.rollout import Simulator
+
+MU, LAM = 3.0, 5.0
+LAWS = ["linear", "neo_hookean", "corotated", "stvk", "stvk_paper"]
+
+
+def stress(law, F, dtype=torch.float64):
+    """tau (N, 3, 3) through the simulator's own kernel."""
+    sim = Simulator(law, dx=0.1, substeps=1, frame_dt=1e-3, dtype=dtype)
+    state = sim.material_state(F.to(dtype), torch.zeros_like(F, dtype=dtype), {"mu": MU, "lam": LAM})
+    R = rotation(F).to(dtype)
+    return R @ unvech(state.stress) @ R.mT
+
+
+def rotation(F):
+    U, S, Vh = torch.linalg.svd(F)
+    U = torch.cat([U[..., :2], U[..., 2:] * torch.linalg.det(U @ Vh)[:, None, None]], -1)
+    return U @ Vh
+
+
+@pytest.mark.parametrize("law", ["linear", "neo_hookean", "corotated", "stvk"])
+def test_stress_is_the_gradient_of_the_energy(law):
+    generator = torch.Generator().manual_seed(2)
+    F = torch.eye(3).double() + 0.25 * torch.randn(50, 3, 3, generator=generator, dtype=torch.float64)
+    F = F[torch.linalg.det(F) > 0.2]
+    F.requires_grad_()
+    (P,) = torch.autograd.grad(law_named(law).energy(F, MU, LAM).sum(), F)
+    tau = P @ F.mT
+    if law == "linear":
+        tau = 0.5 * (tau + tau.mT)
+    else:
+        assert (tau - tau.mT).abs().max() < 1e-12 * tau.abs().max()
+    found = stress(law, F.detach())
+    assert (found - tau.detach()).abs().max() < 1e-12 * tau.abs().max()
+
+
+def test_the_printed_stvk_has_one_stretch_too_many(drawn):
+    _, F = drawn
+    F = F[torch.linalg.det(F) > 0.1]
+    expected = stress("stvk", F) @ (rotation(F) @ F.mT)
+    assert (stress("stvk_paper", F) - expected).abs().max() < 1e-12 * expected.abs().max()
+    assert (stress("stvk", F) - expected).abs().max() > 1e-1 * expected.abs().max()
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_frame_indifference(law, rotations):
+    generator = torch.Generator().manual_seed(3)
+    F = torch.eye(3).double() + 0.3 * torch.randn(200, 3, 3, generator=generator, dtype=torch.float64)
+    S = torch.linalg.svdvals(F)
+    keep = (S[:, 1] - S[:, 2] > -1) & (S[:, 1] + S[:, 2] > 0.1) & (torch.linalg.det(F) > 0.05)
+    F, Q = F[keep], rotations[keep]
+    assert len(F) > 100
+    expected = Q @ stress(law, F) @ Q.mT
+    error = (stress(law, Q @ F) - expected).abs().amax((1, 2)) / expected.abs().amax((1, 2))
+    if law == "linear":
+        assert error.median() > 1e-2  # the control: this law is not objective
+    else:
+        assert error.max() < 1e-12
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_rest_and_small_strain(law):
+    eye = torch.eye(3).double()[None]
+    assert stress(law, eye).abs().max() == 0.0
+    assert stress(law, eye, torch.float32).abs().max() <= 1e-5 * MU
+    e = 1e-5
+    stretch, shear = eye.clone(), eye.clone()
+    stretch[0, 0, 0] += e
+    shear[0, 1, 2] += e
+    assert float(stress(law, stretch)[0, 0, 0]) / e == pytest.approx(LAM + 2 * MU, rel=1e-4)
+    assert float(stress(law, stretch)[0, 1, 1]) / e == pytest.approx(LAM, rel=1e-4)
+    assert float(stress(law, shear)[0, 1, 2]) / e == pytest.approx(MU, rel=1e-4)
+
+
+@pytest.mark.parametrize("dtype, tolerance", [(torch.float64, 1e-13), (torch.float32, 1e-6)])
+@pytest.mark.parametrize("law", LAWS)
+def test_material_state_gradient_and_symmetry(law, dtype, tolerance, drawn):
+    """w and s are six numbers each: symmetric by construction; their value agrees with the stress of a torch evaluation."""
+    names, F = drawn
+    F = F[[i for i, name in enumerate(names) if not name.startswith(("inverted", "nearly"))]]
+    sim = Simulator(law, dx=0.1, substeps=1, frame_dt=1e-3, dtype=dtype)
+    state = sim.material_state(F.to(dtype), torch.zeros_like(F, dtype=dtype), {"mu": MU, "lam": LAM})
+    W = rotation(F).mT @ F
+    expected = W - torch.eye(3).double()
+    assert (unvech(state.w).double() - expected).abs().max() < 10 * tolerance * W.abs().max()
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_gradient_of_the_material_state(law, drawn):
+    names, F = drawn
+    F = F[torch.linalg.det(F) > 1e-6] if law == "neo_hookean" else F
+    sim = Simulator(law, dx=0.1, substeps=1, frame_dt=1e-3, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(4)
+    a, b = (torch.randn(len(F), 6, generator=generator, dtype=torch.float64) for _ in range(2))
+    C = torch.zeros_like(F)
+    mu = MU * (1 + 0.1 * torch.rand(len(F), generator=generator, dtype=torch.float64))
+
+    def loss(F, mu):
+        state = sim.material_state(F, C, {"mu": mu, "lam": LAM})
+        return (a * state.w + b * state.stress).sum(1)
+
+    leaves = F.clone().requires_grad_(), mu.clone().requires_grad_()
+    adj_F, adj_mu = torch.autograd.grad(loss(*leaves).sum(), leaves)
+    dF = torch.randn(F.shape, generator=generator, dtype=torch.float64)
+    dF = dF / torch.linalg.matrix_norm(dF)[:, None, None]
+    S = torch.linalg.svdvals(F)
+    S[:, 2] *= torch.sign(torch.linalg.det(F))
+    h = 3e-3 * torch.minimum(S[:, 1] + S[:, 2], (S - 0.05).abs().amin(1)).clamp(max=1.0)
+    h = torch.minimum(h, 3e-3 * torch.linalg.det(F).abs())
+    step = h[:, None, None]
+    expected = (8 * (loss(F + step * dF, mu) - loss(F - step * dF, mu))
+                - (loss(F + 2 * step * dF, mu) - loss(F - 2 * step * dF, mu))) / (12 * h)  # fmt: skip
+    error = ((adj_F * dF).sum((1, 2)) - expected).abs() / torch.linalg.matrix_norm(adj_F).clamp_min(1.0)
+    assert error.max() < 1e-6, names[int(error.argmax())]
+    expected = (loss(F, mu + 1e-3) - loss(F, mu - 1e-3)) / 2e-3
+    torch.testing.assert_close(adj_mu, expected, rtol=1e-6, atol=1e-8)
+
+
+def test_moduli():
+    E, nu = torch.tensor([1e5, 2e5]).double(), torch.tensor([0.3, 0.45]).double()
+    mu, lam = lame(E, nu)
+    torch.testing.assert_close(mu * (3 * lam + 2 * mu) / (lam + mu), E)
+    torch.testing.assert_close(lam / (2 * (lam + mu)), nu)
+    assert float(wave_modulus("stvk", {"mu": mu, "lam": lam})) == pytest.approx(float((lam + 2 * mu).max()))
+    with pytest.raises(ConfigError, match="mu and lam"):
+        wave_modulus("other", {"kappa": mu})
+
+
+def test_names():
+    assert set(LAWS) | {"von_mises", "drucker_prager"} <= set(law_names())
+    with pytest.raises(ConfigError, match="neo_hookean.*found 'mooney'"):
+        law_named("mooney")

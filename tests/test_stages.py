@@ -1,0 +1,40 @@
+import pytest
+import torch
+
+from mosa.data.datamodule import ViewSchedule
+from mosa.errors import ConfigError
+from mosa.modules.stages import Stage
+
+
+def test_prior_stage_brings_frames_in_progressively_and_reaches_all():
+    stage = Stage("prior", 30, 0.1)
+    counts = [stage.active_frames(i, 5, 15) for i in range(30)]
+    assert counts[0] == 5 and counts[10] == 15 and counts == sorted(counts)
+
+
+def test_learning_rate_decays_to_a_tenth():
+    stage = Stage("joint", 50, 0.1)
+    assert stage.decay(0) == stage.decay(25) == 1.0
+    assert abs(stage.decay(50) - 0.1) < 1e-12
+
+
+def test_convergence_needs_a_flat_loss_after_all_frames_are_in():
+    stage = Stage("prior", 100, 0.1, converged=1e-3)
+    falling = [1.0 / (i + 1) for i in range(60)]
+    assert not stage.ended(falling)
+    assert stage.ended(falling[:40] + [0.02] * 20)
+    assert not stage.ended([0.02] * 20)  # frames are still entering
+
+
+def test_unknown_stage_is_named():
+    with pytest.raises(ConfigError, match="warmup"):
+        Stage("warmup", 1, 0.1)
+
+
+def test_views_cover_all_cameras_once_per_pass_and_depend_on_seed_and_step_alone():
+    schedule = ViewSchedule(12, 2, 100, seed=3)
+    one_pass = [v for i in range(6) for v in schedule[i]]
+    assert sorted(one_pass) == list(range(12))
+    torch.manual_seed(99)
+    assert [ViewSchedule(12, 2, 100, seed=3)[i] for i in range(20)] == [schedule[i] for i in range(20)]
+    assert [ViewSchedule(12, 2, 100, seed=4)[i] for i in range(6)] != [schedule[i] for i in range(6)]
