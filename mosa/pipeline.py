@@ -25,10 +25,10 @@ from mosa.errors import ConfigError
 from mosa.evaluation import Sequence, evaluate, identification, render
 from mosa.modules.body import Body, Start
 from mosa.modules.lit_mosa import LitMosa
+from mosa.reconstruction.starts import first_contact, sequence_start, splats_of
 from mosa.rendering.covariance import covariance_from
-from mosa.reconstruction.starts import first_contact, sequence_start
-from mosa.types import MotionCues, Reconstruction, Scene
 from mosa.twin import Twin, save_rollout
+from mosa.types import MotionCues, Reconstruction, Scene
 
 
 class Clock:
@@ -221,7 +221,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     scene, held_out = scenes(run)
     known = {k: Start(**{n: torch.tensor(v) for n, v in s.items()}) for k, s in twin.config["starts"].items()}
     if cfg.get("scene"):
-        splats = twin_splats(twin.body)
+        splats = splats_of(twin.body)
         known = {f"test/{s.sequence}": sequence_start(twin.body, splats, s, register=True) for s in (scene, *held_out)}
         evaluated = [Sequence(p, s, known[p], first_contact(twin.body, known[p], s)) for p, s in
                      zip(known, (scene, *held_out))]
@@ -233,14 +233,6 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         figures |= floor_figures(twin.body, evaluated, twin.world)
     write_outputs(folder, cfg, twin.body, evaluated, figures, kept)
     return optimized(figures, "test/rms_m")
-
-
-def twin_splats(body: Body):
-    """The body's appearance as splats, for registration in another scene."""
-    from mosa.rendering.covariance import covariance_from
-from mosa.reconstruction.starts import splats_of
-
-    return splats_of(body)
 
 
 def quiet() -> None:

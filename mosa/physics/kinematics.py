@@ -9,6 +9,9 @@ Everything is float64, whatever the precision of the fields: float32 factorisati
 Convention: F = U diag(S) V^T, det U = det V = +1, S descending, the last one carries the sign of det F.
 """
 
+# ruff: noqa: UP018, RUF046, RUF059
+# (Warp: `int(0)` makes a variable that a dynamic loop or branch may change, and results are unpacked whole)
+
 import warp as wp
 
 STRAIN_CLAMP = wp.constant(wp.float64(0.05))
@@ -17,6 +20,8 @@ STRAIN_CLAMP = wp.constant(wp.float64(0.05))
 ROTATION_FLOOR = wp.constant(wp.float64(1.0e-3))
 """Smallest S_i + S_j that a rotation's differential divides by: zero only at det F <= 0, a true singularity."""
 
+# angles below it leave products of 1e-16 behind: the sweep that only has such is the last
+_TURN = wp.constant(wp.float64(1.0e-8))
 _ZERO = wp.constant(wp.float64(0.0))
 _HALF = wp.constant(wp.float64(0.5))
 _ONE = wp.constant(wp.float64(1.0))
@@ -64,7 +69,8 @@ def svd_value(F: wp.mat33d):
         turning = int(0)
         co, si = jacobi_angle(a, b)
         if si != _ZERO:
-            turning = int(1)
+            if wp.abs(si) > _TURN:
+                turning = int(1)
             t = co * a - si * b
             b = si * a + co * b
             a = t
@@ -73,7 +79,8 @@ def svd_value(F: wp.mat33d):
             p = t
         co, si = jacobi_angle(a, c)
         if si != _ZERO:
-            turning = int(1)
+            if wp.abs(si) > _TURN:
+                turning = int(1)
             t = co * a - si * c
             c = si * a + co * c
             a = t
@@ -82,7 +89,8 @@ def svd_value(F: wp.mat33d):
             p = t
         co, si = jacobi_angle(b, c)
         if si != _ZERO:
-            turning = int(1)
+            if wp.abs(si) > _TURN:
+                turning = int(1)
             t = co * b - si * c
             c = si * b + co * c
             b = t

@@ -17,14 +17,15 @@ from mosa.physics.mpm_kernels import INVERTED, NO_EVENT, NONFINITE, OUTSIDE, WIN
 from mosa.physics.workspace import SCALARS, Numerics, Workspace
 
 HELD = ("parameters", "G", "h", "plastic_G", "plastic_h")
-MAX_NODES = 2**27
+MAX_NODES = 2**23
+"""Nodes of the largest window: 200 cells across."""
 
 
 def grid_window(x: Tensor, v: Tensor, dx: float, travel_time: float, margin: int) -> tuple[tuple, tuple]:
     """(lowest node, nodes per axis) that hold the stencils of all particles for `travel_time` seconds.
 
     x, v: (N, 3). Node counts are multiples of 4, so that a moving body seldom changes them.
-    Errors: SimulationDiverged for non-finite input or particles spread over more than 2^27 nodes.
+    Errors: SimulationDiverged for non-finite input or particles spread over more than 2^23 nodes.
     """
     bounds = torch.cat([x.amin(0), x.amax(0), v.abs().amax().reshape(1)]).tolist()  # the only transfer to the host
     if not all(math.isfinite(b) for b in bounds):
@@ -36,7 +37,7 @@ def grid_window(x: Tensor, v: Tensor, dx: float, travel_time: float, margin: int
     dims = [-(-(h - l + 1) // 4) * 4 for l, h in zip(low, high)]
     if math.prod(dims) > MAX_NODES:
         raise SimulationDiverged(
-            f"particles spread over {dims} grid nodes of {dx} m (speeds to {bounds[6]:.3g} m/s): use more substeps, or give a box"
+            f"particles spread over {dims} grid nodes of {dx} m (speeds to {bounds[6]:.3g} m/s): use more substeps, or a box"
         )
     return tuple(low), tuple(dims)
 
@@ -74,8 +75,9 @@ class SegmentSolver:
 
         Errors: SimulationDiverged naming substep and particle.
         """
-        margin = 2
-        while True:
+        # the speed at the start tells the window; a body that is being accelerated may need the most that the time step bound
+        # allows, half a cell per substep
+        for margin in (2, 3 + substeps // 2):
             origin, dims = grid_window(state[0], state[1], self.numerics.dx, 2 * substeps * self.numerics.dt, margin)
             self._dims = dims = tuple(max(a, b) for a, b in zip(dims, self._dims))
             work = self.prepare(state, held, substeps, (origin, dims), with_adjoint=False)
@@ -83,8 +85,7 @@ class SegmentSolver:
             flags = work.flags.tolist()
             if not self._left_window(flags, first):
                 return work.final(), (origin, dims)
-            margin *= 4  # faster than its speed at the start allowed: once more on a wider grid
-            self._dims = (0, 0, 0)
+        raise self._error(WINDOW, flags[WINDOW], first)
 
     def _left_window(self, flags: list[int], first: int) -> bool:
         """Whether a particle left the grid's window; any other event raises."""
@@ -94,14 +95,19 @@ class SegmentSolver:
         event = min(range(4), key=lambda i: (flags[i] // n, i != INVERTED, i == WINDOW, flags[i]))
         if event == WINDOW:
             return True
-        substep, particle = first + flags[event] // n, flags[event] % n
-        law, numerics = self.numerics.law.name, self.numerics
+        raise self._error(event, flags[event], first)
+
+    def _error(self, event: int, flag: int, first: int) -> SimulationDiverged:
+        substep, particle = first + flag // len(self.volume), flag % len(self.volume)
+        law, numerics = self.numerics.law, self.numerics
         what = {
+            WINDOW: "moved by more than half a cell per substep",
             NONFINITE: "position, velocity or deformation is no longer finite",
             OUTSIDE: f"position is outside the box {list(numerics.low)} to {list(numerics.high)} m",
-            INVERTED: f"det F <= 0, which {'law ' + law + ' has no value for' if numerics.law.needs_positive_J else 'on_inversion=error forbids'}",
-        }[event]  # fmt: skip
-        raise SimulationDiverged(
+            INVERTED: "det F <= 0, which "
+            + (f"law {law.name} has no value for" if law.needs_positive_J else "on_inversion=error forbids"),
+        }[event]
+        return SimulationDiverged(
             f"substep {substep}, particle {particle}: {what} (dt {numerics.dt:.3g} s, dx {numerics.dx:.3g} m); "
             "use more substeps, a larger box, or parameters nearer to the calibrated ones"
         )
@@ -185,7 +191,7 @@ class _MaterialState(torch.autograd.Function):
 def material_state(law: Law, F: Tensor, C_affine: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
     """(w, s, e) that an adapter reads (method.md, section 4), differentiable.
 
-    w: (N, 6) vech(W - I); s: (N, 6) vech(R^T tau R) [Pa] of the prior; e: (N, 6) vech(dev log W), None for laws that do not yield.
+    w: (N, 6) vech(W - I); s: (N, 6) vech(R^T tau R) [Pa] of the prior; e: (N, 6) vech(dev log W), None for elastic laws.
     """
     result = _MaterialState.apply(law, F, C_affine, parameters)
     return result if law.plastic else (*result, None)
@@ -206,7 +212,8 @@ class _Return(torch.autograd.Function):
         mapped = torch.zeros_like(F, memory_format=torch.contiguous_format)
         with _stream(F.device):
             arrays = _arrays([F, C, parameters, G, h], ctx.kinds)
-            wp.launch(ctx.kernel, len(F), inputs=[*arrays, *ctx.constants, *_arrays([mapped], [mat33])], device=arrays[0].device)
+            inputs = [*arrays, *ctx.constants, *_arrays([mapped], [mat33])]
+            wp.launch(ctx.kernel, len(F), inputs=inputs, device=arrays[0].device)
         return mapped
 
     @staticmethod

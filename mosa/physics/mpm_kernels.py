@@ -6,6 +6,9 @@ The adjoint of P2G is a pure gather; the adjoint of G2P scatters three numbers p
 Stencils are nested static loops over 3: a single loop over 27 nodes compiles to a dynamic loop.
 """
 
+# ruff: noqa: UP018, RUF046
+# (Warp: `int(0)` makes a variable that a dynamic loop or branch may change, and results are unpacked whole)
+
 from functools import cache
 from types import SimpleNamespace
 

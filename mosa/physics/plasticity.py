@@ -6,13 +6,16 @@ and whether the particle yielded. The flow is coaxial: the deviator is scaled by
 Where |E'| can vanish the argument is replaced *before* the root: 0 x NaN is NaN in a backward pass.
 """
 
+# ruff: noqa: UP018, RUF046
+# (Warp: `int(0)` makes a variable that a dynamic loop or branch may change, and results are unpacked whole)
+
 import torch
 import warp as wp
 from torch import Tensor
 
 from mosa.errors import ConfigError
 from mosa.physics.elasticity import stvk
-from mosa.physics.kinematics import contract, rotation
+from mosa.physics.kinematics import contract
 from mosa.physics.laws import LawParameters, register_law
 
 YIELD_CONVENTIONS = {"paper": 1.0, "sqrt23": (2.0 / 3.0) ** 0.5}

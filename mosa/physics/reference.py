@@ -142,7 +142,8 @@ def substep(law: str, state: ParticleState, p: dict[str, Tensor], volume: Tensor
     low = base.amin(0).long()
     size = (base.amax(0).long() - low + 3).tolist()
     B = mass[:, None, None] * C - dt * volume[:, None, None] * 4 / dx**2 * tau
-    momentum, node_mass = torch.zeros(size[0] * size[1] * size[2], 3).double(), torch.zeros(size[0] * size[1] * size[2]).double()
+    nodes = size[0] * size[1] * size[2]
+    momentum, node_mass = torch.zeros(nodes, 3).double(), torch.zeros(nodes).double()
     stencil = []
     for i in range(3):
         for j in range(3):

@@ -1,9 +1,9 @@
 """The simulator: frames of MLS-MPM from a start, a law and its parameters, with or without an adapter.
 
 State convention: after n substeps a state holds (x^n, v^n, C_affine^n, F^{n+1}, F_tot^{n+1}); F is advanced right after its
-C_affine is known, so that F belongs to x and is known when a substep starts. One substep is then stress(F) -> P2G -> grid -> G2P
--> x += dt v -> F <- map((I + dt C_affine) F), and a rollout starts with one advance of F by the initial C_affine. This is the
-order of method.md, section 6, cut at another place.
+C_affine is known, so that F belongs to x and is known when a substep starts. One substep is then stress(F) -> P2G -> grid ->
+G2P -> x += dt v -> F <- map((I + dt C_affine) F), and a rollout starts with one advance of F by the initial C_affine. This is
+the order of method.md, section 6, cut at another place.
 """
 
 import math
@@ -215,12 +215,14 @@ class Simulator:
         n = len(F)
         answer = AdapterOperator(*adapter(MaterialState(*material_state(self.law, F, C, packed))))
         plastic = answer.plastic_G if self.law.plastic else None
-        result = {"G": answer.G, "h": answer.h, "plastic_G": plastic, "plastic_h": None if plastic is None else answer.plastic_h}
+        plastic_h = None if plastic is None else answer.plastic_h
+        result = {"G": answer.G, "h": answer.h, "plastic_G": plastic, "plastic_h": plastic_h}
         for name, value in result.items():
             shape = (n, 6, 6) if name.endswith("G") else (n, 6)
             if value is not None and (tuple(value.shape) != shape or value.dtype != self.dtype):
                 raise ConfigError(
-                    f"adapter output {name}: expected shape {shape} of {self.dtype}, found {tuple(value.shape)} of {value.dtype}"
+                    f"adapter output {name}: expected shape {shape} of {self.dtype}, found {tuple(value.shape)} of "
+                    f"{value.dtype}"
                 )
         return result
 

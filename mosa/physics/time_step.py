@@ -21,7 +21,8 @@ def required_substeps(
 
     Errors: ConfigError when an argument is not positive, or when more than `limit` substeps would be needed.
     """
-    values = {"modulus_max": modulus_max, "density": density, "frame_dt": frame_dt, "dx": dx, "factor": factor, "courant": courant}
+    values = {"modulus_max": modulus_max, "density": density, "frame_dt": frame_dt, "dx": dx}
+    values |= {"factor": factor, "courant": courant}
     for name, value in values.items():
         if not (math.isfinite(value) and value > 0):
             raise ConfigError(f"time step: {name}: expected a positive number, found {value}")

@@ -1,7 +1,7 @@
 """Device buffers of a segment of substeps, and the launches that advance it and run its adjoint.
 
-Everything is allocated once per (particles, slots, grid window); nothing allocates inside the substep loop. On CUDA the launches
-of a segment are captured as one graph the second time they are asked for.
+Everything is allocated once per (particles, slots, grid window); nothing allocates inside the substep loop. On CUDA the
+launches of a segment are captured as one graph the second time they are asked for.
 """
 
 from dataclasses import dataclass
@@ -114,7 +114,9 @@ class Workspace:
             self.adj_velocity, self.adj_velocity_wp = self._array((nodes, 3), self.kernels.vec3)
         self._graphs.clear()
 
-    def load(self, state: tuple[Tensor, ...], held: dict[str, Tensor | None], volume: Tensor, mass: Tensor, cutoff: float) -> None:
+    def load(
+        self, state: tuple[Tensor, ...], held: dict[str, Tensor | None], volume: Tensor, mass: Tensor, cutoff: float
+    ) -> None:
         """Copy the start of a segment in: (x, v, C_affine, F, F_tot), the parameters and the adapter's operator."""
         for slots, value in zip((self.x, self.v, self.C, self.F), state[:4], strict=True):
             slots[0].copy_(value)
@@ -143,7 +145,7 @@ class Workspace:
         self._launch("advance", self._advance)
 
     def adjoint(self) -> None:
-        """Adjoint of all substeps, last to first, after `advance`. Seeds are in adj_* slot `substeps` % 2, results in slot 0."""
+        """Adjoint of all substeps, last to first, after `advance`. Seeds: adj_* slot `substeps` % 2, results: slot 0."""
         self._launch("adjoint", self._adjoint)
 
     def _launch(self, name: str, body) -> None:
@@ -239,5 +241,6 @@ class Workspace:
                 self.x_wp[step], self.v_wp[step], self.C_wp[step], self.tau_wp[step], self.mass_wp, self.volume_wp, *geometry,
                 self.adj_grid_wp, self.adj_x_wp[a], self.adj_v_wp[a], self.adj_C_wp[a], self.adj_tau_wp,
             ])  # fmt: skip
-            self._run(self.stress, n, self._stress_arguments(step, step),
-                      [self.adj_F_wp[a], self.adj_C_wp[a], held["parameters"], held["G"], held["h"], self.adj_tau_wp])  # fmt: skip
+            self._run(self.stress, n, self._stress_arguments(step, step), [
+                self.adj_F_wp[a], self.adj_C_wp[a], held["parameters"], held["G"], held["h"], self.adj_tau_wp,
+            ])  # fmt: skip

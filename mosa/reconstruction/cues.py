@@ -68,8 +68,13 @@ def neighbourhood(rest: Tensor, *, neighbours: int = 20, condition_limit: float 
     gradient = np.einsum("nk,nki,nij->nkj", kernel, offset, np.linalg.inv(safe)) / scale
     gradient = np.where(good[:, None, None], gradient, 0.0)
     as_tensor = lambda a: torch.as_tensor(a, dtype=rest.dtype, device=rest.device)  # noqa: E731
-    return Neighbourhood(torch.as_tensor(index, device=rest.device), as_tensor(gradient), as_tensor(good.astype(float)),
-                         as_tensor(kernel), as_tensor(offset))
+    return Neighbourhood(
+        torch.as_tensor(index, device=rest.device),
+        as_tensor(gradient),
+        as_tensor(good.astype(float)),
+        as_tensor(kernel),
+        as_tensor(offset),
+    )
 
 
 def polar(deformation: Tensor) -> tuple[Tensor, Tensor]:
@@ -87,9 +92,17 @@ def polar(deformation: Tensor) -> tuple[Tensor, Tensor]:
 def quaternion_rotation(quaternions: Tensor) -> Tensor:
     """Rotation matrices (..., 3, 3) of quaternions (..., 4) wxyz, normalised here."""
     w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)
-    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+    rows = [
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    ]
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 

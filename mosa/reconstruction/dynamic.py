@@ -55,14 +55,14 @@ class DynamicSettings:
     free_shape: bool = False
     track_iterations: int = 40
     track_views: int = 4
-    iterations: int = 200
+    iterations: int = 150
     views: int = 1
     lr_track: float = 0.03
     lr: float = 0.01
     ssim: float = 0.0
     matte: float = 1.0
-    elastic: float = 1e-3
-    bending: float = 1e-3
+    elastic: float = 0.01
+    bending: float = 400.0
     poisson: float = 0.3
     bases: int = 10
     hidden: int = 256
@@ -113,8 +113,15 @@ class _Objective:
         """frames: (S,) long; state: (B,) which of them each window shows."""
         carried, settings = self.carried, self.settings
         sample = self.motion(frames, carried.splats, carried.modes, carried.around)
-        image, alpha = rasterize(sample.positions, sample.covariances, carried.splats.opacities, carried.splats.colors[None],
-                                 batch.cameras, state, self.background)
+        image, alpha = rasterize(
+            sample.positions,
+            sample.covariances,
+            carried.splats.opacities,
+            carried.splats.colors[None],
+            batch.cameras,
+            state,
+            self.background,
+        )
         loss = image_loss(image, alpha, batch, ssim_weight=settings.ssim, matte_weight=settings.matte)
         if settings.elastic > 0:
             loss = loss + settings.elastic * elastic_energy(self._deformation(frames, sample), settings.poisson)
@@ -131,8 +138,17 @@ class _Objective:
         return self.motion(frames, self.scaffold.splats, None, self.scaffold.around).deformation
 
 
-def _minimise(objective: _Objective, optimizer: torch.optim.Optimizer, frames: list[int], windows: Windows, steps: int, views: int,
-              rate: float, generator: torch.Generator, progress: Callable[[int], None] | None) -> None:
+def _minimise(
+    objective: _Objective,
+    optimizer: torch.optim.Optimizer,
+    frames: list[int],
+    windows: Windows,
+    steps: int,
+    views: int,
+    rate: float,
+    generator: torch.Generator,
+    progress: Callable[[int], None] | None,
+) -> None:
     """`steps` steps, each on `views` random windows of every frame in `frames`."""
     draw = _round_robin(windows, frames, generator)
     device = windows.images.device
@@ -148,8 +164,18 @@ def _minimise(objective: _Objective, optimizer: torch.optim.Optimizer, frames: l
             progress(1)
 
 
-def fit_motion(scaffold: Scaffold, carried: Scaffold, windows: Windows, offsets: Tensor, background: Tensor,
-               settings: DynamicSettings, *, reach: float, seed: int, progress: Callable[[int], None] | None = None) -> Motion:
+def fit_motion(
+    scaffold: Scaffold,
+    carried: Scaffold,
+    windows: Windows,
+    offsets: Tensor,
+    background: Tensor,
+    settings: DynamicSettings,
+    *,
+    reach: float,
+    seed: int,
+    progress: Callable[[int], None] | None = None,
+) -> Motion:
     """Motion through all frames of `windows`.
 
     scaffold: the N filled particles; carried: the Gaussians that are rendered, the particles themselves or the static Gaussians,
@@ -161,21 +187,35 @@ def fit_motion(scaffold: Scaffold, carried: Scaffold, windows: Windows, offsets:
     if settings.model == "modes":
         motion = ModalMotion(offsets, scaffold.modes.energy, reach=reach, free_shape=settings.free_shape)
         objective = _Objective(motion, carried, scaffold, background, settings)
-        half = windows.halved()
         for t in moving:
             with torch.no_grad():
                 motion.amplitude[t] = motion.amplitude[t - 1]
             # a fresh optimiser per frame: frames without a gradient and without momentum stay where they are
             optimizer = UniformAdam(motion.parameters(), lr=settings.lr_track, betas=(0.8, 0.95))
-            _minimise(objective, optimizer, [t], half, settings.track_iterations, settings.track_views, settings.lr_track, generator,
-                      progress)
+            _minimise(
+                objective,
+                optimizer,
+                [t],
+                windows,
+                settings.track_iterations,
+                settings.track_views,
+                settings.lr_track,
+                generator,
+                progress,
+            )
         rate, optimizer = settings.lr, UniformAdam(motion.parameters(), lr=settings.lr)
     else:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            motion = MotionBasisNetwork(offsets, centre=scaffold.splats.means.mean(0), reach=reach, bases=settings.bases,
-                                        hidden=settings.hidden, basis_layers=settings.basis_layers,
-                                        coefficient_layers=settings.coefficient_layers).to(background.device)
+            motion = MotionBasisNetwork(
+                offsets,
+                centre=scaffold.splats.means.mean(0),
+                reach=reach,
+                bases=settings.bases,
+                hidden=settings.hidden,
+                basis_layers=settings.basis_layers,
+                coefficient_layers=settings.coefficient_layers,
+            ).to(background.device)
         objective = _Objective(motion, carried, scaffold, background, settings)
         rate = settings.lr_network
         optimizer = torch.optim.Adam(motion.parameters(), lr=rate, betas=(0.9, 0.99), eps=1e-12)

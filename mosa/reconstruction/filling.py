@@ -71,10 +71,10 @@ def body_volume(volume: Volume, *, threshold: float = 0.5) -> float:
     return float(_body(volume, threshold).sum()) * volume.pitch**3
 
 
-def fill(volume: Volume, *, spacing: float, threshold: float = 0.5, smallest_part: float = 0.5) -> Particles:
+def fill(volume: Volume, *, spacing: float, threshold: float = 0.5, smallest_part: float = 0.25) -> Particles:
     """Particles on a lattice of `spacing` [m] inside the 0.5 level of an occupancy volume (pitch well below the spacing).
 
-    A lattice cell filled by at least `smallest_part` holds a particle. Each voxel of the body belongs to the particle of its
+    The fullest cells hold a particle each, as many as volume / spacing^3, but none filled by less than `smallest_part`. Each voxel of the body belongs to the particle of its
     cell or, where that has none, to the nearest one; a particle's volume is that of its voxels and it sits at their centroid: so
     total volume, centre of mass and, nearly, moments of inertia are those of the body, and the interior is a regular lattice.
     Cells of features thinner than the lattice keep a particle of their own. Raises DataError for an empty volume.
@@ -88,10 +88,11 @@ def fill(volume: Volume, *, spacing: float, threshold: float = 0.5, smallest_par
     shape = cell.max(0) - low + 1
     flat = np.ravel_multi_index((cell - low).T, shape)
     count = np.bincount(flat, minlength=int(shape.prod()))
+    # the fullest cells, as many as the volume holds: so a particle's mean volume is spacing^3 for thin bodies too
+    wanted = max(1, round(len(voxels) * (volume.pitch / spacing) ** 3))
     full = (spacing / volume.pitch) ** 3
-    kept = count >= smallest_part * full
-    if not kept.any():
-        kept = count == count.max()
+    smallest = max(np.partition(count, -min(wanted, len(count)))[-min(wanted, len(count))], smallest_part * full)
+    kept = count >= smallest
     thin = np.flatnonzero((count >= 0.2 * full) & ~kept)
     to_cell = lambda i: np.stack(np.unravel_index(i, shape), -1)  # noqa: E731
     if len(thin):

@@ -28,7 +28,6 @@ class Modes:
     gradient: Tensor
     energy: Tensor
 
-
     def at(self, points: Tensor, rest: Tensor, *, neighbours: int = 8) -> Modes:
         """The same modes at other points (M, 3) [m]: first-order expansions around the nearest particles, blended by distance.
 
@@ -62,9 +61,11 @@ def bending_matrix(around: Neighbourhood) -> sparse.csr_matrix:
     rows = np.arange(particles * count).reshape(particles, count)
     entries = sparse.coo_matrix(
         ((root[..., None] * coupling).ravel(), (np.repeat(rows.ravel(), count), np.repeat(index, count, 0).ravel())),
-        shape=(particles * count, particles))
-    diagonal = sparse.coo_matrix(((root * own).ravel(), (rows.ravel(), np.repeat(np.arange(particles), count))),
-                                 shape=entries.shape)
+        shape=(particles * count, particles),
+    )
+    diagonal = sparse.coo_matrix(
+        ((root * own).ravel(), (rows.ravel(), np.repeat(np.arange(particles), count))), shape=entries.shape
+    )
     residual = (entries + diagonal).tocsr()
     return (residual.T @ residual).tocsr()
 

@@ -30,8 +30,15 @@ def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
     """Hamilton product of quaternions (..., 4) wxyz."""
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
-    return torch.stack([aw * bw - ax * bx - ay * by - az * bz, aw * bx + ax * bw + ay * bz - az * by,
-                        aw * by - ax * bz + ay * bw + az * bx, aw * bz + ax * by - ay * bx + az * bw], -1)
+    return torch.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        -1,
+    )
 
 
 def shape_covariances(scales: Tensor, rotations: Tensor) -> Tensor:
@@ -48,7 +55,9 @@ class ModalMotion(nn.Module):
     offsets: (T, 3) [m] first guess of the translation of each frame.
     """
 
-    def __init__(self, offsets: Tensor, energies: Tensor, *, reach: float, softness: float = 10.0, free_shape: bool = False) -> None:
+    def __init__(
+        self, offsets: Tensor, energies: Tensor, *, reach: float, softness: float = 10.0, free_shape: bool = False
+    ) -> None:
         super().__init__()
         frames, count = len(offsets), len(energies)
         self.reach = reach
@@ -84,8 +93,9 @@ class ModalMotion(nn.Module):
         shape = modes.values @ (moving * self.shape_amplitude[frames] * self.turn[:, None])
         scales = splats.scales * shape[..., :3].exp()
         half = 0.5 * shape[..., 3:]
-        rotations = quaternion_product(torch.cat([torch.ones_like(half[..., :1]), half], -1),
-                                       splats.rotations.expand(len(frames), -1, -1))
+        rotations = quaternion_product(
+            torch.cat([torch.ones_like(half[..., :1]), half], -1), splats.rotations.expand(len(frames), -1, -1)
+        )
         rotations = nn.functional.normalize(rotations, dim=-1)
         return MotionSample(positions, shape_covariances(scales, rotations), deformation, scales, rotations)
 
@@ -113,8 +123,19 @@ class MotionBasisNetwork(nn.Module):
     time to a number. The value at t = 0 is subtracted, so that frame 0 is the rest frame. Gaussians have free scale and rotation.
     """
 
-    def __init__(self, offsets: Tensor, *, centre: Tensor, reach: float, bases: int = 10, hidden: int = 256, basis_layers: int = 8,
-                 coefficient_layers: int = 3, space_frequencies: int = 4, time_frequencies: int = 5) -> None:
+    def __init__(
+        self,
+        offsets: Tensor,
+        *,
+        centre: Tensor,
+        reach: float,
+        bases: int = 10,
+        hidden: int = 256,
+        basis_layers: int = 8,
+        coefficient_layers: int = 3,
+        space_frequencies: int = 4,
+        time_frequencies: int = 5,
+    ) -> None:
         super().__init__()
         self.register_buffer("offsets", offsets - offsets[0])
         self.register_buffer("centre", centre)

@@ -27,15 +27,21 @@ class Windows:
 
     def select(self, chosen: Tensor) -> Windows:
         """The windows at `chosen`, a long tensor of indices."""
-        return Windows(self.images[chosen], self.mattes[chosen], self.cameras.select(chosen.tolist()), self.view[chosen],
-                       self.frame[chosen])
+        return Windows(
+            self.images[chosen],
+            self.mattes[chosen],
+            self.cameras.select(chosen.tolist()),
+            self.view[chosen],
+            self.frame[chosen],
+        )
 
     def of_frame(self, frame: int) -> Windows:
         return self.select((self.frame == frame).nonzero()[:, 0])
 
     def to(self, device: torch.device | str) -> Windows:
-        return Windows(self.images.to(device), self.mattes.to(device), self.cameras.to(device), self.view.to(device),
-                       self.frame.to(device))
+        return Windows(
+            self.images.to(device), self.mattes.to(device), self.cameras.to(device), self.view.to(device), self.frame.to(device)
+        )
 
     def halved(self) -> Windows:
         """The same windows at half the resolution (mean of 2 x 2 pixels)."""
@@ -78,8 +84,12 @@ def object_windows(scene: Scene, views: list[int], frames: list[int], *, margin:
     pad = max(width, height)
     mattes = F.pad(mattes, (pad, pad, pad, pad))
     images = torch.stack([F.pad(images[..., c], (pad, pad, pad, pad), value=float(scene.background[c])) for c in range(3)], -1)
-    cut = lambda a: torch.stack([a[b, y + pad : y + pad + height, x + pad : x + pad + width]  # noqa: E731
-                                 for b, (x, y) in enumerate(zip(x0.tolist(), y0.tolist()))])
+    cut = lambda a: torch.stack(
+        [
+            a[b, y + pad : y + pad + height, x + pad : x + pad + width]  # noqa: E731
+            for b, (x, y) in enumerate(zip(x0.tolist(), y0.tolist()))
+        ]
+    )
     K = scene.cameras.K[view].clone()
     K[:, 0, 2] -= x0
     K[:, 1, 2] -= y0

@@ -36,8 +36,8 @@ class ReconstructionSettings:
     front of the static Gaussians' depth by more than carve_tolerance [spacings]; points: static Gaussians; neighbours: of the
     least-squares deformation; cue: neighbourhood | gaussian (method.md, section 7); margin: px of the windows around mattes."""
 
-    resolution: int = 64
-    ridge_passes: int = 16
+    resolution: int = 80
+    ridge_passes: int = 24
     carve: bool = False
     carve_tolerance: float = 0.75
     points: int = 3000
@@ -53,8 +53,10 @@ class ReconstructionSettings:
             raise ConfigError(f"reconstruction.cue: expected neighbourhood or gaussian, found {self.cue!r}")
         free = self.dynamic.free_shape or self.dynamic.model == "network"
         if self.cue == "gaussian" and not free:
-            raise ConfigError("reconstruction.cue=gaussian reads the Gaussians' own scale and rotation: set "
-                              "reconstruction.dynamic.free_shape=true or reconstruction.dynamic.model=network")
+            raise ConfigError(
+                "reconstruction.cue=gaussian reads the Gaussians' own scale and rotation: set "
+                "reconstruction.dynamic.free_shape=true or reconstruction.dynamic.model=network"
+            )
 
 
 def _section(cls: type, values: Mapping[str, Any], where: str) -> Any:
@@ -87,7 +89,11 @@ def object_hull(scene: Scene, settings: ReconstructionSettings) -> Volume:
     bounds = hull_bounds(mattes, cameras, scene.box)
     pitch = float((bounds[1] - bounds[0]).max()) / settings.resolution
     hull = visual_hull(mattes, cameras, scene.box, pitch=pitch)
-    return shave_ridges(hull, cameras, passes=settings.ridge_passes) if settings.ridge_passes else hull
+    return (
+        shave_ridges(hull, cameras, passes=settings.ridge_passes, sigma=settings.resolution / 40)
+        if settings.ridge_passes
+        else hull
+    )
 
 
 def spacing_for(scene: Scene, particles: int, settings: ReconstructionSettings | None = None) -> float:
@@ -142,22 +148,38 @@ def _tensors(splats: Splats) -> dict[str, Tensor]:
 def _render_still(splats: Splats, windows: Windows, background: Tensor) -> Tensor:
     state = torch.zeros(len(windows), dtype=torch.long, device=background.device)
     with torch.no_grad():
-        return rasterize(splats.means[None], isotropic_covariances(splats.scales.mean(1))[None], splats.opacities,
-                         splats.colors[None], windows.cameras, state, background)[0]
+        return rasterize(
+            splats.means[None],
+            isotropic_covariances(splats.scales.mean(1))[None],
+            splats.opacities,
+            splats.colors[None],
+            windows.cameras,
+            state,
+            background,
+        )[0]
 
 
 def fill_body(hull: Volume, static: Splats, windows: Windows, settings: ReconstructionSettings, spacing: float) -> Particles:
     """Particles inside the hull, after carving by the static Gaussians' depth where asked for."""
     if settings.carve:
         state = torch.zeros(len(windows), dtype=torch.long, device=static.means.device)
-        depth, alpha = expected_depth(static.means[None], isotropic_covariances(static.scales.mean(1))[None], static.opacities,
-                                      windows.cameras, state)
+        depth, alpha = expected_depth(
+            static.means[None], isotropic_covariances(static.scales.mean(1))[None], static.opacities, windows.cameras, state
+        )
         hull = carve(hull, depth, alpha, windows.cameras, tolerance=settings.carve_tolerance * spacing)
     return fill(hull, spacing=spacing)
 
 
-def reconstruct(scene: Scene, *, settings: ReconstructionSettings, spacing: float, cache_dir: str | Path | None, seed: int = 0,
-                device: torch.device | str = "cpu", progress: bool = True) -> Reconstruction:
+def reconstruct(
+    scene: Scene,
+    *,
+    settings: ReconstructionSettings,
+    spacing: float,
+    cache_dir: str | Path | None,
+    seed: int = 0,
+    device: torch.device | str = "cpu",
+    progress: bool = True,
+) -> Reconstruction:
     """Particles at frame 0 with their appearance, and their motion through the training frames, from images alone.
 
     scene: only its training cameras and training frames are read, never its truth. spacing [m] of the particles; cache_dir: root
@@ -167,8 +189,17 @@ def reconstruct(scene: Scene, *, settings: ReconstructionSettings, spacing: floa
     if spacing <= 0:
         raise ConfigError(f"reconstruct: spacing must be positive, found {spacing}")
     views, frames = scene.training_cameras, scene.training_frames
-    key = {"version": CACHE_VERSION, "scene": f"{scene.name}-{scene.sequence}", "data": scene.fingerprint, "views": views,
-           "frames": frames, "spacing": spacing, "seed": seed, "settings": asdict(settings), "box": scene.box.tolist()}
+    key = {
+        "version": CACHE_VERSION,
+        "scene": f"{scene.name}-{scene.sequence}",
+        "data": scene.fingerprint,
+        "views": views,
+        "frames": frames,
+        "spacing": spacing,
+        "seed": seed,
+        "settings": asdict(settings),
+        "box": scene.box.tolist(),
+    }
     cache = _Cache(Path(cache_dir) if cache_dir is not None else None, key)
     hull = Volume(**cache.stage("hull", lambda: _volume_tensors(object_hull(scene, settings))))
     windows = object_windows(scene, views, frames, margin=settings.margin).to(device)
@@ -225,12 +256,26 @@ def scaffold_splats(particles: Particles, static: Splats, device: torch.device |
     positions = particles.positions.to(device)
     rotations = torch.zeros(n, 4, device=device)
     rotations[:, 0] = 1
-    return Splats(positions, torch.full((n, 3), 0.35 * particles.spacing, device=device), rotations,
-                  torch.full((n,), 0.8, device=device), inherited_colors(positions, static))
+    return Splats(
+        positions,
+        torch.full((n, 3), 0.35 * particles.spacing, device=device),
+        rotations,
+        torch.full((n,), 0.8, device=device),
+        inherited_colors(positions, static),
+    )
 
 
-def _motion(scene: Scene, splats: Splats, static: Splats, windows: Windows, background: Tensor, settings: ReconstructionSettings, seed: int,
-            bar: Callable[[str, int], tqdm], cache: _Cache) -> dict[str, Tensor]:
+def _motion(
+    scene: Scene,
+    splats: Splats,
+    static: Splats,
+    windows: Windows,
+    background: Tensor,
+    settings: ReconstructionSettings,
+    seed: int,
+    bar: Callable[[str, int], tqdm],
+    cache: _Cache,
+) -> dict[str, Tensor]:
     """Positions, covariances and, where free, shapes of the particles in every training frame."""
     views, frames = scene.training_cameras, scene.training_frames
     cameras, dynamic = scene.cameras.select(views), settings.dynamic
@@ -243,12 +288,20 @@ def _motion(scene: Scene, splats: Splats, static: Splats, windows: Windows, back
     if dynamic.carriers == "static":
         carried = Scaffold(static, modes.at(static.means, splats.means))
     with bar("motion", total) as steps:
-        motion = fit_motion(scaffold, carried, windows, centres, background, dynamic, reach=reach, seed=seed,
-                            progress=steps.update)
+        motion = fit_motion(
+            scaffold, carried, windows, centres, background, dynamic, reach=reach, seed=seed, progress=steps.update
+        )
     with torch.no_grad():
         sample = motion(torch.arange(len(frames), device=splats.means.device), splats, modes, around)
-        rendered = rasterize(sample.positions, sample.covariances, splats.opacities, splats.colors[None], windows.cameras,
-                             windows.frame, background)[0]
+        rendered = rasterize(
+            sample.positions,
+            sample.covariances,
+            splats.opacities,
+            splats.colors[None],
+            windows.cameras,
+            windows.frame,
+            background,
+        )[0]
     cache.strip("motion", windows, rendered, columns=12)
     result = {"positions": sample.positions, "covariances": sample.covariances}
     if sample.scales is not None:

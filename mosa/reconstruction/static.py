@@ -114,8 +114,13 @@ def initial_splats(volume: Volume, windows: Windows, *, count: int, seed: int) -
     n = len(points)
     rotations = torch.zeros(n, 4, device=device)
     rotations[:, 0] = 1
-    return Splats(points, torch.full((n, 3), 0.6 * spacing, device=device), rotations,
-                  torch.full((n,), 0.7, device=device), projected_colors(points, normals, windows))
+    return Splats(
+        points,
+        torch.full((n, 3), 0.6 * spacing, device=device),
+        rotations,
+        torch.full((n,), 0.7, device=device),
+        projected_colors(points, normals, windows),
+    )
 
 
 def inherited_colors(points: Tensor, splats: Splats, *, neighbours: int = 4) -> Tensor:
@@ -146,8 +151,16 @@ def _relocate(parameters: dict[str, Tensor], optimizer: torch.optim.Adam, genera
     parameters["means"].data[dead] += noise * 0.5 * parameters["log_scale"].data[dead].exp()[:, None]
 
 
-def fit_splats(splats: Splats, windows: Windows, background: Tensor, settings: FitSettings, *, move: bool, seed: int,
-               progress: Callable[[int], None] | None = None) -> Splats:
+def fit_splats(
+    splats: Splats,
+    windows: Windows,
+    background: Tensor,
+    settings: FitSettings,
+    *,
+    move: bool,
+    seed: int,
+    progress: Callable[[int], None] | None = None,
+) -> Splats:
     """Isotropic Gaussians fitted to windows of ONE frame: colours, opacities, scales and, with `move`, positions."""
     generator = torch.Generator().manual_seed(seed)
     scale0 = splats.scales.mean(1)
@@ -158,11 +171,16 @@ def fit_splats(splats: Splats, windows: Windows, background: Tensor, settings: F
         "opacity": torch.logit(splats.opacities.clamp(0.01, 0.99)),
         "color": torch.logit(splats.colors.clamp(0.01, 0.99)),
     }
-    rates = {"means": settings.lr_positions * unit, "log_scale": settings.lr_scales, "opacity": settings.lr_opacities,
-             "color": settings.lr_colors * 4}
+    rates = {
+        "means": settings.lr_positions * unit,
+        "log_scale": settings.lr_scales,
+        "opacity": settings.lr_opacities,
+        "color": settings.lr_colors * 4,
+    }
     learned = {name: p.requires_grad_(True) for name, p in parameters.items() if move or name != "means"}
-    optimizer = torch.optim.Adam([{"params": [p], "lr": rates[name], "name": name} for name, p in learned.items()],
-                                 betas=(0.9, 0.99), eps=1e-12)
+    optimizer = torch.optim.Adam(
+        [{"params": [p], "lr": rates[name], "name": name} for name, p in learned.items()], betas=(0.9, 0.99), eps=1e-12
+    )
     start = [group["lr"] for group in optimizer.param_groups]
     order = torch.empty(0, dtype=torch.long)
     lower, upper = (scale0 / 4).log(), (scale0 * settings.largest).log()
@@ -173,20 +191,36 @@ def fit_splats(splats: Splats, windows: Windows, background: Tensor, settings: F
         for group, rate in zip(optimizer.param_groups, start):
             group["lr"] = rate * (0.55 + 0.45 * math.cos(math.pi * step / settings.iterations))
         scale = parameters["log_scale"].exp()
-        image, alpha = rasterize(parameters["means"][None], isotropic_covariances(scale)[None],
-                                 torch.sigmoid(parameters["opacity"]), torch.sigmoid(parameters["color"])[None],
-                                 batch.cameras, torch.zeros(len(batch), dtype=torch.long, device=background.device), background)
+        image, alpha = rasterize(
+            parameters["means"][None],
+            isotropic_covariances(scale)[None],
+            torch.sigmoid(parameters["opacity"]),
+            torch.sigmoid(parameters["color"])[None],
+            batch.cameras,
+            torch.zeros(len(batch), dtype=torch.long, device=background.device),
+            background,
+        )
         loss = image_loss(image, alpha, batch, ssim_weight=settings.ssim, matte_weight=settings.matte)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
         with torch.no_grad():
             parameters["log_scale"].clamp_(lower, upper)
-            if move and settings.relocate_every and step and step % settings.relocate_every == 0 \
-                    and step < 0.8 * settings.iterations:
+            if (
+                move
+                and settings.relocate_every
+                and step
+                and step % settings.relocate_every == 0
+                and step < 0.8 * settings.iterations
+            ):
                 _relocate(parameters, optimizer, generator)
         if progress is not None:
             progress(1)
     with torch.no_grad():
-        return Splats(parameters["means"].detach(), parameters["log_scale"].exp()[:, None].repeat(1, 3),
-                      splats.rotations, torch.sigmoid(parameters["opacity"]), torch.sigmoid(parameters["color"]))
+        return Splats(
+            parameters["means"].detach(),
+            parameters["log_scale"].exp()[:, None].repeat(1, 3),
+            splats.rotations,
+            torch.sigmoid(parameters["opacity"]),
+            torch.sigmoid(parameters["color"]),
+        )

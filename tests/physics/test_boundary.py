@@ -44,8 +44,8 @@ UP = (0.0, 1.0, 0.0)
     ],
 )
 def test_modes(mode, friction, u, expected):
-    r, _ = run(torch.tensor([u]).double(), UP, mode, friction)
-    torch.testing.assert_close(r, torch.tensor([expected]).double(), rtol=0, atol=1e-15)
+    r, _ = run(torch.tensor([u], dtype=torch.float64), UP, mode, friction)
+    torch.testing.assert_close(r, torch.tensor([expected], dtype=torch.float64), rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize("mode, friction", [("sticky", 0.0), ("slip", 0.0), ("separate", 0.0), ("separate", 0.3)])

@@ -22,7 +22,7 @@ def stress(law, F, dtype=torch.float64):
 
 
 def rotation(F):
-    U, S, Vh = torch.linalg.svd(F)
+    U, _, Vh = torch.linalg.svd(F)
     U = torch.cat([U[..., :2], U[..., 2:] * torch.linalg.det(U @ Vh)[:, None, None]], -1)
     return U @ Vh
 
@@ -137,5 +137,5 @@ def test_moduli():
 
 def test_names():
     assert set(LAWS) | {"von_mises", "drucker_prager"} <= set(law_names())
-    with pytest.raises(ConfigError, match="neo_hookean.*found 'mooney'"):
+    with pytest.raises(ConfigError, match=r"neo_hookean.*found 'mooney'"):
         law_named("mooney")

@@ -65,7 +65,9 @@ def test_svd_has_proper_frames_and_signed_values(drawn):
     _, F = drawn
 
     @wp.kernel(module="unique")
-    def factors(F: wp.array(dtype=wp.mat33d), U: wp.array(dtype=wp.mat33d), S: wp.array(dtype=wp.vec3d), V: wp.array(dtype=wp.mat33d)):
+    def factors(
+        F: wp.array(dtype=wp.mat33d), U: wp.array(dtype=wp.mat33d), S: wp.array(dtype=wp.vec3d), V: wp.array(dtype=wp.mat33d)
+    ):  # fmt: skip
         i = wp.tid()
         u, s, v = svd(F[i])
         U[i] = u
@@ -112,9 +114,9 @@ def test_gradient_against_differences(name, drawn):
         dF = dF / torch.linalg.matrix_norm(dF)[:, None, None]
         adj_F, adj_c = run_adjoint(name, F, c, seed)
         assert bool(torch.isfinite(adj_F).all())
-        expected = (seed * directional(lambda s: run(name, F + s * dF, c), h)).sum((1, 2))
-        scale = torch.linalg.matrix_norm(adj_F) * 1.0
-        error = ((adj_F * dF).sum((1, 2)) - expected).abs() / scale.clamp_min(1.0)
+        expected = (seed * directional(lambda s, dF=dF: run(name, F + s * dF, c), h)).sum((1, 2))
+        scale = torch.linalg.matrix_norm(adj_F).clamp_min(1.0)
+        error = ((adj_F * dF).sum((1, 2)) - expected).abs() / scale
         assert error.max() < 1e-6, (name, int(error.argmax()), float(error.max()))
         if name == "contract":
             step = torch.full_like(c, 1e-3)[:, None, None]
@@ -124,6 +126,6 @@ def test_gradient_against_differences(name, drawn):
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_gradient_is_finite_at_the_true_singularity(name):
-    F = torch.stack([torch.diag(torch.tensor(d).double()) for d in ([1.0, 0.5, -0.5], [1.0, 0.0, 0.0], [0.0] * 3, [1, 1, -1.0])])
+    F = torch.diag_embed(torch.tensor([[1.0, 0.5, -0.5], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 1.0, -1.0]]).double())
     adj_F, adj_c = run_adjoint(name, F, torch.full((4,), 0.5).double(), torch.ones(4, 3, 3).double())
     assert bool(torch.isfinite(adj_F).all()) and bool(torch.isfinite(adj_c).all())

@@ -89,7 +89,8 @@ def test_zero_operator_is_the_plain_map_and_gradients(law, adapted, drawn):
     """Gradient in F, the parameters and the operator, also at equal and inverted singular values."""
     names, F = drawn
     # away from the switches: the map has kinks at first yield, at the tip and at the clamp
-    keep = [i for i, name in enumerate(names) if name in ("generic", "large", "inverted", "inverted, equal", "two equal", "dilated")]
+    kept = ("generic", "large", "inverted", "inverted, equal", "two equal", "dilated")
+    keep = [i for i, name in enumerate(names) if name in kept]
     F, names = torch.cat([F[keep], 0.7 * trial(40)]), [names[i] for i in keep] + ["trial"] * 40
     n = len(F)
     generator = torch.Generator().manual_seed(7)

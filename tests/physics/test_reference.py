@@ -34,11 +34,13 @@ def test_twin(law, adapted, make_block):
     leaves = [t.clone().requires_grad_() for t in (state.x, state.v, state.C_affine, state.F)]
     started = ParticleState(*leaves, leaves[3])
     volume = torch.full((n,), 0.02**3, dtype=torch.float64)
-    parameters = {"mu": torch.tensor(MU), "lam": torch.tensor(LAM), **{k: torch.tensor(v) for k, v in EXTRA.get(law, {}).items()}}
-    parameters = {k: v.double().requires_grad_() for k, v in parameters.items()}
+    parameters = {"mu": MU, "lam": LAM, **EXTRA.get(law, {})}
+    parameters = {k: torch.tensor(v, dtype=torch.float64, requires_grad=True) for k, v in parameters.items()}
     operator = drawn_operator(n) if adapted else None
     steps = 4
-    sim = Simulator(law, dx=DX, substeps=steps, frame_dt=steps * DT, gravity=(0.3, -9.8, 0.0), planes=PLANES, dtype=torch.float64)
+    sim = Simulator(
+        law, dx=DX, substeps=steps, frame_dt=steps * DT, gravity=(0.3, -9.8, 0.0), planes=PLANES, dtype=torch.float64
+    )
     rollout = sim.rollout(started, parameters, volume, DENSITY, 2, adapter=(lambda _: operator) if adapted else None,
                           stride=steps, started=True)  # fmt: skip
 
@@ -56,7 +58,8 @@ def test_twin(law, adapted, make_block):
         value, expected = getattr(rollout.final, name).detach(), getattr(twin, name).detach()
         assert (value - expected).abs().max() < 1e-12 * steps * max(1.0, float(expected.abs().max())), name
 
-    weights = {name: torch.randn(getattr(twin, name).shape, generator=torch.Generator().manual_seed(1)).double() for name in names}
+    generator = torch.Generator().manual_seed(1)
+    weights = {name: torch.randn(getattr(twin, name).shape, generator=generator).double() for name in names}
 
     def gradient(final):
         loss = sum((weights[name] * getattr(final, name)).sum() for name in names)

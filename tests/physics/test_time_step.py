@@ -11,7 +11,7 @@ def test_bounds():
     assert wave_speed(4e5, 1000.0) == 20.0
     count = required_substeps(**arguments, v_max=1.0)
     assert courant_number(4e5, 1000.0, 0.02 / count, 0.03) <= 0.6 < courant_number(4e5, 1000.0, 0.02 / (count - 1), 0.03)
-    assert required_substeps(**arguments, v_max=1.0, factor=4.0) == 2 * count - (2 * count * 0.03 * 0.6 > 40 * 0.02 + 0.018)
+    assert required_substeps(**arguments, v_max=1.0, factor=4.0) in (2 * count - 1, 2 * count)
     fast = required_substeps(**arguments, v_max=1e3)
     assert 1e3 * 0.02 / fast <= 0.5 * 0.03 < 1e3 * 0.02 / (fast - 1)
 

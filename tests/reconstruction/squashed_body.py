@@ -72,8 +72,13 @@ def cameras(count: int, size: int) -> Cameras:
         matrix[:3, :3], matrix[:3, 3] = axes, -axes @ (target + 1.2 * back)
         K.append([[2.4 * size, 0, size / 2], [0, 2.4 * size, size / 2], [0, 0, 1]])
         w2c.append(matrix)
-    return Cameras(torch.tensor(np.array(K), dtype=torch.float32), torch.tensor(np.array(w2c), dtype=torch.float32), size, size,
-                   tuple(f"camera_{i}" for i in range(count)))
+    return Cameras(
+        torch.tensor(np.array(K), dtype=torch.float32),
+        torch.tensor(np.array(w2c), dtype=torch.float32),
+        size,
+        size,
+        tuple(f"camera_{i}" for i in range(count)),
+    )
 
 
 def draw(view: Cameras, time: float, last: float, oversample: int = 2) -> tuple[np.ndarray, np.ndarray]:
@@ -99,8 +104,7 @@ def draw(view: Cameras, time: float, last: float, oversample: int = 2) -> tuple[
     image = np.ones((len(rays), 3))
     image[hit] = color(backward(start + depth[hit, None] * rays[hit], time, last))
     blocks = (view.height, oversample, view.width, oversample)
-    return (image.reshape(*blocks, 3).mean((1, 3)).astype(np.float32),
-            hit.reshape(blocks).mean((1, 3)).astype(np.float32))
+    return (image.reshape(*blocks, 3).mean((1, 3)).astype(np.float32), hit.reshape(blocks).mean((1, 3)).astype(np.float32))
 
 
 def make_scene(*, views: int = 8, frames: int = 8, size: int = 96, frame_dt: float = 0.02) -> Scene:
@@ -116,6 +120,20 @@ def make_scene(*, views: int = 8, frames: int = 8, size: int = 96, frame_dt: flo
     positions = np.stack([forward(rest, t, times[-1]) for t in times])
     as_tensor = lambda a: torch.as_tensor(a, dtype=torch.float32)  # noqa: E731
     truth = Truth(as_tensor(rest), as_tensor(positions), torch.eye(3), as_tensor([0.3, -1.6, 0.0]))
-    return Scene("squashed_body", "train", images, mattes, rig, as_tensor(times), as_tensor([0, -9.8, 0]),
-                 as_tensor([0, 1.0, 0]), Ground(0.0), as_tensor([[-0.5, 0.0, -0.5], [0.5, 0.6, 0.5]]), 1000.0, torch.ones(3),
-                 True, truth=truth, fingerprint=f"squashed_body-{views}-{frames}-{size}")
+    return Scene(
+        "squashed_body",
+        "train",
+        images,
+        mattes,
+        rig,
+        as_tensor(times),
+        as_tensor([0, -9.8, 0]),
+        as_tensor([0, 1.0, 0]),
+        Ground(0.0),
+        as_tensor([[-0.5, 0.0, -0.5], [0.5, 0.6, 0.5]]),
+        1000.0,
+        torch.ones(3),
+        True,
+        truth=truth,
+        fingerprint=f"squashed_body-{views}-{frames}-{size}",
+    )

@@ -38,9 +38,9 @@ class Footage:
     frames: int = 15
     size: int = 320
     fps: float = 50.0
-    field: float = 0.29
-    target: float = 0.205
-    distance: float = 1.5
+    field: float = 0.35
+    target: float = 0.30
+    distance: float = 1.8
     elevations: tuple[float, ...] = (0.16, 0.55, 0.95)
 
 
@@ -53,7 +53,7 @@ class BuiltinObject:
     material: HiddenMaterial
     drops: dict[str, Drop]
     footage: Footage = field(default_factory=Footage)
-    spacing: float = 0.005
+    spacing: float = 0.0075
     pitch: float = 0.0025
 
 
@@ -65,8 +65,8 @@ PEANUT = HiddenMaterial(
 
 DROPS = {
     "train": Drop(speed=2.5),
-    "test_60": Drop(speed=2.5, axis=(0.3, 0.2, 1.0), degrees=60.0, offset=(0.012, -0.008)),
-    "test_40": Drop(speed=3.2, axis=(1.0, 0.4, 0.2), degrees=40.0, offset=(-0.010, 0.010)),
+    "test_60": Drop(speed=2.5, axis=(0.3, 0.2, 1.0), degrees=60.0, offset=(-0.035, -0.010)),
+    "test_40": Drop(speed=3.2, axis=(1.0, 0.4, 0.2), degrees=40.0, offset=(-0.010, 0.030)),
 }
 
 OBJECTS = {
@@ -76,7 +76,7 @@ OBJECTS = {
     "tiny": BuiltinObject(
         "rabbit", 0.25, RABBIT,
         {name: Drop(d.speed, d.axis, d.degrees, d.offset, contact=0.032) for name, d in DROPS.items()},
-        Footage(cameras=6, frames=5, size=128, field=0.23, target=0.15), spacing=0.0125, pitch=0.006,
+        Footage(cameras=6, frames=5, size=128, field=0.25, target=0.165), spacing=0.0125, pitch=0.006,
     ),
 }  # fmt: skip
 

@@ -89,53 +89,55 @@ def coat(points: np.ndarray, rng: np.random.Generator, base, first, second, *, p
 
 # --- rabbit ---------------------------------------------------------------------------------------------------------------
 
-LEFT_EAR = ((0.030, 0.178, 0.020), (0.010, 0.237, 0.036))
-RIGHT_EAR = ((0.030, 0.178, -0.020), (-0.014, 0.226, -0.054))
+LEFT_EAR = ((0.018, 0.180, 0.030), (0.004, 0.227, 0.045))
+RIGHT_EAR = ((0.018, 0.180, -0.030), (-0.014, 0.217, -0.058))
 
 
 def ear(points: np.ndarray, start, end, margin: float = 0.0) -> np.ndarray:
-    """A leaf: narrow at the head, widest past the middle, `margin` [m] wider all round."""
-    middle = np.add(0.45 * np.array(start), 0.55 * np.array(end))
-    return np.minimum(
-        capsule(points, start, middle, 0.0135 + margin, 0.0195 + margin), capsule(points, middle, end, 0.0195 + margin, 0.0130 + margin)
-    )
+    """A leaf: narrower at the head, widest half way, `margin` [m] wider all round."""
+    middle = np.add(start, end) / 2
+    lower = capsule(points, start, middle, 0.0205 + margin, 0.0255 + margin)
+    return np.minimum(lower, capsule(points, middle, end, 0.0255 + margin, 0.0200 + margin))
 
 
 def rabbit_distance(points: np.ndarray) -> np.ndarray:
-    """A sitting rabbit, 0.25 m from feet to ear tip: body, haunches, feet, paws, chest, head, ears of unequal pose, tail."""
+    """A sitting rabbit, 0.25 m from feet to ear tip: body, haunches, feet, paws, head, ears of unequal pose, tail.
+
+    Stout: every part is at least two cells of a learner's grid (0.02 m) thick, so that its law and not its grid decides.
+    """
     both = mirrored(points)
-    body = ellipsoid(points, (-0.012, 0.074, 0.0), (0.074, 0.066, 0.058))
-    body = join(body, sphere(points, (0.034, 0.092, 0.0), 0.046), 0.03)
-    body = join(body, ellipsoid(both, (-0.032, 0.050, 0.042), (0.046, 0.044, 0.029)), 0.012)
-    body = join(body, sphere(points, (-0.092, 0.058, 0.0), 0.024), 0.012)
-    feet = capsule(both, (-0.005, 0.0175, 0.046), (0.052, 0.0155, 0.043), 0.0175, 0.0155)
-    paws = capsule(both, (0.044, 0.078, 0.024), (0.068, 0.0150, 0.019), 0.018, 0.0150)
-    body = join(join(body, feet, 0.015), paws, 0.012)
-    head = join(ellipsoid(points, (0.050, 0.150, 0.0), (0.046, 0.040, 0.041)), sphere(both, (0.082, 0.139, 0.010), 0.018), 0.016)
-    body = join(body, head, 0.022)
+    body = ellipsoid(points, (-0.012, 0.080, 0.0), (0.092, 0.080, 0.080))
+    body = join(body, ellipsoid(both, (-0.030, 0.045, 0.052), (0.052, 0.045, 0.038)), 0.020)
+    body = join(body, sphere(points, (-0.108, 0.062, 0.0), 0.026), 0.014)
+    feet = capsule(both, (0.000, 0.022, 0.054), (0.060, 0.020, 0.048), 0.022, 0.020)
+    paws = capsule(both, (0.050, 0.085, 0.032), (0.078, 0.040, 0.026), 0.024, 0.020)
+    body = join(join(body, feet, 0.020), paws, 0.016)
+    head = join(ellipsoid(points, (0.036, 0.145, 0.0), (0.062, 0.052, 0.058)), sphere(both, (0.080, 0.132, 0.012), 0.024), 0.020)
+    body = join(body, head, 0.030)
     for start, end in (LEFT_EAR, RIGHT_EAR):
-        body = join(body, ear(points, start, end), 0.012)
+        body = join(body, ear(points, start, end), 0.016)
     return body
 
 
 def rabbit_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """A spotted coat; white muzzle, chest, feet and tail; pink nose and inner ears; one dark ear."""
     both = mirrored(points)
-    color = coat(points, rng, (0.90, 0.78, 0.60), (0.76, 0.42, 0.20), (0.33, 0.20, 0.14), patch=0.10, grain=0.026)
+    color = coat(points, rng, (0.90, 0.78, 0.60), (0.76, 0.42, 0.20), (0.33, 0.20, 0.14), patch=0.10, grain=0.028)
     white, pink = (0.97, 0.94, 0.90), (0.93, 0.56, 0.56)
-    tip = waves(points, rng, 0.03) * 0.002
+    edge = waves(points, rng, 0.03) * 0.002
     for part in (
-        sphere(points, (0.098, 0.134, 0.0), 0.024), sphere(points, (-0.094, 0.058, 0.0), 0.026),
-        sphere(points, (0.076, 0.088, 0.0), 0.030), capsule(both, (0.04, 0.012, 0.045), (0.075, 0.010, 0.03), 0.022),
+        sphere(points, (0.100, 0.126, 0.0), 0.030), sphere(points, (-0.110, 0.062, 0.0), 0.029),
+        sphere(points, (0.088, 0.084, 0.0), 0.032), capsule(both, (0.05, 0.016, 0.05), (0.09, 0.014, 0.04), 0.026),
+        sphere(both, (0.090, 0.040, 0.026), 0.020),
     ):  # fmt: skip
-        color = blend(color, white, step(-(part + tip), 0.0, 0.006))
-    color = blend(color, (0.30, 0.18, 0.13), step(-ear(points, *RIGHT_EAR, margin=0.003), 0.0, 0.008))
+        color = blend(color, white, step(-(part + edge), 0.0, 0.006))
+    color = blend(color, (0.30, 0.18, 0.13), step(-ear(points, *RIGHT_EAR, margin=0.004), 0.0, 0.008))
     for start, end in (LEFT_EAR, RIGHT_EAR):
-        front = np.array([0.016, 0.004, 0.0])
-        color = blend(color, pink, step(-ear(points, np.add(start, front), np.add(end, front), margin=-0.007), 0.0, 0.005))
-    color = blend(color, pink, step(-sphere(points, (0.102, 0.146, 0.0), 0.0085), 0.0, 0.004))
-    color = blend(color, (0.07, 0.05, 0.05), step(-sphere(both, (0.078, 0.161, 0.031), 0.0098), 0.0, 0.003))
-    color = blend(color, (1.0, 1.0, 1.0), step(-sphere(both, (0.0845, 0.1655, 0.0335), 0.0036), 0.0, 0.002))
+        front = np.array([0.020, 0.004, 0.0])
+        color = blend(color, pink, step(-ear(points, np.add(start, front), np.add(end, front), margin=-0.008), 0.0, 0.006))
+    color = blend(color, pink, step(-sphere(points, (0.105, 0.141, 0.0), 0.0110), 0.0, 0.004))
+    color = blend(color, (0.07, 0.05, 0.05), step(-sphere(both, (0.080, 0.162, 0.040), 0.0125), 0.0, 0.004))
+    color = blend(color, (1.0, 1.0, 1.0), step(-sphere(both, (0.0875, 0.1685, 0.0405), 0.0045), 0.0, 0.002))
     return np.clip(color, 0.02, 1.0)
 
 
@@ -163,6 +165,6 @@ def peanut_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 SHAPES = {
-    "rabbit": Shape(rabbit_distance, rabbit_color, np.array([[-0.13, -0.01, -0.085], [0.12, 0.27, 0.085]])),
+    "rabbit": Shape(rabbit_distance, rabbit_color, np.array([[-0.15, -0.01, -0.10], [0.13, 0.27, 0.10]])),
     "peanut": Shape(peanut_distance, peanut_color, np.array([[-0.09, -0.01, -0.09], [0.10, 0.28, 0.09]])),
 }

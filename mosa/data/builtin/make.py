@@ -1,0 +1,141 @@
+"""Making a built-in sequence once: simulate, carry the surface along, film it, and keep the result on disk."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from mosa.data.builtin.drop import simulate
+from mosa.data.builtin.objects import OBJECTS, BuiltinObject, drop_named, object_named
+from mosa.data.builtin.renderer import render_surface, ring_of_cameras
+from mosa.data.builtin.shapes import SHAPES
+from mosa.data.builtin.surface import bind, extract_surface, fill
+from mosa.errors import ConfigError
+from mosa.types import Cameras
+
+# part of the key of a cached sequence: raise it whenever what is made changes
+VERSION = 1
+TRUTH_PARTICLES = 8000
+
+
+@dataclass(frozen=True)
+class Take:
+    """A filmed sequence. pictures: (V, T, H, W, 4) uint8, straight alpha; rest: (M, 3), positions: (T, M, 3) [m] of at most 8000
+    of the truth's particles; rotation: (3, 3); velocity: (3,) [m/s]."""
+
+    pictures: np.ndarray
+    rest: np.ndarray
+    positions: np.ndarray
+    rotation: np.ndarray
+    velocity: np.ndarray
+
+
+def default_cache() -> Path:
+    """$XDG_CACHE_HOME/mosa or ~/.cache/mosa."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mosa"
+
+
+def cameras_of(body: BuiltinObject, seed: int) -> Cameras:
+    """The cameras of an object at its native image size; the seed turns the ring."""
+    film = body.footage
+    turn = float(np.random.default_rng([seed, 7]).uniform(0, 2 * np.pi / film.cameras))
+    return ring_of_cameras(
+        film.cameras, film.size, target=(0.0, film.target, 0.0), distance=film.distance, elevations=film.elevations,
+        field=film.field, turn=turn,
+    )  # fmt: skip
+
+
+def make(
+    name: str, sequence: str, *, material: str = "anisotropic", seed: int = 0, cache: str | Path | None = None, progress: bool = True
+) -> Take:
+    """The take of a sequence, from the cache folder where it lies there. Equal arguments give equal bytes.
+
+    Errors: ConfigError for an unknown name, sequence or material, or a cache folder that cannot be written.
+    """
+    body, drop = object_named(name), drop_named(name, sequence)
+    hidden = body.material.variant(material)
+    key = hashlib.sha256(repr((VERSION, body, hidden, drop, seed)).encode()).hexdigest()[:12]
+    folder = Path(cache) if cache is not None else default_cache()
+    file = folder / "builtin" / f"{name}-{sequence}-{material}-{seed}-{key}.npz"
+    kept = read_take(file)
+    if kept is not None:
+        return kept
+    take = film_drop(name, sequence, material, seed, progress)
+    try:
+        write_take(file, take)
+    except OSError as error:
+        raise ConfigError(f"scene.cache: cannot write {file} ({error.strerror}); choose a folder with scene.cache=") from error
+    return take
+
+
+def film_drop(name: str, sequence: str, material: str, seed: int, progress: bool) -> Take:
+    """Simulate and film, without the cache."""
+    body, drop = OBJECTS[name], drop_named(name, sequence)
+    shape, film = SHAPES[body.shape], body.footage
+    # one generator a purpose: the same texture, lattice and cameras in every sequence and material of a seed
+    surface = extract_surface(shape, body.pitch, np.random.default_rng([seed, 1]))
+    particles = fill(shape, body.spacing, np.random.default_rng([seed, 2]))
+    skin = bind(surface.vertices, particles, body.spacing)
+    label = f"{name}/{sequence} (synthetic, {material})"
+    with tqdm(total=film.frames - 1, desc=f"{label}: simulate", unit="frame", disable=not progress, dynamic_ncols=True) as bar:
+        fall = simulate(
+            body, body.material.variant(material), particles, surface.vertices, drop, body.drops["train"],
+            progress=lambda frame: bar.update(),
+        )  # fmt: skip
+    cameras = cameras_of(body, seed)
+    pictures = [
+        render_surface(surface, skin.follow(x), cameras)
+        for x in tqdm(fall.positions, desc=f"{label}: film", unit="frame", disable=not progress, dynamic_ncols=True)
+    ]
+    chosen = np.sort(np.random.default_rng([seed, 3]).permutation(len(particles))[:TRUTH_PARTICLES])
+    return Take(
+        np.stack(pictures, 1), fall.rest[chosen].astype(np.float32), fall.positions[:, chosen].astype(np.float32), fall.rotation,
+        fall.velocity,
+    )  # fmt: skip
+
+
+def read_take(file: Path) -> Take | None:
+    """A cached take, or None where there is none or a damaged one, which is then made again."""
+    if not file.is_file():
+        return None
+    try:
+        with np.load(file) as stored:
+            return Take(*(stored[n] for n in ("pictures", "rest", "positions", "rotation", "velocity")))
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        print(f"{file}: damaged cache file ({error}); making it again")
+        return None
+
+
+def write_take(file: Path, take: Take) -> None:
+    """Write atomically: a process that is stopped leaves no half file, two that write at once leave one whole."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=file.parent, suffix=".npz")
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            np.savez_compressed(stream, **vars(take))
+        os.replace(temporary, file)
+    finally:
+        Path(temporary).unlink(missing_ok=True)
+
+
+def pictures_to_footage(pictures: np.ndarray, size: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Images (V, T, h, w, 3) on white and mattes (V, T, h, w), area averages of RGBA pictures (V, T, H, W, 4)."""
+    from mosa.data.footage import WHITE
+    from mosa.data.images import composite, resize
+
+    V, T = pictures.shape[:2]
+    images, mattes = np.empty((V, T, size[1], size[0], 3), np.float32), np.empty((V, T, size[1], size[0]), np.float32)
+    for v in range(V):
+        for t in range(T):
+            picture = pictures[v, t].astype(np.float32) / 255
+            images[v, t] = resize(composite(picture[..., :3], picture[..., 3], WHITE), *size)
+            mattes[v, t] = resize(np.ascontiguousarray(picture[..., 3]), *size)
+    return torch.from_numpy(images), torch.from_numpy(mattes)
