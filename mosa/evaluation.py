@@ -32,11 +32,17 @@ class Sequence:
 
 
 @torch.no_grad()
-def rollouts(body: Body, sequence: Sequence, world: World, variants=VARIANTS) -> dict[str, Rollout]:
-    """Every variant's rollout over all frames of `sequence`."""
+def rollouts(body: Body, sequence: Sequence, world: World, variants=VARIANTS) -> tuple[dict[str, Rollout], float | None]:
+    """Every variant's rollout over all frames of `sequence`, and mean |C| of the adapted one (None without an adapter)."""
     scene = sequence.scene
     frame_dt = float(scene.times[1] - scene.times[0])
-    return {v: body.simulate(sequence.start, world, scene.frames, frame_dt, variant=v) for v in variants}
+    sizes: list[float] = []
+    result = {
+        v: body.simulate(sequence.start, world, scene.frames, frame_dt, variant=v,
+                         collect=lambda adapter: sizes.append(float(adapter.statistics().mean_abs_C)))
+        for v in variants
+    }
+    return result, float(np.mean(sizes)) if sizes else None
 
 
 @torch.no_grad()
@@ -101,7 +107,10 @@ def evaluate(body: Body, sequences: list[Sequence], world: World, *, samples: in
     bar = tqdm(total=len(sequences) * len(variants), desc="evaluate", unit="rollout", dynamic_ncols=True)
     for sequence in sequences:
         kept[sequence.prefix] = {}
-        for variant, rollout in rollouts(body, sequence, world, variants).items():
+        simulated, size = rollouts(body, sequence, world, variants)
+        if size is not None:
+            figures[f"{sequence.prefix}/mean_abs_C"] = size
+        for variant, rollout in simulated.items():
             kept[sequence.prefix][variant] = rollout
             figures |= sequence_metrics(body, sequence, rollout, PREFIX[variant], samples, assignment)
             bar.update()

@@ -1,4 +1,4 @@
-"""The way of a run: scene -> reconstruction -> starts -> fit -> figures, rollouts, video. Each stage is cached or resumable."""
+"""The way of a run: scene -> reconstruction -> starts -> fit -> figures, rollouts, video. Stages are cached or resumable."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from mosa.evaluation import Sequence, evaluate, identification, render
 from mosa.modules.body import Body, Start
 from mosa.modules.lit_mosa import LitMosa
 from mosa.reconstruction.starts import first_contact, sequence_start, splats_of
+from mosa.rendering.cameras import crop_boxes, crop_images
 from mosa.rendering.covariance import covariance_from
 from mosa.twin import Twin, save_rollout
 from mosa.types import MotionCues, Reconstruction, Scene
@@ -55,7 +56,8 @@ def reconstruct_scene(cfg: DictConfig, scene: Scene, device: str) -> tuple[Recon
     settings = build_settings(**plain(cfg.reconstruction))
     dx = cfg.simulation.dx
     spacing = dx / 2 if dx is not None else spacing_for(scene, cfg.simulation.particles)
-    reconstruction = reconstruct(scene, settings=settings, spacing=spacing, cache_dir=cache_folder(cfg), seed=cfg.seed, device=device)
+    reconstruction = reconstruct(scene, settings=settings, spacing=spacing, cache_dir=cache_folder(cfg), seed=cfg.seed,
+                                 device=device)
     return reconstruction, 2 * spacing
 
 
@@ -125,7 +127,8 @@ def body_of(reconstruction: Reconstruction, config: dict) -> Body:
     """The body of a reconstruction, with the law and settings of the run."""
     splats = reconstruction.splats
     return build_body(config, {"rest": splats.means, "volume": reconstruction.volume, "colors": splats.colors,
-                               "opacities": splats.opacities, "covariances": covariance_from(splats.scales, splats.rotations)})
+                               "opacities": splats.opacities,
+                               "covariances": covariance_from(splats.scales, splats.rotations)})
 
 
 def fit(cfg, scene, reconstruction, body, start, world, contact, config, folder, device) -> None:
@@ -133,7 +136,8 @@ def fit(cfg, scene, reconstruction, body, start, world, contact, config, folder,
     frames = scene.training_frames
     observations = training_observations(scene, reconstruction, margin=cfg.rendering.margin, device=device)
     cues = reconstruction.cues
-    cues = MotionCues(*(getattr(cues, n)[: len(frames)].to(device) for n in ("positions", "rotation", "stretch", "weight", "covariances")))
+    names = ("positions", "rotation", "stretch", "weight", "covariances")
+    cues = MotionCues(*(getattr(cues, n)[: len(frames)].to(device) for n in names))
     plain_fit = plain(cfg.fit)
     stages = build_stages(plain_fit, heterogeneity=body.heterogeneity is not None, adapter=body.adapter is not None)
     module = LitMosa(body, start=start, world=world, observations=observations, cues=cues,
@@ -164,7 +168,7 @@ def start_figures(start: Start) -> dict[str, float]:
 
 
 def floor_figures(body: Body, evaluated: list[Sequence], world) -> dict[str, float]:
-    """What the true law reaches on the learner's own grid and particles: differences below it mean nothing. Synthetic scenes only."""
+    """What the true law reaches on the learner's own grid and particles, on synthetic scenes: differences below mean nothing."""
     from mosa.data.builtin.floor import floor_rollout
     from mosa.evaluation import motion_metrics, test_means
 
@@ -184,17 +188,23 @@ def write_outputs(folder: Path, cfg: DictConfig, body: Body, evaluated: list[Seq
     (folder / "metrics.json").write_text(json.dumps(dict(sorted(figures.items())), indent=1))
     save_rollout(folder / "rollout.npz", {prefix: variants["adapted"] for prefix, variants in kept.items()})
     if cfg.evaluation.video:
-        shown = evaluated[-1]
-        camera = [(shown.scene.training_cameras or [0])[0]]
-        columns = {"real": shown.scene.images[camera[0]]}
-        for variant, title in (("prior", "prior"), ("adapted", "adapted (MoSA)")):
-            columns[title] = render(body, kept[shown.prefix][variant], shown.scene, camera)[0]
-        frames = side_by_side(columns, enlarge=max(1, round(320 / columns["real"].shape[1])))
+        frames = comparison(body, evaluated[-1], kept[evaluated[-1].prefix])
         write_video(folder / "video.mp4", frames, fps=6)
         write_strip(folder / "strip.png", frames, every=max(1, len(frames) // 5))
     table = results_table(figures) + "\n\n" + parameter_table(figures)
     (folder / "results.md").write_text(table + "\n")
     print(f"\n{table}\n\nrun folder: {folder}")
+
+
+def comparison(body: Body, shown: Sequence, variants: dict, size: int = 320) -> list:
+    """Frames real | prior | adapted from the first camera, cut to where the object goes and enlarged to about `size` px."""
+    scene = shown.scene
+    camera = [(scene.training_cameras or [0])[0]]
+    x0, y0, width, height = crop_boxes(scene.mattes[camera], margin=12)
+    columns = {"real": scene.images[camera]}
+    columns |= {title: render(body, variants[v], scene, camera) for v, title in (("prior", "prior"), ("adapted", "adapted (MoSA)"))}
+    columns = {title: crop_images(images, x0, y0, width, height, axis=2)[0] for title, images in columns.items()}
+    return side_by_side(columns, enlarge=max(1, round(size / max(width, height))))
 
 
 def optimized(figures: dict[str, float], wanted: str) -> float | None:
@@ -227,7 +237,8 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
                      zip(known, (scene, *held_out))]
     else:
         evaluated = sequences(twin.body, scene, held_out, known)
-    figures, kept = evaluate(twin.body, evaluated, twin.world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
+    figures, kept = evaluate(twin.body, evaluated, twin.world, samples=cfg.evaluation.samples,
+                             assignment=cfg.evaluation.assignment)
     figures |= identification(twin.body, scene)
     if cfg.evaluation.floor:
         figures |= floor_figures(twin.body, evaluated, twin.world)

@@ -9,7 +9,16 @@ import numpy as np
 import torch
 
 from mosa.data.footage import (
-    WHITE, Footage, frame_range, matrix, merge_time, number, read_json, same_camera, stack_cameras, world_to_camera,
+    WHITE,
+    Footage,
+    frame_range,
+    matrix,
+    merge_time,
+    number,
+    read_json,
+    same_camera,
+    stack_cameras,
+    world_to_camera,
 )  # fmt: skip
 from mosa.data.images import composite, expect_size, read_image, resize, scaled_size
 from mosa.data.scene import assemble

@@ -1,9 +1,11 @@
 """The redistribution operator: four LU-parametrised 3x3 corrections assembled into one 6x6 operator on Voigt stress.
 
-Steps 2 to 4 of method.md, section 4. vech order: xx, yy, zz, yz, zx, xy.
+Steps 2 to 4 of method.md, section 4; appendix on the microplane parametrisation in the paper. vech order: xx, yy, zz, yz, zx, xy.
 """
 
 from __future__ import annotations
+
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -11,58 +13,101 @@ from torch import Tensor
 XX, YY, ZZ, YZ, ZX, XY = range(6)
 PLANES = ((XX, XY, ZX), (YY, YZ, XY), (ZZ, ZX, YZ))
 """Components of the traction on each microplane: normal first."""
-UPPER = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
-LOWER = [(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)]
+UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+LOWER = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
+"""Places of the 12 numbers of one matrix: upper triangle row by row, then lower."""
 
 
-def _fill(places: list[tuple[int, int]]) -> Tensor:
-    """(6, 9) map from triangle entries to a flat 3x3 matrix."""
-    result = torch.zeros(6, 9)
-    for k, (i, j) in enumerate(places):
-        result[k, 3 * i + j] = 1
-    return result
+@lru_cache(maxsize=16)
+def _triangles(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """(2, 6, 9) maps from the entries of the upper and the lower triangle to a flat 3x3 matrix."""
+    result = torch.zeros(2, 6, 9, dtype=dtype)
+    for which, places in enumerate((UPPER, LOWER)):
+        for k, (i, j) in enumerate(places):
+            result[which, k, 3 * i + j] = 1
+    return result.to(device)
 
 
-def _scatter() -> Tensor:
-    """(27, 36) map from the entries of (I + C_x, I + C_y, I + C_z) to the operator that yields n and the averaged shears."""
-    result = torch.zeros(3, 3, 3, 6, 6)
-    shear_target = {YZ: 0.5, ZX: 0.5, XY: 0.5}  # each shear appears on two planes and is their mean
+@lru_cache(maxsize=16)
+def _placement(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """(27, 36) map from the entries of (C_x, C_y, C_z) to the 6x6 matrix that gives the normals and the averaged shears."""
+    result = torch.zeros(3, 3, 3, 6, 6, dtype=dtype)
     for plane, components in enumerate(PLANES):
         for row, target in enumerate(components):
-            weight = shear_target.get(target, 1.0)
+            weight = 1.0 if target in (XX, YY, ZZ) else 0.5  # each shear appears on two planes and is their mean
             for column, source in enumerate(components):
                 result[plane, row, column, target, source] += weight
-    return result.reshape(27, 36)
+    return result.reshape(27, 36).to(device)
 
 
 def lu_factors(numbers: Tensor) -> tuple[Tensor, Tensor]:
-    """(I + L, I + U), each (..., 3, 3), from (..., 12): upper triangle row by row, then lower."""
-    eye = torch.eye(3, dtype=numbers.dtype, device=numbers.device)
-    upper = (numbers[..., :6] @ _fill(UPPER).to(numbers)).unflatten(-1, (3, 3))
-    lower = (numbers[..., 6:] @ _fill(LOWER).to(numbers)).unflatten(-1, (3, 3))
-    return eye + lower, eye + upper
+    """Entries of the factors, (L, U), each (..., 3, 3), from (..., 12): upper triangle row by row, then lower."""
+    upper, lower = _triangles(numbers.dtype, numbers.device)
+    return (numbers[..., 6:] @ lower).unflatten(-1, (3, 3)), (numbers[..., :6] @ upper).unflatten(-1, (3, 3))
 
 
 def correction(numbers: Tensor) -> Tensor:
-    """I + C = (I + L)(I + U), (..., 3, 3) from (..., 12); det >= (1 - alpha)^6 where all entries are within alpha < 1."""
-    lower, upper = lu_factors(numbers)
-    return lower @ upper
+    """C = (I + L)(I + U) - I, (..., 3, 3) from (..., 12), exactly 0 at 0.
+
+    det(I + C) >= (1 - alpha)^6 where all numbers are within alpha < 1.
+    """
+    L, U = lu_factors(numbers)
+    return L + U + L @ U
 
 
 def plane_operator(planes: Tensor) -> Tensor:
-    """(N, 6, 6) operator T of the three planes (N, 3, 3, 3): T s = (n, averaged shears) (step 3)."""
-    return (planes.flatten(-3) @ _scatter().to(planes)).unflatten(-1, (6, 6))
+    """(N, 6, 6) T - I of the corrections (N, 3, 3, 3) of the three planes: T s = (normals, averaged shears) (step 3)."""
+    return (planes.flatten(-3) @ _placement(planes.dtype, planes.device)).unflatten(-1, (6, 6))
 
 
-def assemble(planes: Tensor, normal: Tensor) -> Tensor:
-    """The whole 6x6 operator: plane operator, then (I + C_xyz) on the normal components (step 4)."""
-    T = plane_operator(planes)
-    return torch.cat([normal @ T[..., :3, :], T[..., 3:, :]], -2)
+def redistribution(planes: Tensor, normal: Tensor) -> Tensor:
+    """(N, 6, 6) A - I: the planes (N, 3, 3, 3), then I + C_xyz, `normal` (N, 3, 3), on the normal components (step 4)."""
+    return with_normal(plane_operator(planes), normal)
 
 
-def stepwise(stress: Tensor, planes: Tensor, normal: Tensor) -> Tensor:
-    """The same on stress (N, 6) without assembling: the paper's order of operations, what tests compare `assemble` with."""
-    t = [(planes[:, k] @ stress[:, list(c), None])[..., 0] for k, c in enumerate(PLANES)]
-    n = (normal @ torch.stack([t[0][:, 0], t[1][:, 0], t[2][:, 0]], -1)[..., None])[..., 0]
-    shear = [0.5 * (t[1][:, 1] + t[2][:, 2]), 0.5 * (t[2][:, 1] + t[0][:, 2]), 0.5 * (t[0][:, 1] + t[1][:, 2])]
-    return torch.cat([n, torch.stack(shear, -1)], -1)
+def with_normal(T: Tensor, normal: Tensor) -> Tensor:
+    """`redistribution` of a plane operator T - I (N, 6, 6)."""
+    block = torch.nn.functional.pad(normal, (0, 3))  # C_xyz I, in the columns of the normal components
+    return torch.cat([T[..., :3, :] + block + normal @ T[..., :3, :], T[..., 3:, :]], -2)
+
+
+def stepwise_planes(stress: Tensor, planes: Tensor) -> tuple[Tensor, Tensor]:
+    """(n (N, 3), shears (N, 3) yz, zx, xy) of stress (N, 6) on the three planes, in the paper's order (step 3).
+
+    planes: corrections C (N, 3, 3, 3). For tests and for reading: `plane_operator` is what runs.
+    """
+    xx, yy, zz, yz, zx, xy = stress.unbind(-1)
+    C_x, C_y, C_z = planes.unbind(1)
+
+    def on_plane(C: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+        traction = torch.stack([a, b, c], -1)
+        return traction + (C @ traction[..., None])[..., 0]
+
+    t_x, t_y, t_z = on_plane(C_x, xx, xy, zx), on_plane(C_y, yy, yz, xy), on_plane(C_z, zz, zx, yz)
+    normals = torch.stack([t_x[:, 0], t_y[:, 0], t_z[:, 0]], -1)
+    shears = torch.stack([t_y[:, 1] + t_z[:, 2], t_x[:, 2] + t_z[:, 1], t_x[:, 1] + t_y[:, 2]], -1) / 2
+    return normals, shears
+
+
+MANDEL = (1.0, 1.0, 1.0, 2**0.5, 2**0.5, 2**0.5)
+"""Scaling of vech components that turns the double contraction of symmetric tensors into a dot product of 6-vectors."""
+
+
+def isotropic_stiffness(poisson: Tensor) -> Tensor:
+    """(6, 6) C0 = 2 mu I + lam 1x1 in Mandel scaling and units of 2 mu; poisson: ()."""
+    one = poisson.new_tensor([1.0, 1, 1, 0, 0, 0])
+    return torch.eye(6).to(poisson) + poisson / (1 - 2 * poisson) * torch.outer(one, one)
+
+
+def major_symmetric(G: Tensor, poisson: Tensor) -> Tensor:
+    """(G + C0 G^T C0^-1)/2 in Mandel scaling, (..., 6, 6) on vech: then (I + G) C0 is symmetric and the law has an energy."""
+    scale = torch.tensor(MANDEL).to(G)
+    C0 = isotropic_stiffness(poisson.to(G))
+
+    def project(A: Tensor) -> Tensor:
+        A = scale[:, None] * A / scale
+        A = 0.5 * (A + C0 @ A.mT @ torch.linalg.inv(C0))
+        return A / scale[:, None] * scale
+
+    basis = torch.eye(36).to(G).unflatten(-1, (6, 6))  # one linear map on the 36 entries: a matrix product instead of many
+    return (G.flatten(-2) @ project(basis).flatten(-2)).unflatten(-1, (6, 6))

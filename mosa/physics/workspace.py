@@ -153,18 +153,18 @@ class Workspace:
             body()
             return
         stream = wp.stream_from_torch(torch.cuda.current_stream(self.numerics.device))
-        with wp.ScopedStream(stream):
-            graph = self._graphs.get(name)
-            if graph is None:
+        graph = self._graphs.get(name)
+        if graph == "loaded":
+            # on Warp's own stream: torch's default one cannot be captured
+            with wp.ScopedCapture(device=self.origin_wp.device, force_module_load=False) as capture:
+                body()
+            graph = self._graphs[name] = capture.graph
+        if graph is None:
+            with wp.ScopedStream(stream):
                 body()  # the first pass compiles and loads the kernels, which a capture must not do
-                self._graphs[name] = "loaded"
-            elif graph == "loaded":
-                with wp.ScopedCapture(stream=stream) as capture:
-                    body()
-                self._graphs[name] = capture.graph
-                wp.capture_launch(capture.graph)
-            else:
-                wp.capture_launch(graph)
+            self._graphs[name] = "loaded"
+        else:
+            wp.capture_launch(graph, stream=stream)
 
     def _run(self, kernel, dim: int, inputs: list, adj_inputs: list | None = None) -> None:
         device = self.origin_wp.device

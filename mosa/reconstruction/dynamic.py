@@ -62,7 +62,7 @@ class DynamicSettings:
     ssim: float = 0.0
     matte: float = 1.0
     elastic: float = 0.01
-    bending: float = 400.0
+    bending: float = 3.5
     poisson: float = 0.3
     bases: int = 10
     hidden: int = 256

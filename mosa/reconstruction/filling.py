@@ -71,13 +71,27 @@ def body_volume(volume: Volume, *, threshold: float = 0.5) -> float:
     return float(_body(volume, threshold).sum()) * volume.pitch**3
 
 
+def _keep_thin_features(kept: np.ndarray, count: np.ndarray, cell: np.ndarray, voxels: np.ndarray, centres: np.ndarray,
+                        reach: float) -> None:
+    """Keeps further cells, the fullest first, until no voxel is farther than `reach` from a kept cell's centre.
+
+    kept, count: per cell; cell: (M,) cell of each voxel; voxels: (M, 3); centres: of all cells. Changes `kept`.
+    """
+    far = np.flatnonzero(~kept[cell])
+    far = far[cKDTree(centres[kept]).query(voxels[far])[0] > reach] if len(far) else far
+    while len(far):
+        best = cell[far][np.argmax(count[cell[far]])]
+        kept[best] = True
+        far = far[np.linalg.norm(voxels[far] - centres[best], axis=1) > reach]
+
+
 def fill(volume: Volume, *, spacing: float, threshold: float = 0.5, smallest_part: float = 0.25) -> Particles:
     """Particles on a lattice of `spacing` [m] inside the 0.5 level of an occupancy volume (pitch well below the spacing).
 
     The fullest cells hold a particle each, as many as volume / spacing^3, but none filled by less than `smallest_part`. Each voxel of the body belongs to the particle of its
     cell or, where that has none, to the nearest one; a particle's volume is that of its voxels and it sits at their centroid: so
     total volume, centre of mass and, nearly, moments of inertia are those of the body, and the interior is a regular lattice.
-    Cells of features thinner than the lattice keep a particle of their own. Raises DataError for an empty volume.
+    Features thinner than the lattice keep particles of their own. Raises DataError for an empty volume.
     """
     body = _body(volume, threshold)
     origin = volume.origin.double().cpu().numpy()
@@ -93,11 +107,8 @@ def fill(volume: Volume, *, spacing: float, threshold: float = 0.5, smallest_par
     full = (spacing / volume.pitch) ** 3
     smallest = max(np.partition(count, -min(wanted, len(count)))[-min(wanted, len(count))], smallest_part * full)
     kept = count >= smallest
-    thin = np.flatnonzero((count >= 0.2 * full) & ~kept)
     to_cell = lambda i: np.stack(np.unravel_index(i, shape), -1)  # noqa: E731
-    if len(thin):
-        far = cKDTree(to_cell(np.flatnonzero(kept))).query(to_cell(thin))[0] > 1.8
-        kept[thin[far]] = True
+    _keep_thin_features(kept, count, flat, voxels, (to_cell(np.arange(len(count))) + low + 0.5) * spacing + centre, 1.5 * spacing)
     names = np.flatnonzero(kept)
     owner = np.full(len(count), -1)
     owner[names] = np.arange(len(names))

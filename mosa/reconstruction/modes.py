@@ -21,8 +21,8 @@ from mosa.reconstruction.cues import Neighbourhood
 
 @dataclass(frozen=True)
 class Modes:
-    """values: (N, K) orthonormal times sqrt(N); gradient: (N, 3, K) [1/m] their least-squares gradients; energy: (K,) bending
-    energy of each, in units of the K-th; the first four are affine (energy 0)."""
+    """values: (N, K) orthonormal times sqrt(N); gradient: (N, 3, K) [1/m] their least-squares gradients; energy: (K,) mean
+    squared curvature of each, times the body's radius^4; the first four are affine (energy 0)."""
 
     values: Tensor
     gradient: Tensor
@@ -93,7 +93,10 @@ def deformation_modes(rest: Tensor, around: Neighbourhood, *, count: int) -> Mod
         energy = np.einsum("nk,nk->k", extra, matrix @ extra)
         by_energy = np.argsort(energy)
         modes = np.concatenate([affine, extra[:, by_energy]], 1)
-        energy = np.concatenate([np.zeros(4), energy[by_energy] / energy.max()])
+        # residuals of pairs at distance r are about curvature r^2 / 2: to curvature in units of 1 / size, whatever the spacing
+        reach = np.sqrt((centred**2).sum(1).mean())
+        distance = np.sqrt((around.offset.double().cpu().numpy() ** 2).sum(-1).mean())
+        energy = np.concatenate([np.zeros(4), energy[by_energy] * (reach / distance) ** 4])
     modes = modes * np.sqrt(particles)
     index, operator = around.index.cpu().numpy(), around.gradient.double().cpu().numpy()
     gradient = np.zeros((particles, 3, modes.shape[1]))

@@ -33,9 +33,7 @@ def spread_rotations(count: int) -> Tensor:
     t = s / count
     alpha, beta = 2 * torch.pi * s / 2**0.5, 2 * torch.pi * s / 1.533751168755204288118041
     r, q = t.sqrt(), (1 - t).sqrt()
-    return quaternion_to_matrix(
-        torch.stack((r * alpha.sin(), r * alpha.cos(), q * beta.sin(), q * beta.cos()), -1)
-    ).float()
+    return quaternion_to_matrix(torch.stack((r * alpha.sin(), r * alpha.cos(), q * beta.sin(), q * beta.cos()), -1)).float()
 
 
 def matte_centres(mattes: Tensor, cameras: Cameras) -> Tensor:
@@ -174,12 +172,12 @@ def flight(pose: Poses, motion: Tensor, times: Tensor, gravity: Tensor) -> Poses
 
 def flight_jacobian(motion: Tensor, times: Tensor, radius: float) -> Tensor:
     """Derivative (T, 6, 12) of the poses' parameters (shift, angle x radius) [m] with respect to `motion`."""
-    spin = motion[9:]
+    angle, spin = motion[3:6], motion[9:]
     J = torch.zeros(len(times), 6, 12).to(motion)
     eye = torch.eye(3).to(motion)
     J[:, :3, :3] = eye
     J[:, :3, 6:9] = times[:, None, None] * eye
-    J[:, 3:, 3:6] = radius * rotation_exp(spin * times[:, None])
+    J[:, 3:, 3:6] = radius * rotation_exp(spin * times[:, None]) @ left_jacobian(angle)
     J[:, 3:, 9:] = radius * times[:, None, None] * left_jacobian(spin * times[:, None])
     return J
 
@@ -249,9 +247,7 @@ def fit_flight(
             damping = damping * 6
         step = damped(state[1][None], state[2][None], damping)[0]
         trial = best + step
-        moved = torch.stack(
-            (step[:3].norm(), step[6:9].norm() * times[-1], step[9:].norm() * times[-1] * body.radius)
-        ).max()
+        moved = torch.stack((step[:3].norm(), step[6:9].norm() * times[-1], step[9:].norm() * times[-1] * body.radius)).max()
         if float(moved) < 2e-3 * level.pixel:
             break
     return best

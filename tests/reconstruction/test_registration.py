@@ -75,7 +75,7 @@ def found_pose(splats, truth, cameras, **options):
 
 def test_pose_of_the_same_body():
     """The same splats, noisy images, half a turn away: only noise limits the fit."""
-    splats, truth, cameras = lattice_body(0.019), turned(2.0, -1.2, 1.9), ring(6, 128)
+    splats, truth, cameras = lattice_body(0.022), turned(2.0, -1.2, 1.9), ring(5, 112)
     images, mattes = found_pose(splats, truth, cameras)
     Q, center = register_pose(splats, images, mattes, cameras, background=WHITE, rest_center=REST_CENTER)
     assert degrees(Q, truth.rotation[0]) < 0.1
@@ -85,17 +85,19 @@ def test_pose_of_the_same_body():
 
 def test_pose_of_a_body_known_only_roughly():
     """Filmed with five times as many splats and shaded by a fixed light: 0.5 degrees and 0.5 mm of 0.25 m at 160 px."""
-    fine, coarse, truth, cameras = lattice_body(0.0075), lattice_body(0.0125), turned(-0.4, 0.9, 0.5), ring(8, 160)
+    fine, coarse, truth, cameras = lattice_body(0.0075), lattice_body(0.0125), turned(-0.4, 0.9, 0.5), ring(6, 160)
     images, mattes = found_pose(fine, truth, cameras, shading=0.25)
-    Q, center = register_pose(coarse, images, mattes, cameras, background=WHITE, rest_center=REST_CENTER)
+    options = dict(background=WHITE, rest_center=REST_CENTER, rotations=300, starts=12)
+    Q, center = register_pose(coarse, images, mattes, cameras, **options)
     assert degrees(Q, truth.rotation[0]) < 0.5
     assert float((center - truth.center[0]).norm()) < 5e-4
 
 
 def test_pose_of_a_ball_comes_from_its_colours():
-    splats, truth, cameras = lattice_body(0.019, ball=True), turned(0.3, 2.2, -0.8), ring(6, 96)
+    splats, truth, cameras = lattice_body(0.022, ball=True), turned(0.3, 2.2, -0.8), ring(5, 96)
     images, mattes = found_pose(splats, truth, cameras)
-    Q, _ = register_pose(splats, images, mattes, cameras, background=WHITE, rest_center=REST_CENTER, starts=12)
+    options = dict(background=WHITE, rest_center=REST_CENTER, rotations=300, starts=12)
+    Q, _ = register_pose(splats, images, mattes, cameras, **options)
     assert degrees(Q, truth.rotation[0]) < 0.3
 
 
@@ -137,21 +139,12 @@ def test_flight_jacobian_against_differences():
     motion = torch.tensor([0.01, 0.02, -0.01, 0.1, -0.2, 0.05, 1.0, -2.0, 0.5, 3.0, -4.0, 2.0], dtype=torch.float64)
     start = Poses(rotation_exp(torch.tensor([[0.5, 1.0, -0.3]]).double()), torch.zeros(1, 3).double())
     times, gravity, radius, h = torch.tensor([0.0, 0.02, 0.1]).double(), GRAVITY.double(), 0.1, 1e-6
-    start_moved = Poses(start.rotation, start.center)
     J = flight_jacobian(motion, times, radius)
-    middle = flight(start_moved, motion, times, gravity)
+    middle = flight(start, motion, times, gravity)
     for k in range(12):
-        # rotation of the start is parametrised about the start's current pose: compare there
-        sides = []
-        for sign in (-1, 1):
-            step = torch.zeros_like(motion)
-            step[k] = sign * h
-            if 3 <= k < 6:
-                base = flight(start_moved, torch.cat((motion[:6], torch.zeros(6))), times[:1], gravity)
-                nudged = base.moved(step[None, :3], step[None, 3:6])
-                sides.append(flight(nudged, torch.cat((torch.zeros(6).double(), motion[6:])), times, gravity))
-            else:
-                sides.append(flight(start_moved, motion + step, times, gravity))
+        step = torch.zeros_like(motion)
+        step[k] = h
+        sides = [flight(start, motion + sign * step, times, gravity) for sign in (-1, 1)]
         shift = (sides[1].center - sides[0].center) / (2 * h)
         turn = (sides[1].rotation - sides[0].rotation) / (2 * h) @ middle.rotation.transpose(1, 2)
         angle = radius * torch.stack((turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]), -1)

@@ -54,10 +54,11 @@ def load_builtin(
     take = make(name, sequence, material=material, seed=seed, cache=cache)
     chosen = frame_range(list(range(film.frames)), frames, f"{name}/{sequence}")
     images, mattes = pictures_to_footage(take.pictures[:, chosen], size)
+    if chosen[0] != 0:
+        raise ConfigError(f"scene.frames: built-in sequences start at frame 0, where their pose is known; found {list(frames)}")
     footage = Footage(scale_cameras(cameras_of(body, seed), scale), tuple(chosen), torch.tensor(chosen) / film.fps, images, mattes,
                       torch.ones(3))
     tensor = lambda a: torch.tensor(a, dtype=torch.float32)  # noqa: E731
-    # the pose is known as a number for frame 0 only
     truth = Truth(tensor(take.rest), tensor(take.positions[chosen]), tensor(take.rotation), tensor(take.velocity), hidden.summary())
     return assemble(
         footage, name=name, gravity=GRAVITY, box=BOX, ground=Ground(0.0, "sticky"), density=hidden.density, sequence=sequence,

@@ -1,8 +1,7 @@
 """The material of the built-in scenes, which no prior of the learner can express: fibres and a stiffness that varies in space."""
 
-from dataclasses import dataclass
-
 import math
+from dataclasses import dataclass
 
 import torch
 import warp as wp

@@ -36,10 +36,10 @@ class Footage:
 
     cameras: int = 12
     frames: int = 15
-    size: int = 320
+    size: int = 400
     fps: float = 50.0
-    field: float = 0.35
-    target: float = 0.30
+    field: float = 0.36
+    target: float = 0.32
     distance: float = 1.8
     elevations: tuple[float, ...] = (0.16, 0.55, 0.95)
 

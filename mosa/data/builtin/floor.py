@@ -1,0 +1,45 @@
+"""The floor of the figures: the true law on the learner's own particles and grid, started from the true pose."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from mosa.data.builtin.hidden_material import LAW
+from mosa.data.builtin.objects import object_named
+from mosa.errors import ConfigError
+from mosa.physics.rollout import Simulator
+from mosa.physics.time_step import required_substeps
+from mosa.types import ParticleState, Scene
+
+
+@torch.no_grad()
+def floor_rollout(body, scene: Scene, world) -> Tensor:
+    """Positions (T, N, 3) [m] of the body's particles under the hidden material of a built-in scene.
+
+    body: `mosa.modules.body.Body`; its particles, volumes, grid and learned contact height are used, its law is not. What is left
+    between this and the truth is the learner's discretisation: differences below it mean nothing.
+    Errors: ConfigError where the scene is not a built-in one; SimulationDiverged.
+    """
+    truth = scene.truth
+    if truth is None or not scene.synthetic:
+        raise ConfigError(f"scene {scene.name}: the true law is known for built-in scenes only")
+    hidden = object_named(scene.name).material.variant("anisotropic" if truth.parameters["ratio"] > 1 else "isotropic")
+    settings, frame_dt = body.settings, float(scene.times[1] - scene.times[0])
+    rest = body.rest.detach().float().cpu()
+    Q = truth.rotation.float()
+    start = (rest - truth.rest.mean(0)) @ Q.T + truth.positions[0].mean(0)
+    speed = float(truth.velocity.norm()) + float(world.gravity.norm()) * frame_dt * scene.frames
+    substeps = required_substeps(
+        hidden.wave_modulus(), hidden.density, frame_dt, settings.dx, v_max=speed, courant=min(settings.courant, 0.3), limit=5000
+    )
+    simulator = Simulator(
+        LAW, dx=settings.dx, substeps=substeps, frame_dt=frame_dt, gravity=world.gravity, up=world.up, ground=world.ground
+    )
+    n, gravity, up = len(rest), world.gravity.float().cpu(), world.up.float().cpu()
+    lift = body.contact().detach().float().cpu() * up
+    F = Q.expand(n, 3, 3).contiguous()
+    velocity = (truth.velocity.float() - 0.5 * frame_dt / substeps * gravity).expand(n, 3).contiguous()
+    state = ParticleState(start + lift, velocity, torch.zeros(n, 3, 3), F, F)
+    rollout = simulator.rollout(state, hidden.parameters(rest), body.volume.float().cpu(), hidden.density, scene.frames)
+    return rollout.x - lift

@@ -1,0 +1,215 @@
+"""transforms.json, as Blender scripts and Nerfstudio write it, with a time per frame: the way in for one's own capture."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mosa.data.footage import (
+    WHITE,
+    Footage,
+    frame_range,
+    matrix,
+    number,
+    read_json,
+    same_camera,
+    stack_cameras,
+    world_to_camera,
+)  # fmt: skip
+from mosa.data.images import composite, expect_size, read_image, resize, scaled_size
+from mosa.data.scene import assemble
+from mosa.errors import DataError
+from mosa.rendering.cameras import scale_cameras
+from mosa.types import Scene
+
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+EXTENSIONS = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG")
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One entry: where it is written, image and mask file, time [s] or None, own intrinsics, pose w2c (4, 4), camera label."""
+
+    where: str
+    image: Path
+    mask: Path | None
+    time: float | None
+    intrinsics: dict[str, float]
+    w2c: np.ndarray
+    camera: str | None
+
+
+def read_transforms(path: str | Path, *, frames=None, fps: float | None = None, scale: float = 1.0) -> Footage:
+    """Footage of a transforms.json (path: the file, or its folder).
+
+    Top level or per entry: fl_x, fl_y, cx, cy [px] or camera_angle_x [rad], w, h. Per entry: file_path (extension may be left
+    out), transform_matrix (camera to world, OpenGL axes), time [s] (left out: the last number in the file name counts frames, and
+    fps says how fast), mask_path (grey, white = object; left out: the image's alpha), camera (left out: entries with one pose and
+    intrinsics are one camera). Errors: DataError naming file and entry, ConfigError.
+    """
+    file = Path(path)
+    file = file / "transforms.json" if file.is_dir() or not file.suffix else file
+    document = read_json(file)
+    shots = read_shots(file, document, fps)
+    cameras, by_camera = group(shots, file)
+    times, table = synchronise(by_camera, fps)
+    wanted = frame_range(list(range(len(times))), frames, str(file))
+    full, first, images, mattes = None, "", [], []
+    for row in table:
+        pictures = []
+        for frame in wanted:
+            color, matte = read_shot(row[frame])
+            if full is None:
+                full, first = color.shape[1::-1], row[frame].image.name
+                size = scaled_size(*full, scale)
+            expect_size(row[frame].image, color, *full, reason=f"as {first}")
+            pictures.append((resize(composite(color, matte, WHITE), *size), resize(matte, *size)))
+        images.append(np.stack([p[0] for p in pictures]))
+        mattes.append(np.stack([p[1] for p in pictures]))
+    calibration = {name: (camera_matrix(shot, *full), shot.w2c) for name, shot in cameras.items()}
+    rig = stack_cameras(calibration, *full)
+    return Footage(
+        scale_cameras(rig, scale) if scale != 1 else rig, tuple(wanted), torch.tensor([times[f] for f in wanted]).float(),
+        torch.from_numpy(np.stack(images)), torch.from_numpy(np.stack(mattes)), torch.ones(3),
+    )  # fmt: skip
+
+
+def read_shots(file: Path, document, fps: float | None) -> list[Shot]:
+    """The entries of a document. Errors: DataError naming entry and key."""
+    if not isinstance(document, dict) or not isinstance(document.get("frames"), list) or not document["frames"]:
+        raise DataError(f"{file}: expected an object with a list `frames`, one entry per image")
+    shared = {k: number(v, f"{file}, {k}") for k, v in document.items() if k in intrinsic_keys()}
+    shots = []
+    for i, entry in enumerate(document["frames"]):
+        where = f"{file}, frames[{i}]"
+        for key in ("file_path", "transform_matrix"):
+            if not isinstance(entry, dict) or key not in entry:
+                raise DataError(f"{where}: expected the key {key}")
+        intrinsics = shared | {k: number(v, f"{where}, {k}") for k, v in entry.items() if k in intrinsic_keys()}
+        bent = [k for k in DISTORTION if intrinsics.get(k, 0.0) != 0]
+        if bent:
+            raise DataError(f"{where}: lens distortion ({', '.join(bent)}) is not modelled; undistort the images first")
+        image = locate(file.parent, str(entry["file_path"]), where)
+        mask = locate(file.parent, str(entry["mask_path"]), where) if entry.get("mask_path") else None
+        pose = matrix(entry["transform_matrix"], (3, 4), f"{where}, transform_matrix")
+        time = number(entry["time"], f"{where}, time") if entry.get("time") is not None else None
+        if time is None:
+            time = counted_time(image, fps, where)
+        camera = str(entry["camera"]) if entry.get("camera") is not None else None
+        shots.append(Shot(where, image, mask, time, intrinsics, world_to_camera(pose, where), camera))
+    return shots
+
+
+def intrinsic_keys() -> tuple[str, ...]:
+    return ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", *DISTORTION)
+
+
+def locate(folder: Path, name: str, where: str) -> Path:
+    """The file a path names, its extension left out or not. Errors: DataError where there is none."""
+    for extension in EXTENSIONS:
+        candidate = folder / (name + extension)
+        if candidate.is_file():
+            return candidate
+    raise DataError(f"{folder / name}: image not found ({where})")
+
+
+def counted_time(image: Path, fps: float | None, where: str) -> float:
+    """Time [s] from the last number in a file name."""
+    counter = re.findall(r"\d+", image.stem)
+    if fps is None or not counter:
+        raise DataError(f"{where}: expected a time in seconds, found none; add `time`, or number the files and set scene.fps")
+    return int(counter[-1]) / fps
+
+
+def group(shots: list[Shot], file: Path) -> tuple[dict[str, Shot], dict[str, list[Shot]]]:
+    """Camera name -> its first shot, and all its shots; by label, or by equal pose and intrinsics.
+
+    Errors: DataError where a labelled camera moves, or unlabelled ones all do.
+    """
+    first: dict[str, Shot] = {}
+    members: dict[str, list[Shot]] = {}
+    for shot in shots:
+        name = shot.camera
+        if name is None:
+            same = (n for n, s in first.items() if s.camera is None and shot.intrinsics == s.intrinsics
+                    and same_camera((np.eye(3), s.w2c), np.eye(3), shot.w2c))
+            name = next(same, str(len(first)))
+        known = first.setdefault(name, shot)
+        if known.intrinsics != shot.intrinsics or not same_camera((np.eye(3), known.w2c), np.eye(3), shot.w2c):
+            raise DataError(f"{shot.where}: camera {name} has another pose or intrinsics than in {known.where}; cameras must not move")
+        members.setdefault(name, []).append(shot)
+    if len(shots) > 2 and len(first) == len(shots):
+        raise DataError(
+            f"{file}: {len(shots)} entries with {len(first)} different poses: expected cameras that stand still and are seen again at "
+            "every time; a single moving camera cannot be used"
+        )
+    return first, members
+
+
+def synchronise(by_camera: dict[str, list[Shot]], fps: float | None) -> tuple[list[float], list[list[Shot]]]:
+    """Times of the frames [s], and the shots [camera][frame]. Errors: DataError where a camera lacks a frame or has one twice."""
+    tolerance = 1e-6 if fps is None else 0.25 / fps
+    times: list[float] = []
+    for time in sorted(s.time for shots in by_camera.values() for s in shots):
+        if not times or time - times[-1] > tolerance:
+            times.append(time)
+    table = []
+    for name, shots in by_camera.items():
+        row: list[Shot | None] = [None] * len(times)
+        for shot in shots:
+            index = int(np.abs(np.array(times) - shot.time).argmin())
+            if row[index] is not None:
+                raise DataError(f"{shot.where}: camera {name} has two images at {shot.time:.6f} s, the other in {row[index].where}")
+            row[index] = shot
+        missing = [round(t, 6) for t, s in zip(times, row) if s is None]
+        if missing:
+            raise DataError(
+                f"{shots[0].where}: camera {name} has no image at {missing[:4]} s, where other cameras have one; cameras must be "
+                f"synchronous: {len(times)} frames expected, {len(shots)} found"
+            )
+        table.append(row)
+    return times, table
+
+
+def read_shot(shot: Shot) -> tuple[np.ndarray, np.ndarray]:
+    """Colour (H, W, 3) and matte (H, W). Errors: DataError where there is no matte."""
+    pixels = read_image(shot.image)
+    color = np.ascontiguousarray(np.broadcast_to(pixels[..., :3], (*pixels.shape[:2], 3)))
+    if shot.mask is not None:
+        mask = read_image(shot.mask)
+        expect_size(shot.mask, mask, *pixels.shape[1::-1], reason=f"as {shot.image.name}")
+        return color, np.ascontiguousarray(mask[..., 0])
+    if pixels.shape[2] != 4:
+        raise DataError(
+            f"{shot.image}: no matte: expected an alpha channel, or a mask_path in {shot.where}, found {pixels.shape[2]} channels"
+        )
+    return color, np.ascontiguousarray(pixels[..., 3])
+
+
+def camera_matrix(shot: Shot, width: int, height: int) -> np.ndarray:
+    """K (3, 3) [px]. Errors: DataError where the focal length is missing, or intrinsics are of another image size."""
+    known = shot.intrinsics
+    for key, size in (("w", width), ("h", height)):
+        if key in known and known[key] != size:
+            raise DataError(f"{shot.where}: intrinsics are for {key} = {known[key]:g} px, but {shot.image.name} is {width}x{height}")
+    if "fl_x" in known:
+        focal = known["fl_x"], known.get("fl_y", known["fl_x"])
+    elif "camera_angle_x" in known:
+        focal = (0.5 * width / math.tan(0.5 * known["camera_angle_x"]),) * 2
+    else:
+        raise DataError(f"{shot.where}: expected fl_x (and fl_y) in pixels or camera_angle_x in radians, found neither")
+    return np.array([[focal[0], 0, known.get("cx", width / 2)], [0, focal[1], known.get("cy", height / 2)], [0, 0, 1]])
+
+
+def load_transforms(
+    path: str | Path, *, frames=None, fps: float | None = None, scale: float = 1.0, name: str | None = None, **world
+) -> Scene:
+    """Scene of a transforms.json. `world`: the keyword arguments of `mosa.data.scene.assemble`."""
+    footage = read_transforms(path, frames=frames, fps=fps, scale=scale)
+    folder = Path(path).resolve()
+    return assemble(footage, name=name or (folder.parent.name if folder.suffix else folder.name), **world)

@@ -1,0 +1,140 @@
+"""Static stage: the image terms, the Gaussians fitted to frame 0, and the appearance of coarse particles."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torchmetrics.functional.image import structural_similarity_index_measure
+
+from mosa.errors import DataError
+from mosa.reconstruction.filling import body_volume, fill
+from mosa.reconstruction.hull import visual_hull
+from mosa.reconstruction.observed import object_windows
+from mosa.reconstruction.pipeline import scaffold_splats
+from mosa.reconstruction.static import (
+    FitSettings,
+    fit_splats,
+    initial_splats,
+    isotropic_covariances,
+    projected_colors,
+    ssim,
+    surface_points,
+)
+from mosa.rendering.rasterizer import rasterize
+
+QUICK = FitSettings(iterations=120, views=2)
+
+
+@pytest.fixture(scope="module")
+def hull(squashed):
+    return visual_hull(squashed.mattes[:, 0], squashed.cameras, squashed.box, pitch=0.0032)
+
+
+@pytest.fixture(scope="module")
+def still(squashed):
+    return object_windows(squashed, list(range(8)), [0, 1]).of_frame(0)
+
+
+def rendered(splats, windows):
+    state = torch.zeros(len(windows), dtype=torch.long)
+    return rasterize(splats.means[None], isotropic_covariances(splats.scales[:, 0])[None], splats.opacities, splats.colors[None],
+                     windows.cameras, state, torch.ones(3))
+
+
+def psnr(a, b):
+    return float(-10 * torch.log10(((a - b) ** 2).mean()))
+
+
+@pytest.fixture(scope="module")
+def fitted(hull, still):
+    return fit_splats(initial_splats(hull, still, count=1500, seed=0), still, torch.ones(3), QUICK, move=True, seed=0)
+
+
+def test_ssim_agrees_with_torchmetrics():
+    generator = torch.Generator().manual_seed(1)
+    a = torch.rand(2, 40, 33, 3, generator=generator)
+    b = (a + 0.2 * torch.rand(2, 40, 33, 3, generator=generator)).clamp(0, 1)
+    expected = structural_similarity_index_measure(a.permute(0, 3, 1, 2), b.permute(0, 3, 1, 2), data_range=1.0)
+    # torchmetrics averages over a border that it filled by reflection and does not quite cut off again
+    assert float(ssim(a, b)) == pytest.approx(float(expected), abs=1e-3)
+    assert float(1 - ssim(a, b)) == pytest.approx(float(1 - expected), rel=0.02)
+    assert float(ssim(a, a)) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_windows_show_what_the_shifted_cameras_see(squashed):
+    windows = object_windows(squashed, [0, 3], [0, 4], margin=5)
+    assert len(windows) == 4 and windows.view.tolist() == [0, 0, 3, 3] and windows.frame.tolist() == [0, 4, 0, 4]
+    assert windows.cameras.width % 8 == 0 and windows.cameras.height % 8 == 0
+    for b in range(4):
+        v, t = int(windows.view[b]), int(windows.frame[b])
+        shift = squashed.cameras.K[v, :2, 2] - windows.cameras.K[b, :2, 2]
+        x0, y0 = (round(float(s)) for s in shift)
+        assert torch.allclose(shift, torch.tensor([x0, y0], dtype=torch.float32), atol=1e-4)
+        # some windows reach beyond the image: compare what lies inside
+        ya, yb = max(y0, 0), min(y0 + windows.cameras.height, 96)
+        xa, xb = max(x0, 0), min(x0 + windows.cameras.width, 96)
+        part = windows.images[b, ya - y0 : yb - y0, xa - x0 : xb - x0]
+        assert torch.equal(part, squashed.images[v, t, ya:yb, xa:xb])
+        assert float(windows.mattes[b].sum()) == pytest.approx(float(squashed.mattes[v, t].sum()), rel=1e-5)
+        assert windows.mattes[b, 0].max() == 0 and windows.mattes[b, :, -1].max() == 0
+
+
+def test_an_empty_matte_names_camera_and_frame(squashed):
+    from dataclasses import replace
+
+    mattes = squashed.mattes.clone()
+    mattes[2, 1] = 0
+    with pytest.raises(DataError, match="camera_2 at frame 1 is empty"):
+        object_windows(replace(squashed, mattes=mattes), list(range(8)), [0, 1])
+
+
+def test_half_resolution_windows_project_alike(still):
+    half = still.halved()
+    assert half.images.shape[1] == still.images.shape[1] // 2
+    point = torch.tensor([0.03, 0.29, 0.02])
+    for full, small in zip(still.cameras.K, half.cameras.K):
+        seen = still.cameras.w2c[0, :3, :3] @ point + still.cameras.w2c[0, :3, 3]
+        assert torch.allclose((full @ seen)[:2] / 2, (small @ seen)[:2], atol=1e-5)
+
+
+def test_start_lies_on_the_surface_with_its_colours(hull, still):
+    points, normals, spacing = surface_points(hull, count=1500, seed=0)
+    colors = projected_colors(points, normals, still)
+    from squashed_body import backward, color, inside
+
+    rest = backward(points.double().numpy(), 0.0, 1.0)
+    assert abs(inside(rest)).mean() < 0.08
+    assert 0.003 < spacing < 0.02
+    true = torch.as_tensor(color(rest), dtype=torch.float32)
+    assert float((colors - true).abs().median()) < 0.1
+
+
+def test_static_gaussians_reproduce_the_frame(hull, still, fitted):
+    start = initial_splats(hull, still, count=1500, seed=0)
+    before, after = psnr(rendered(start, still)[0], still.images), psnr(rendered(fitted, still)[0], still.images)
+    assert after > before + 5 and after > 26
+    _, alpha = rendered(fitted, still)
+    a, b = alpha > 0.5, still.mattes > 0.5
+    assert float((a & b).sum() / (a | b).sum()) > 0.97
+    assert torch.equal(fitted.scales[:, 0], fitted.scales[:, 2])
+
+
+def test_particles_take_over_colours_and_silhouette(hull, still, fitted):
+    spacing = (body_volume(hull) / 1500) ** (1 / 3)
+    particles = fill(hull, spacing=spacing)
+    start = scaffold_splats(particles, fitted, "cpu")
+    end = fit_splats(start, still, torch.ones(3), QUICK, move=False, seed=0)
+    assert torch.equal(end.means, particles.positions)
+    image, alpha = rendered(end, still)
+    assert psnr(image, still.images) > max(psnr(rendered(start, still)[0], still.images) + 1.5, 24)
+    a, b = alpha > 0.5, still.mattes > 0.5
+    assert float((a & b).sum() / (a | b).sum()) > 0.96
+    # opaque: pixels inside the silhouette show the body, not the background
+    assert float(alpha[still.mattes > 0.999].mean()) > 0.97
+
+
+def test_fits_are_deterministic(hull, still):
+    short = FitSettings(iterations=5, views=2)
+    start = initial_splats(hull, still, count=300, seed=3)
+    runs = [fit_splats(start, still, torch.ones(3), short, move=True, seed=3) for _ in range(2)]
+    assert torch.equal(runs[0].means, runs[1].means) and torch.equal(runs[0].colors, runs[1].colors)
