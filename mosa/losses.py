@@ -4,68 +4,176 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 TINY = 1e-8
+STRAIN_FLOOR = 1e-3
+"""e of the stretch term: strains below it have no direction to compare (and would give gradients like 1/strain)."""
+FLAT = 1e-3
+"""Rotation term: det F below which a particle has no weight."""
 
 
-def image_loss(rendered: Tensor, real: Tensor) -> Tensor:
-    """L_img: mean L1 over views, frames, pixels and channels of images (V, T, H, W, 3)."""
-    return (rendered - real).abs().mean()
+def weighted_mean(values: Tensor, weight: Tensor | None) -> Tensor:
+    """Mean of `values`, weighted by `weight` of the same shape (0 where all weights are 0)."""
+    if weight is None:
+        return values.mean()
+    return (weight * values).sum() / weight.sum().clamp(min=TINY)
 
 
-def mask_loss(alpha: Tensor, mattes: Tensor) -> Tensor:
-    """L_msk: mean L1 over views, frames and pixels of (V, T, H, W)."""
-    return (alpha - mattes).abs().mean()
+def image_loss(rendered: Tensor, real: Tensor, weight: Tensor | None = None) -> Tensor:
+    """L_img: mean L1 over views, frames, pixels and channels. Images (V, T, H, W, 3) in [0, 1]; weight (V, T, H, W)."""
+    return weighted_mean((rendered - real).abs().mean(-1), weight)
 
 
-def flow_loss(simulated: Tensor, seen: Tensor, image_width: int) -> Tensor:
-    """L_flow: mean L1 of flow maps (V, T - 1, H, W, 2) [px], in image widths."""
-    return (simulated - seen).abs().mean() / image_width
+def mask_loss(alpha: Tensor, mattes: Tensor, weight: Tensor | None = None) -> Tensor:
+    """L_msk: mean L1 over views, frames and pixels of (V, T, H, W) in [0, 1]; weight: same shape or None."""
+    return weighted_mean((alpha - mattes).abs(), weight)
+
+
+def flow_loss(simulated: Tensor, seen: Tensor, image_width: int, weight: Tensor | None = None) -> Tensor:
+    """L_flow: mean L1 of flow maps (V, T - 1, H, W, 2) [px], in image widths; weight: (V, T - 1, H, W) or None.
+
+    In pixels the term would drown the others and grow with the resolution. image_width: of the whole image, not of a crop.
+    """
+    return weighted_mean((simulated - seen).abs().mean(-1), weight) / image_width
+
+
+def cofactors(F: Tensor) -> Tensor:
+    """det(F) F^-T of (..., 3, 3)."""
+    a, b, c = F.unbind(-2)
+    return torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -2)
+
+
+class _Polar(torch.autograd.Function):
+    """R of F = R W, det F > 0. dR = R [omega]_x, (tr(W) I - W) omega = axial(R^T dF): regular at equal stretches."""
+
+    @staticmethod
+    def forward(ctx, F: Tensor) -> Tensor:
+        R = F
+        for step in range(14):
+            cofactor = cofactors(R)
+            det = (R[..., 0, :] * cofactor[..., 0, :]).sum(-1)[..., None, None]
+            # Newton's iteration; the first steps are scaled (Higham), or a flat F would need one step per factor of two
+            scale = (size(cofactor) / (det * size(R))).sqrt() if step < 5 else 1.0
+            following = 0.5 * (scale * R + cofactor / (det * scale))
+            change = (following - R).abs().amax() if R.numel() else 0.0
+            R = following
+            if step >= 5 and change < 10 * torch.finfo(F.dtype).eps:
+                break
+        ctx.save_for_backward(F, R)
+        return R
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, seed: Tensor) -> Tensor:
+        F, R = ctx.saved_tensors
+        W = R.mT @ F
+        trace = W.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+        M = trace * torch.eye(3, dtype=F.dtype, device=F.device) - 0.5 * (W + W.mT)
+        cofactor = cofactors(M)
+        det = (M[..., 0, :] * cofactor[..., 0, :]).sum(-1)
+        omega = (cofactor @ axial(R.mT @ seed)[..., None])[..., 0] / det[..., None]  # M is symmetric
+        return R @ skew(omega)
+
+
+def size(A: Tensor) -> Tensor:
+    """Frobenius norm (..., 1, 1) of (..., 3, 3)."""
+    return A.norm(dim=(-2, -1), keepdim=True)
+
+
+def axial(A: Tensor) -> Tensor:
+    """Axial vector (..., 3) of A - A^T, (..., 3, 3)."""
+    return torch.stack([A[..., 2, 1] - A[..., 1, 2], A[..., 0, 2] - A[..., 2, 0], A[..., 1, 0] - A[..., 0, 1]], -1)
+
+
+def skew(w: Tensor) -> Tensor:
+    """[w]_x, (..., 3, 3) of (..., 3)."""
+    x, y, z = w.unbind(-1)
+    o = torch.zeros_like(x)
+    return torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).unflatten(-1, (3, 3))
 
 
 def polar_rotation(F: Tensor) -> Tensor:
-    """Polar rotations of F (..., 3, 3) by six Newton steps on the inverse transpose: no singular vectors, so no gradient that
-    blows up at equal singular values. For det F > 0."""
-    R = F
-    for _ in range(6):
-        cofactor = torch.stack([torch.linalg.cross(R[..., 1, :], R[..., 2, :]), torch.linalg.cross(R[..., 2, :], R[..., 0, :]),
-                                torch.linalg.cross(R[..., 0, :], R[..., 1, :])], -2)
-        det = (R[..., 0, :] * cofactor[..., 0, :]).sum(-1)
-        R = 0.5 * (R + cofactor / det[..., None, None])
-    return R
+    """Polar rotations of F (..., 3, 3) with det F > 0; exact gradient, also where stretches are equal."""
+    return _Polar.apply(F)
 
 
 def rotation_loss(F_tot: Tensor, cue: Tensor, weight: Tensor, start: Tensor) -> Tensor:
-    """L_r: mean over particles and frames of |R_cue - R(F_tot) Q^T|_F^2. F_tot, cue: (T, N, 3, 3); weight: (T, N); start: Q (3, 3).
+    """L_r: mean over particles and frames of |R_cue - R(F_tot) Q^T|_F^2, in [0, 8].
 
+    F_tot, cue: (T, N, 3, 3), frame 0 first; weight: (T, N); start: Q (3, 3), the rotation the sequence started with.
     Frame 0 and inverted particles have no weight.
     """
-    positive = torch.linalg.det(F_tot.detach()) > 1e-3
-    weight = weight * positive
+    positive = ~(torch.linalg.det(F_tot.detach()) <= FLAT)  # a NaN stays in, so that the loss shows it
     eye = torch.eye(3, dtype=F_tot.dtype, device=F_tot.device)
     R = polar_rotation(torch.where(positive[..., None, None], F_tot, eye))  # replaced before, or 0 x NaN would pass through
-    squared = (cue - R @ start.transpose(-1, -2).to(R)).square().sum((-1, -2))
-    return (weight * squared)[1:].sum() / weight[1:].sum().clamp(min=TINY)
+    squared = (cue - R @ start.mT.to(R)).square().sum((-1, -2))
+    return weighted_mean(squared[1:], (weight * positive)[1:])
 
 
-def singular_values(F: Tensor) -> Tensor:
-    """Descending singular values (..., 3) of F (..., 3, 3); finite gradients also where they coincide."""
-    return torch.linalg.svdvals(F)
+class _Stretches(torch.autograd.Function):
+    """Singular values of F (..., 3, 3) by the eigenvectors V of F^T F: dS_i = u_i . dF v_i, u_i = F v_i / S_i."""
+
+    @staticmethod
+    def forward(ctx, F: Tensor) -> Tensor:
+        if not torch.isfinite(F).all():  # the solver would stop without a word on the cause; a NaN loss is reported
+            ctx.save_for_backward(F, F, F[..., 0])
+            return torch.full_like(F[..., 0], torch.nan)
+        squares, V = torch.linalg.eigh(F.mT @ F)
+        S = squares.flip(-1).clamp(min=0).sqrt()
+        inverted = torch.linalg.det(F) < 0
+        S = torch.cat([S[..., :2], torch.where(inverted, -S[..., 2], S[..., 2])[..., None]], -1)
+        ctx.save_for_backward(F, V.flip(-1), S)
+        return S
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, seed: Tensor) -> Tensor:
+        F, V, S = ctx.saved_tensors
+        seed = shared_where_equal(seed, S, 100 * torch.finfo(S.dtype).eps)
+        # where S vanishes F v does too: the quotient is bounded, but not determined
+        safe = torch.where(S.abs() < TINY, torch.full_like(S, TINY), S)
+        return F @ (V * (seed / safe)[..., None, :]) @ V.mT
 
 
-def stretch_loss(F_tot: Tensor, cue: Tensor, weight: Tensor, floor: float = 1e-3) -> Tensor:
-    """L_s: mean squared difference of the directions of (Lambda - 1) of cue and simulation, sorted.
+def shared_where_equal(seed: Tensor, values: Tensor, tolerance: float) -> Tensor:
+    """Gradients (..., 3) by sorted `values`, averaged over those that coincide.
 
-    F_tot: (T, N, 3, 3); cue: (T, N, 3) descending stretches; weight: (T, N). No weight where the cue's largest |Lambda - 1| is
-    below `floor`.
+    Their axes are then arbitrary: the average is the one choice that does not depend on them (and the shortest subgradient).
+    """
+    first, second = ((values[..., i] - values[..., i + 1]).abs() <= tolerance * values[..., 0].abs() for i in (0, 1))
+    a, b, c = seed.unbind(-1)
+    all_three, ab, bc = first & second, (a + b) / 2, (b + c) / 2
+    mean = (a + b + c) / 3
+    shared = (
+        torch.where(first, ab, a), torch.where(first, ab, torch.where(second, bc, b)), torch.where(second, bc, c)
+    )  # fmt: skip
+    return torch.stack([torch.where(all_three, mean, x) for x in shared], -1)
+
+
+def stretches(F: Tensor) -> Tensor:
+    """Descending singular values (..., 3) of F (..., 3, 3), the smallest with the sign of det F (method.md, section 1).
+
+    Where values coincide the gradient is that of their sum, shared among them.
+    """
+    return _Stretches.apply(F)
+
+
+def stretch_loss(F_tot: Tensor, cue: Tensor, weight: Tensor, floor: float = STRAIN_FLOOR) -> Tensor:
+    """L_s: mean squared difference of norm(Lambda_cue - 1) and norm(Lambda - 1), sorted, norm(a) = a/(|a| + floor).
+
+    F_tot: (T, N, 3, 3), frame 0 first; cue: (T, N, 3) stretches dS/S_0 + 1, descending; weight: (T, N). No weight at
+    frame 0 and where the cue's largest |Lambda - 1| is below `floor`.
     """
     seen = cue - 1
     weight = weight * (seen.abs().amax(-1) > floor)
-    strain = singular_values(F_tot) - 1
-    def unit(a: Tensor) -> Tensor:
-        return a / (torch.sqrt(a.square().sum(-1, keepdim=True) + 1e-12) + 1e-6)
-    squared = (unit(seen) - unit(strain)).square().mean(-1)
-    return (weight * squared)[1:].sum() / weight[1:].sum().clamp(min=TINY)
+
+    def direction(a: Tensor) -> Tensor:
+        # smooth at 0: the simulation starts there
+        return a / (torch.sqrt(a.square().sum(-1, keepdim=True) + floor**2 / 100) + floor)
+
+    squared = (direction(seen) - direction(stretches(F_tot) - 1)).square().mean(-1)
+    return weighted_mean(squared[1:], weight[1:])
 
 
 def heterogeneity_loss(eta: Tensor, lambda_mu: float = 1.0, lambda_var: float = 1.0) -> Tensor:

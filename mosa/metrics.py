@@ -1,4 +1,4 @@
-"""Figures of evaluation.md."""
+"""Figures of evaluation.md: distances between motions and shapes [m], image similarity, and the floors to read them against."""
 
 from __future__ import annotations
 
@@ -10,26 +10,54 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
+CHAMFER_SAMPLES, ASSIGNMENT_SAMPLES = 8192, 2048
+RIDGE = 1e-3
+"""Of the local fit's slopes, relative to the neighbourhood's own size."""
+
+
+# --- motion ---------------------------------------------------------------------------------------------------------
+
 
 def interpolate_motion(rest: Tensor, positions: Tensor, query: Tensor, neighbours: int = 8) -> Tensor:
-    """True motion at rest positions `query` (N, 3): (T, N, 3) [m] from truth rest (M, 3) and positions (T, M, 3), by inverse
-    distance over the nearest true rest points."""
-    distance, index = cKDTree(rest.cpu().numpy()).query(query.cpu().numpy(), k=min(neighbours, len(rest)))
-    weight = 1 / np.maximum(distance, 1e-9)
-    weight = torch.as_tensor(weight / weight.sum(1, keepdims=True)).to(positions)
-    displaced = positions - rest.to(positions)
-    moved = (displaced[:, torch.as_tensor(index)] * weight[None, ..., None]).sum(2)
-    return query.cpu().to(positions) + moved
+    """True motion at rest positions `query` (N, 3): (T, N, 3) [m], from true rest points (M, 3) and positions (T, M, 3).
+
+    A linear fit to the nearest true rest points, weighted by inverse distance. A plain weighted mean lies at the
+    neighbours' centroid, not at the query, and has a floor of millimetres on a body that turns. What the neighbours leave
+    open (fewer than four of them, or all in a plane) is taken from the affine motion of the whole, what that leaves open
+    from its translation.
+    """
+    points, wanted = rest.cpu().double(), query.cpu().double()
+    displaced = positions.cpu().double() - points
+    distance, index = cKDTree(points.numpy()).query(wanted.numpy(), k=np.arange(1, min(neighbours, len(points)) + 1))
+    weight = torch.as_tensor(1 / np.maximum(distance, 1e-12))
+    weight, index = weight / weight.sum(1, keepdim=True), torch.as_tensor(index)
+    center = points.mean(0)
+    basis = torch.nn.functional.pad(points - center, (0, 1), value=1.0)
+    # (T, 4, 3), the shortest solution: clouds that are flat or have few points pass
+    affine = torch.linalg.lstsq(basis.expand(len(displaced), -1, -1), displaced, driver="gelsd").solution
+    residual = displaced - basis @ affine
+    # value at the query of the fit = weighted sum of the neighbours' residuals with these coefficients
+    reach = torch.as_tensor(distance).amax(1).clamp(min=1e-12)
+    local = torch.nn.functional.pad((points[index] - wanted[:, None]) / reach[:, None, None], (0, 1), value=1.0)
+    moment = torch.einsum("nk,nki,nkj->nij", weight, local, local)
+    moment = moment + torch.diag(torch.tensor([RIDGE, RIDGE, RIDGE, 0.0], dtype=torch.float64))
+    unit = torch.tensor([0.0, 0, 0, 1], dtype=torch.float64).expand(len(wanted), 4)
+    coefficients = weight * torch.einsum("nki,ni->nk", local, torch.linalg.solve(moment, unit))
+    at_query = wanted + torch.nn.functional.pad(wanted - center, (0, 1), value=1.0) @ affine
+    return (at_query + torch.einsum("nk,tnkd->tnd", coefficients, residual[:, index])).to(positions)
 
 
 def rms(x: Tensor, target: Tensor) -> float:
-    """Root mean square distance [m] of (T, N, 3) and (T, N, 3)."""
+    """Root mean square distance [m] of (T, N, 3) and (T, N, 3), over particles and frames."""
     return float((x.double() - target.double()).square().sum(-1).mean().sqrt())
 
 
+# --- shapes without identity ----------------------------------------------------------------------------------------
+
+
 def subsample(points: Tensor, count: int, seed: int) -> np.ndarray:
-    """At most `count` points without replacement."""
-    points = points.detach().cpu().numpy()
+    """At most `count` points without replacement, float64."""
+    points = points.detach().cpu().double().numpy()
     if len(points) <= count:
         return points
     return points[np.random.default_rng(seed).choice(len(points), count, replace=False)]
@@ -40,33 +68,88 @@ def _nearest(a: Tensor, b: Tensor, samples: int, seed: int) -> tuple[np.ndarray,
     return cKDTree(b).query(a)[0], cKDTree(a).query(b)[0]
 
 
-def chamfer_squared(a: Tensor, b: Tensor, *, samples: int = 8192, seed: int = 0) -> float:
-    """Two-sided sum of mean squared nearest distances [m^2]."""
+def chamfer_squared(a: Tensor, b: Tensor, *, samples: int = CHAMFER_SAMPLES, seed: int = 0) -> float:
+    """`cd_sq_m2`: two-sided sum of mean squared nearest distances [m^2] of clouds (N, 3) and (M, 3) [m]."""
     ab, ba = _nearest(a, b, samples, seed)
     return float((ab**2).mean() + (ba**2).mean())
 
 
-def chamfer(a: Tensor, b: Tensor, *, samples: int = 8192, seed: int = 0) -> float:
-    """Two-sided sum of mean nearest distances [m]."""
+def chamfer(a: Tensor, b: Tensor, *, samples: int = CHAMFER_SAMPLES, seed: int = 0) -> float:
+    """`cd_m`: two-sided sum of mean nearest distances [m] of clouds (N, 3) and (M, 3) [m]."""
     ab, ba = _nearest(a, b, samples, seed)
     return float(ab.mean() + ba.mean())
 
 
-def emd(a: Tensor, b: Tensor, *, samples: int = 2048, seed: int = 0) -> float:
-    """Mean distance [m] of the exact assignment between equal random subsets."""
+def emd(a: Tensor, b: Tensor, *, samples: int = ASSIGNMENT_SAMPLES, seed: int = 0) -> float:
+    """`emd_m`: mean distance [m] of the exact assignment between equally many random points of (N, 3) and (M, 3) [m]."""
     count = min(samples, len(a), len(b))
     cost = cdist(subsample(a, count, seed), subsample(b, count, seed + 1))
     rows, columns = linear_sum_assignment(cost)
     return float(cost[rows, columns].mean())
 
 
+def resample_shape(cloud: Tensor, count: int, seed: int) -> Tensor:
+    """`count` independent random points (count, 3) [m] of the shape that `cloud` (M, 3) [m] fills, M > 1.
+
+    A point of the cloud, drawn with replacement and displaced within its cell: a cube of side s, which the density gives,
+    4/3 pi r_k^3 = (k + 1/2) s^3 with r_k the distance to the k-th neighbour, median over the cloud.
+    """
+    points = cloud.detach().cpu().double().numpy()
+    generator = np.random.default_rng(seed)
+    k = min(12, len(points) - 1)  # at 12 a lattice gives its own spacing to 2 %, and so does a random cloud
+    reach = np.median(cKDTree(points).query(points, k=[k + 1])[0])
+    spacing = reach * (4 / 3 * np.pi / (k + 0.5)) ** (1 / 3)
+    chosen = points[generator.integers(len(points), size=count)]
+    return torch.as_tensor(chosen + generator.uniform(-spacing / 2, spacing / 2, chosen.shape))
+
+
+def sampling_floors(
+    cloud: Tensor,
+    first: int,
+    second: int,
+    *,
+    samples: int = CHAMFER_SAMPLES,
+    assignment: int = ASSIGNMENT_SAMPLES,
+    seed: int = 0,
+) -> dict[str, float]:
+    """`cd_sq_m2`, `cd_m`, `emd_m` between two random samplings of one shape, of `first` and `second` points.
+
+    cloud: (M, 3) [m] fills the true shape. A model can get below: regular points lie closer than random ones.
+    """
+    a, b = resample_shape(cloud, first, 2 * seed + 101), resample_shape(cloud, second, 2 * seed + 102)
+    return {
+        "cd_sq_m2": chamfer_squared(a, b, samples=samples, seed=seed),
+        "cd_m": chamfer(a, b, samples=samples, seed=seed),
+        "emd_m": emd(a, b, samples=assignment, seed=seed),
+    }
+
+
+# --- images ---------------------------------------------------------------------------------------------------------
+
+
 def psnr(rendered: Tensor, real: Tensor) -> float:
-    """Mean over images (T, H, W, 3) in [0, 1] of the PSNR [dB]."""
-    return float(peak_signal_noise_ratio(rendered.movedim(-1, 1), real.movedim(-1, 1), data_range=1.0, reduction="elementwise_mean",
-                                         dim=(1, 2, 3)))
+    """Mean over images (T, H, W, 3) in [0, 1] of each one's PSNR [dB]; infinite if one of them is exact."""
+    a, b = rendered.movedim(-1, 1), real.movedim(-1, 1)
+    return float(peak_signal_noise_ratio(a, b, data_range=1.0, dim=(1, 2, 3), reduction="elementwise_mean"))
 
 
 def ssim(rendered: Tensor, real: Tensor) -> float:
-    """Mean over images (T, H, W, 3) in [0, 1] of the SSIM: 11x11 Gaussian window, sigma 1.5."""
-    return float(structural_similarity_index_measure(rendered.movedim(-1, 1), real.movedim(-1, 1), data_range=1.0, sigma=1.5,
-                                                     kernel_size=11))
+    """Mean over images (T, H, W, 3) in [0, 1] of the SSIM (Wang et al. 2004): 11x11 Gaussian window, sigma 1.5.
+
+    Over all pixels, with borders reflected (torchmetrics; others leave 5 px at the border out). At least 6 x 6 px.
+    """
+    a, b = rendered.movedim(-1, 1), real.movedim(-1, 1)
+    return float(structural_similarity_index_measure(a, b, data_range=1.0, sigma=1.5, kernel_size=11))
+
+
+# --- parameters -----------------------------------------------------------------------------------------------------
+
+LOGARITHMIC = ("E", "mu", "kappa", "yield_stress")
+
+
+def identification_errors(name: str, estimate: float, true: float) -> dict[str, float]:
+    """`<name>_relative_error` |estimate - true| / |true|; for log-parameters also `<name>_ratio` estimate / true."""
+    figures = {f"{name}_relative_error": abs(estimate - true) / abs(true)}
+    if name in LOGARITHMIC:
+        figures[f"{name}_ratio"] = estimate / true
+    return figures

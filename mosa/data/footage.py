@@ -38,7 +38,9 @@ def read_json(path: Path):
     try:
         return json.loads(path.read_text())
     except json.JSONDecodeError as error:
-        raise DataError(f"{path}: expected JSON, found a mistake in line {error.lineno}, column {error.colno}: {error.msg}") from error
+        raise DataError(
+            f"{path}: expected JSON, found a mistake in line {error.lineno}, column {error.colno}: {error.msg}"
+        ) from error
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: expected JSON text, found bytes that are no UTF-8") from error
 
@@ -48,7 +50,9 @@ def matrix(value, shape: tuple[int, int], where: str) -> np.ndarray:
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise DataError(f"{where}: expected a {shape[0]}x{shape[1]} matrix of numbers, found {str(value)[:80]}") from error
+        raise DataError(
+            f"{where}: expected a {shape[0]}x{shape[1]} matrix of numbers, found {str(value)[:80]}"
+        ) from error
     if array.shape == (4, 4) and shape == (3, 4):
         array = array[:3]
     if array.shape != shape:
@@ -91,7 +95,7 @@ def frame_range(present: list[int], wanted, where: str) -> list[int]:
     Errors: ConfigError where an end is not there, DataError where numbers are missing in between.
     """
     if wanted is not None:
-        wanted = list(wanted)
+        wanted = list(wanted) if isinstance(wanted, (list, tuple)) else [wanted]
         if len(wanted) != 2 or not all(isinstance(f, int) and not isinstance(f, bool) for f in wanted):
             raise ConfigError(f"scene.frames: expected [first, last], found {wanted}")
         for end in wanted:
@@ -100,7 +104,9 @@ def frame_range(present: list[int], wanted, where: str) -> list[int]:
         present = [f for f in present if wanted[0] <= f <= wanted[1]]
     missing = sorted(set(range(present[0], present[-1] + 1)) - set(present)) if present else []
     if missing:
-        raise DataError(f"{where}: frames {missing} are missing between {present[0]} and {present[-1]}; restrict scene.frames")
+        raise DataError(
+            f"{where}: frames {missing} are missing between {present[0]} and {present[-1]}; restrict scene.frames"
+        )
     if len(present) < 2:
         raise DataError(f"{where}: expected at least two frames, found {len(present)}")
     return present
@@ -111,7 +117,8 @@ def merge_time(times: dict[int, tuple[float, str]], frame: int, time: float, whe
     known, first = times.setdefault(frame, (time, where))
     if abs(known - time) > 1e-6:
         raise DataError(
-            f"{where}: frame {frame} has time {time:.6f} s, but {known:.6f} s in {first}; the cameras of a scene must be synchronous"
+            f"{where}: frame {frame} has time {time:.6f} s, but {known:.6f} s in {first}; "
+            "the cameras of a scene must be synchronous"
         )
 
 

@@ -19,9 +19,11 @@ def read_image(path: Path) -> np.ndarray:
     if not path.is_file():
         raise DataError(f"{path}: image not found")
     try:
-        pixels = np.asarray(iio.imread(path))
+        pixels = np.asarray(iio.imread(path, plugin="pillow"))
     except (OSError, SyntaxError, ValueError, RuntimeError) as error:
-        raise DataError(f"{path}: expected a readable image, found a damaged one ({error}); copy or export it again") from error
+        raise DataError(
+            f"{path}: expected a readable image, found a damaged one ({error}); copy or export it again"
+        ) from error
     if pixels.dtype == np.uint8:
         pixels = pixels.astype(np.float32) / 255
     elif pixels.dtype == np.uint16:
@@ -35,7 +37,9 @@ def read_image(path: Path) -> np.ndarray:
     if pixels.ndim != 3 or pixels.shape[2] not in (1, 3, 4):
         raise DataError(f"{path}: expected a picture with 1, 3 or 4 channels, found an array of shape {pixels.shape}")
     if not np.isfinite(pixels).all():
-        raise DataError(f"{path}: expected finite pixels, found {int((~np.isfinite(pixels)).sum())} that are NaN or infinite")
+        raise DataError(
+            f"{path}: expected finite pixels, found {int((~np.isfinite(pixels)).sum())} that are NaN or infinite"
+        )
     return np.clip(pixels, 0, 1)
 
 
@@ -59,7 +63,9 @@ def scaled_size(width: int, height: int, scale: float) -> tuple[int, int]:
         raise ConfigError(f"scene.scale: expected a number in (0, 1], found {scale}")
     size = round(width * scale), round(height * scale)
     if min(size) < 16:
-        raise ConfigError(f"scene.scale: {scale} leaves {size[0]}x{size[1]} px of {width}x{height}; at least 16 px are needed")
+        raise ConfigError(
+            f"scene.scale: {scale} leaves {size[0]}x{size[1]} px of {width}x{height}; at least 16 px are needed"
+        )
     return size
 
 

@@ -51,7 +51,9 @@ def read_pacnerf(path: str | Path, *, frames=None, scale: float = 1.0) -> Footag
     """
     folder = Path(path)
     if not folder.is_dir():
-        raise DataError(f"{folder}: folder not found; set scene.path to a scene in PAC-NeRF's layout (all_data.json, data/)")
+        raise DataError(
+            f"{folder}: folder not found; set scene.path to a scene in PAC-NeRF's layout (all_data.json, data/)"
+        )
     listing = folder / "all_data.json"
     calibration, times = read_listing(listing)
     prefix, present = usable_frames(folder, calibration)
@@ -63,8 +65,8 @@ def read_pacnerf(path: str | Path, *, frames=None, scale: float = 1.0) -> Footag
             file = folder / "data" / f"{prefix}_{camera}_{frame}.png"
             if not file.is_file():
                 raise DataError(
-                    f"{file}: image not found, though {listing.name} lists camera {camera} and other cameras have frame {frame}; "
-                    "restore it or restrict scene.frames"
+                    f"{file}: image not found, though {listing.name} lists camera {camera} and other cameras have "
+                    f"frame {frame}; restore it or restrict scene.frames"
                 )
             pixels = read_image(file)
             if full is None:
@@ -96,12 +98,16 @@ def read_listing(path: Path) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], 
                 raise DataError(f"{where}: expected the keys file_path, time, c2w and intrinsic, found no {key}")
         found = NAME.search(str(entry["file_path"]))
         if found is None:
-            raise DataError(f"{where}: expected a file_path like ./data/r_<camera>_<frame>.png, found {entry['file_path']!r}")
+            raise DataError(
+                f"{where}: expected a file_path like ./data/r_<camera>_<frame>.png, found {entry['file_path']!r}"
+            )
         camera, frame = found[2], int(found[3])
         K = matrix(entry["intrinsic"], (3, 3), f"{where}, intrinsic")
         w2c = world_to_camera(matrix(entry["c2w"], (3, 4), f"{where}, c2w"), f"{where}, c2w")
         if not same_camera(calibration.setdefault(camera, (K, w2c)), K, w2c):
-            raise DataError(f"{where}: camera {camera} has another pose or intrinsics than before; cameras must not move")
+            raise DataError(
+                f"{where}: camera {camera} has another pose or intrinsics than before; cameras must not move"
+            )
         if frame >= 0:
             merge_time(times, frame, number(entry["time"], f"{where}, time"), where)
     return dict(sorted(calibration.items(), key=lambda item: int(item[0]))), times
@@ -123,8 +129,9 @@ def usable_frames(folder: Path, calibration: dict) -> tuple[str, list[int]]:
             return kind, sorted(present[kind])
     if present["r"]:
         raise DataError(
-            f"{folder / 'data'}: no mattes: expected a_<camera>_<frame>.png (RGBA) or m_<camera>_<frame>.png (background painted "
-            "white), found raw r_ images only; matte them first, with the background plate r_<camera>_-1.png"
+            f"{folder / 'data'}: no mattes: expected a_<camera>_<frame>.png (RGBA) or m_<camera>_<frame>.png "
+            "(background painted white), found raw r_ images only; matte them first, "
+            "with the background plate r_<camera>_-1.png"
         )
     raise DataError(f"{folder / 'data'}: expected images a_<camera>_<frame>.png, found none")
 

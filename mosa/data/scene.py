@@ -24,7 +24,9 @@ FORMATS = {
 """Format -> module:function. A new format is one function (path=..., the keys it needs) -> Scene and one line here."""
 
 
-def load_scene(*, format: str, root: str | None = None, path: str | None = None, ground=None, cache=None, **keys) -> Scene:
+def load_scene(
+    *, format: str, root: str | None = None, path: str | None = None, ground=None, cache=None, **keys
+) -> Scene:
     """The scene that the keys of conf/scene describe, validated.
 
     root is put before a relative path; ground: {height [m], mode, friction} or None; cache: folder for made scenes.
@@ -37,7 +39,9 @@ def load_scene(*, format: str, root: str | None = None, path: str | None = None,
     if format == "builtin":
         return validate(call(loader, {"cache": cache, **{k: v for k, v in keys.items() if v is not None}}))
     if path is None:
-        raise ConfigError(f"scene.path: expected the folder of a scene in format {format}, found nothing; scene.path=<folder>")
+        raise ConfigError(
+            f"scene.path: expected the folder of a scene in format {format}, found nothing; scene.path=<folder>"
+        )
     arguments = {k: v for k, v in keys.items() if v is not None}
     arguments["ground"] = ground_from(ground)
     if keys.get("particles") is not None:
@@ -51,8 +55,10 @@ def held_out_sequences(**keys) -> list[Scene]:
         return []
     from mosa.data.builtin import held_out_names
 
-    return [load_scene(**{**keys, "sequence": s, "holdout_frames": None, "last_free_frame": None})
-            for s in held_out_names(keys.get("name"))]
+    return [
+        load_scene(**{**keys, "sequence": s, "holdout_frames": None, "last_free_frame": None})
+        for s in held_out_names(keys.get("name"))
+    ]
 
 
 def under(root: str | None, path: str) -> Path:
@@ -68,7 +74,9 @@ def call(loader: Callable, arguments: dict) -> Scene:
         known |= set(inspect.signature(assemble).parameters)
     for key in arguments:
         if key not in known:
-            raise ConfigError(f"scene.{key}: not a key of this format; it takes {', '.join(sorted(known - {'world', 'footage'}))}")
+            raise ConfigError(
+                f"scene.{key}: not a key of this format; it takes {', '.join(sorted(known - {'world', 'footage'}))}"
+            )
     return loader(**arguments)
 
 
@@ -108,7 +116,9 @@ def held_out_cameras(names, footage_names: tuple[str, ...]) -> tuple[int, ...]:
             raise ConfigError(f"scene.holdout_cameras: no camera {name!r}; the scene has {', '.join(footage_names)}")
         indices.append(footage_names.index(str(name)))
     if len(footage_names) - len(set(indices)) < 2:
-        raise ConfigError(f"scene.holdout_cameras: {len(set(indices))} of {len(footage_names)} held out; two must be left to learn from")
+        raise ConfigError(
+            f"scene.holdout_cameras: {len(set(indices))} of {len(footage_names)} held out; two must be left to learn from"
+        )
     return tuple(sorted(set(indices)))
 
 
@@ -130,7 +140,9 @@ def held_out_frames(numbers, frames: tuple[int, ...]) -> tuple[int, ...]:
             "what comes after a gap cannot be learned from"
         )
     if len(frames) - len(indices) < 3:
-        raise ConfigError(f"scene.holdout_frames: {len(indices)} of {len(frames)} frames held out; three must be left to learn from")
+        raise ConfigError(
+            f"scene.holdout_frames: {len(indices)} of {len(frames)} frames held out; three must be left to learn from"
+        )
     return tuple(sorted(indices))
 
 
@@ -156,7 +168,7 @@ def assemble(
     """Scene from footage and the keys that say what world it shows.
 
     gravity [m/s^2], up, box ((min), (max)) [m]: three numbers each; density [kg/m^3]; last_free_frame and holdout_frames: frame
-    numbers as in the files; holdout_cameras: names; particles: folder of PLY files, one per frame; fps overrides the data's times.
+    numbers as in the files; holdout_cameras: names; particles: folder of PLY files, one per frame; fps overrides times.
     Errors: ConfigError naming the key, DataError for particle files.
     """
     up = vector(up, "up")
@@ -178,7 +190,9 @@ def assemble(
         times = torch.tensor([(f - footage.frames[0]) / fps for f in footage.frames], dtype=torch.float32)
     if last_free_frame is not None:
         if last_free_frame not in footage.frames:
-            raise ConfigError(f"scene.last_free_frame: no frame {last_free_frame}; the scene has {footage.frames[0]} to {footage.frames[-1]}")
+            raise ConfigError(
+                f"scene.last_free_frame: no frame {last_free_frame}; the scene has {footage.frames[0]} to {footage.frames[-1]}"
+            )
         last_free_frame = footage.frames.index(last_free_frame)
     scene = Scene(
         name=name, sequence=sequence, images=footage.images, mattes=footage.mattes, cameras=footage.cameras, times=times,

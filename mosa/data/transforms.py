@@ -48,9 +48,9 @@ def read_transforms(path: str | Path, *, frames=None, fps: float | None = None, 
     """Footage of a transforms.json (path: the file, or its folder).
 
     Top level or per entry: fl_x, fl_y, cx, cy [px] or camera_angle_x [rad], w, h. Per entry: file_path (extension may be left
-    out), transform_matrix (camera to world, OpenGL axes), time [s] (left out: the last number in the file name counts frames, and
-    fps says how fast), mask_path (grey, white = object; left out: the image's alpha), camera (left out: entries with one pose and
-    intrinsics are one camera). Errors: DataError naming file and entry, ConfigError.
+    out), transform_matrix (camera to world, OpenGL axes), time [s] (left out: the last number in the file name counts
+    frames at fps), mask_path (grey, white = object; left out: the image's alpha), camera (left out: entries with one
+    pose and intrinsics are one camera). Errors: DataError naming file and entry, ConfigError.
     """
     file = Path(path)
     file = file / "transforms.json" if file.is_dir() or not file.suffix else file
@@ -122,7 +122,9 @@ def counted_time(image: Path, fps: float | None, where: str) -> float:
     """Time [s] from the last number in a file name."""
     counter = re.findall(r"\d+", image.stem)
     if fps is None or not counter:
-        raise DataError(f"{where}: expected a time in seconds, found none; add `time`, or number the files and set scene.fps")
+        raise DataError(
+            f"{where}: expected a time in seconds, found none; add `time`, or number the files and set scene.fps"
+        )
     return int(counter[-1]) / fps
 
 
@@ -136,23 +138,30 @@ def group(shots: list[Shot], file: Path) -> tuple[dict[str, Shot], dict[str, lis
     for shot in shots:
         name = shot.camera
         if name is None:
-            same = (n for n, s in first.items() if s.camera is None and shot.intrinsics == s.intrinsics
-                    and same_camera((np.eye(3), s.w2c), np.eye(3), shot.w2c))
+            same = (
+                n
+                for n, s in first.items()
+                if s.camera is None
+                and shot.intrinsics == s.intrinsics
+                and same_camera((np.eye(3), s.w2c), np.eye(3), shot.w2c)
+            )
             name = next(same, str(len(first)))
         known = first.setdefault(name, shot)
         if known.intrinsics != shot.intrinsics or not same_camera((np.eye(3), known.w2c), np.eye(3), shot.w2c):
-            raise DataError(f"{shot.where}: camera {name} has another pose or intrinsics than in {known.where}; cameras must not move")
+            raise DataError(
+                f"{shot.where}: camera {name} has another pose or intrinsics than in {known.where}; cameras must not move"
+            )
         members.setdefault(name, []).append(shot)
     if len(shots) > 2 and len(first) == len(shots):
         raise DataError(
-            f"{file}: {len(shots)} entries with {len(first)} different poses: expected cameras that stand still and are seen again at "
-            "every time; a single moving camera cannot be used"
+            f"{file}: {len(shots)} entries with {len(first)} different poses: expected cameras that stand still and see "
+            "every frame; a single moving camera cannot be used"
         )
     return first, members
 
 
 def synchronise(by_camera: dict[str, list[Shot]], fps: float | None) -> tuple[list[float], list[list[Shot]]]:
-    """Times of the frames [s], and the shots [camera][frame]. Errors: DataError where a camera lacks a frame or has one twice."""
+    """Times of the frames [s], and the shots [camera][frame]. DataError where one is missing or doubled."""
     tolerance = 1e-6 if fps is None else 0.25 / fps
     times: list[float] = []
     for time in sorted(s.time for shots in by_camera.values() for s in shots):
@@ -164,13 +173,15 @@ def synchronise(by_camera: dict[str, list[Shot]], fps: float | None) -> tuple[li
         for shot in shots:
             index = int(np.abs(np.array(times) - shot.time).argmin())
             if row[index] is not None:
-                raise DataError(f"{shot.where}: camera {name} has two images at {shot.time:.6f} s, the other in {row[index].where}")
+                raise DataError(
+                    f"{shot.where}: camera {name} has two images at {shot.time:.6f} s, the other in {row[index].where}"
+                )
             row[index] = shot
         missing = [round(t, 6) for t, s in zip(times, row) if s is None]
         if missing:
             raise DataError(
-                f"{shots[0].where}: camera {name} has no image at {missing[:4]} s, where other cameras have one; cameras must be "
-                f"synchronous: {len(times)} frames expected, {len(shots)} found"
+                f"{shots[0].where}: camera {name} has no image at {missing[:4]} s, where other cameras have one; "
+                f"cameras must be synchronous: {len(times)} frames expected, {len(shots)} found"
             )
         table.append(row)
     return times, table
@@ -186,7 +197,8 @@ def read_shot(shot: Shot) -> tuple[np.ndarray, np.ndarray]:
         return color, np.ascontiguousarray(mask[..., 0])
     if pixels.shape[2] != 4:
         raise DataError(
-            f"{shot.image}: no matte: expected an alpha channel, or a mask_path in {shot.where}, found {pixels.shape[2]} channels"
+            f"{shot.image}: no matte: expected an alpha channel, or a mask_path in {shot.where}, "
+            f"found {pixels.shape[2]} channels"
         )
     return color, np.ascontiguousarray(pixels[..., 3])
 
@@ -196,7 +208,9 @@ def camera_matrix(shot: Shot, width: int, height: int) -> np.ndarray:
     known = shot.intrinsics
     for key, size in (("w", width), ("h", height)):
         if key in known and known[key] != size:
-            raise DataError(f"{shot.where}: intrinsics are for {key} = {known[key]:g} px, but {shot.image.name} is {width}x{height}")
+            raise DataError(
+                f"{shot.where}: intrinsics are for {key} = {known[key]:g} px, but {shot.image.name} is {width}x{height}"
+            )
     if "fl_x" in known:
         focal = known["fl_x"], known.get("fl_y", known["fl_x"])
     elif "camera_angle_x" in known:

@@ -29,7 +29,9 @@ def validate(scene: Scene) -> Scene:
         for v in range(V):
             for t in range(T):
                 if not bool(torch.isfinite(value[v, t]).all()):
-                    raise DataError(f"{label}: {name}: NaN or infinite pixels in camera {scene.cameras.names[v]}, frame {t}")
+                    raise DataError(
+                        f"{label}: {name}: NaN or infinite pixels in camera {scene.cameras.names[v]}, frame {t}"
+                    )
     check_cameras(scene, label)
     check_times(scene, label)
     check_mattes(scene, label)
@@ -43,7 +45,9 @@ def check_cameras(scene: Scene, label: str) -> None:
         if not bool(torch.isfinite(cameras.K[v]).all() and torch.isfinite(cameras.w2c[v]).all()):
             raise DataError(f"{label}: camera {name}: NaN or infinite numbers in its calibration")
         if not bool((cameras.K[v].diagonal()[:2] > 0).all()):
-            raise DataError(f"{label}: camera {name}: expected positive focal lengths, found {cameras.K[v].diagonal()[:2].tolist()}")
+            raise DataError(
+                f"{label}: camera {name}: expected positive focal lengths, found {cameras.K[v].diagonal()[:2].tolist()}"
+            )
         R = cameras.w2c[v, :3, :3].double()
         if float((R @ R.T - torch.eye(3, dtype=R.dtype)).abs().max()) > 2e-3 or float(torch.linalg.det(R)) < 0:
             raise DataError(f"{label}: camera {name}: expected a rotation in its pose, found {R.tolist()}")
@@ -59,7 +63,9 @@ def check_times(scene: Scene, label: str) -> None:
     """Increasing times at one frame rate."""
     steps = scene.times.double().diff()
     if not bool(torch.isfinite(scene.times).all()) or not bool((steps > 0).all()):
-        raise DataError(f"{label}: expected increasing frame times, found {[round(t, 5) for t in scene.times.tolist()]}")
+        raise DataError(
+            f"{label}: expected increasing frame times, found {[round(t, 5) for t in scene.times.tolist()]}"
+        )
     # float32 keeps 7 digits of the time itself, which is more than the jitter only for steps far smaller than the time
     allowed = TIME_JITTER * float(steps.median()) + 2e-7 * float(scene.times.abs().max())
     worst = int((steps - steps.median()).abs().argmax())
@@ -76,24 +82,40 @@ def check_mattes(scene: Scene, label: str) -> None:
     for v, name in enumerate(scene.cameras.names):
         if float(covered[v, 0]) == 0:
             raise DataError(
-                f"{label}: camera {name}: the matte of the first frame is empty; expected the object in view of every camera there: "
-                "matte it, remove the camera, or start later with scene.frames"
+                f"{label}: camera {name}: the matte of the first frame is empty; expected the object in view of every "
+                "camera there: matte it, remove the camera, or start later with scene.frames"
             )
         if float(covered[v].min()) > 0.99:
             raise DataError(
-                f"{label}: camera {name}: the matte covers {float(covered[v].min()):.0%} of every image; the footage has no matte "
-                "(an alpha channel that is opaque everywhere?)"
+                f"{label}: camera {name}: the matte covers {float(covered[v].min()):.0%} of every image; "
+                "the footage has no matte (an alpha channel that is opaque everywhere?)"
             )
 
 
 def fingerprint(scene: Scene) -> str:
     """Hash of everything that learning can depend on: images, mattes, cameras, times, world, and what is held out."""
     digest = hashlib.sha256()
-    for tensor in (scene.images, scene.mattes, scene.cameras.K, scene.cameras.w2c, scene.times, scene.gravity, scene.up, scene.box,
-                   scene.background):
+    for tensor in (
+        scene.images,
+        scene.mattes,
+        scene.cameras.K,
+        scene.cameras.w2c,
+        scene.times,
+        scene.gravity,
+        scene.up,
+        scene.box,
+        scene.background,
+    ):
         digest.update(str(tuple(tensor.shape)).encode())
         digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-    facts = (scene.cameras.width, scene.cameras.height, scene.ground, scene.density, scene.last_free_frame, scene.holdout_cameras,
-             scene.holdout_frames)
+    facts = (
+        scene.cameras.width,
+        scene.cameras.height,
+        scene.ground,
+        scene.density,
+        scene.last_free_frame,
+        scene.holdout_cameras,
+        scene.holdout_frames,
+    )
     digest.update(repr(facts).encode())
     return digest.hexdigest()[:16]

@@ -68,10 +68,12 @@ class Adapter(nn.Module):
     def switch_on(self, reference_modulus: Tensor | float, poisson: Tensor | float = 0.3) -> None:
         """Fix E_ref [Pa] and the Poisson number of C0 to the calibrated prior's. They never change afterwards: a moving unit
         would make dL/dE wrong and the law irreproducible from its weights. Errors: ConfigError on a second, other value."""
-        for name, value in (("E_ref", float(reference_modulus)), ("poisson", float(poisson))):
-            buffer = getattr(self, name)
+        for name, value in (("E_ref", reference_modulus), ("poisson", poisson)):
+            buffer, value = getattr(self, name), float(torch.as_tensor(value).detach())
             if not torch.isnan(buffer) and abs(float(buffer) - value) > 1e-6 * abs(value):
-                raise ConfigError(f"adapter: {name} is {float(buffer):.6g} already and fixed, found {value:.6g}: build a new adapter")
+                raise ConfigError(
+                    f"adapter: {name} is fixed at {float(buffer):.6g} already, found {value:.6g}: build a new adapter"
+                )
             buffer.fill_(value)
 
     @property
@@ -102,9 +104,9 @@ class StressAdapter(Adapter):
     """
 
     def __init__(
-        self, *, alpha: float = 0.1, l_max: float | None = 0.1, input_scale: float = 10.0, hidden: int = 64, rest_free: bool = True,
-        plastic: bool = False, major_symmetry: bool = False, state_dependence: str = "full", recompute: bool = False,
-        no_C: bool = False, no_pre: bool = False, no_post: bool = False, no_prior_stress: bool = False,
+        self, *, alpha: float = 0.1, l_max: float | None = 0.1, input_scale: float = 10.0, hidden: int = 64,
+        rest_free: bool = True, plastic: bool = False, major_symmetry: bool = False, state_dependence: str = "full",
+        recompute: bool = False, no_C: bool = False, no_pre: bool = False, no_post: bool = False, no_prior_stress: bool = False,
     ) -> None:  # fmt: skip
         super().__init__()
         if not 0 < alpha < 1:
@@ -115,10 +117,12 @@ class StressAdapter(Adapter):
         if no_prior_stress and no_pre:
             raise ConfigError("adapter: no_prior_stress needs L_pre (no_pre=false): the stress comes from it alone")
         self.rest_free, self.recompute = rest_free, recompute
-        shape = {"alpha": alpha, "input_scale": input_scale, "hidden": hidden, "state_dependence": state_dependence, "no_C": no_C,
-                 "no_pre": no_pre, "no_post": no_post}  # fmt: skip
+        shape = {"alpha": alpha, "input_scale": input_scale, "hidden": hidden, "state_dependence": state_dependence}
+        shape |= {"no_C": no_C, "no_pre": no_pre, "no_post": no_post}
         bound = None if no_prior_stress else l_max  # without the prior the residuals have to carry the whole stress
-        self.operator = ProgressiveOperator(l_max=bound, major_symmetry=major_symmetry, no_prior_stress=no_prior_stress, **shape)
+        self.operator = ProgressiveOperator(
+            l_max=bound, major_symmetry=major_symmetry, no_prior_stress=no_prior_stress, **shape
+        )
         # C0 is a stiffness: it has no meaning for the strain in the yield function
         self.plastic_operator = ProgressiveOperator(l_max=l_max, **shape) if plastic else None
 
@@ -139,7 +143,7 @@ class StressAdapter(Adapter):
         return G + torch.eye(6).to(G), b
 
     def increment(self, w: Tensor, s: Tensor) -> Tensor:
-        """d(w, s) - [rest_free] d(0, 0), (N, 6), in the paper's order of operations (steps 1 to 6); w, s: (N, 6) dimensionless."""
+        """d(w, s) - [rest_free] d(0, 0), (N, 6), in the paper's order (steps 1 to 6); w, s: (N, 6) dimensionless."""
         if self.operator.major_symmetry:
             G, b, _ = self.affine(self.operator, w, s)
             return apply(G, s) + b

@@ -5,22 +5,30 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from mosa.errors import ConfigError
+from mosa.modules.networks import TwoHiddenLayers, zero_outputs
+
 
 class HeterogeneityField(nn.Module):
-    """Coordinate network eta on rest positions normalised to the box (low, high), each (3,) [m]. eta is 0 at initialisation.
+    """Coordinate network eta on rest positions normalised to the object's box. eta is exactly 0 at initialisation.
 
-    frequencies: sines and cosines of pi 2^k x, k = 0 .. frequencies - 1, beside x itself.
+    low, high: (3,) [m] corners of the box; amplitude: largest relative deviation; frequencies: sines and cosines of pi 2^k x,
+    k = 0 .. frequencies - 1, beside x in [-1, 1] itself. Errors: ConfigError naming the key.
     """
 
     def __init__(self, low: Tensor, high: Tensor, amplitude: float = 0.2, hidden: int = 32, frequencies: int = 2) -> None:
         super().__init__()
+        if not 0 < amplitude < 1:
+            raise ConfigError(f"heterogeneity.amplitude: expected a number between 0 and 1, found {amplitude}")
+        if frequencies < 0 or hidden < 1:
+            raise ConfigError(f"heterogeneity: expected frequencies >= 0 and hidden >= 1, found {frequencies} and {hidden}")
+        if not bool((high > low).all()):
+            raise ConfigError(f"heterogeneity: the box of the object has no volume: {low.tolist()} to {high.tolist()}")
         self.register_buffer("low", low.detach().clone())
         self.register_buffer("high", high.detach().clone())
         self.amplitude, self.frequencies = amplitude, frequencies
-        self.net = nn.Sequential(nn.Linear(3 + 6 * frequencies, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU(),
-                                 nn.Linear(hidden, 1))
-        nn.init.zeros_(self.net[-1].weight)
-        nn.init.zeros_(self.net[-1].bias)
+        self.net = TwoHiddenLayers(3 + 6 * frequencies, 1, hidden)
+        zero_outputs(self.net[-1])
 
     def forward(self, X: Tensor) -> Tensor:
         """eta (N,) at rest positions X (N, 3) [m]."""

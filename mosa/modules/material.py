@@ -3,85 +3,140 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError
 from mosa.physics.elasticity import lame
+from mosa.physics.laws import law_named
 from mosa.physics.plasticity import friction_alpha
+from mosa.physics.rollout import MaterialState, Simulator
 
 NU_MAX, ANGLE_MAX = 0.49, 89.0
 
 
+class Form(NamedTuple):
+    """An open range and the map onto it. low, high: its bounds; held: bounds a parameter may be held at."""
+
+    low: float
+    high: float
+    held: tuple[float, ...]
+    inverse: Callable[[float], float]
+    physical: Callable[[Tensor], Tensor]
+
+
 def _logit(p: float) -> float:
-    return math.log(p / (1 - p))
+    return math.log(p) - math.log1p(-p)
 
 
-# name -> (to unconstrained, to physical, is inside its open range)
+def _scaled_sigmoid(high: float, held: tuple[float, ...]) -> Form:
+    return Form(0.0, high, held, lambda v: _logit(v / high), lambda u: high * torch.sigmoid(u))
+
+
+LOG = Form(0.0, math.inf, (), math.log, torch.exp)
+SOFTPLUS = Form(0.0, math.inf, (0.0,), lambda v: v + math.log(-math.expm1(-v)), nn.functional.softplus)
 FORMS = {
-    "log": (math.log, torch.exp, lambda v: v > 0),
-    "softplus": (lambda v: v + math.log(-math.expm1(-v)), nn.functional.softplus, lambda v: v > 0),
-    "nu": (lambda v: _logit(v / NU_MAX), lambda u: NU_MAX * torch.sigmoid(u), lambda v: 0 < v < NU_MAX),
-    "angle": (lambda v: _logit(v / ANGLE_MAX), lambda u: ANGLE_MAX * torch.sigmoid(u), lambda v: 0 < v < ANGLE_MAX),
-}
-FORM_OF = {"E": "log", "mu": "log", "kappa": "log", "yield_stress": "log", "viscosity": "softplus", "cohesion": "softplus",
-           "nu": "nu", "friction_angle": "angle"}
-AT_BOUND = {"cohesion": 0.0, "viscosity": 0.0}
-"""Values a parameter may start from that its unconstrained form cannot reach; it is held there."""
+    "E": LOG, "mu": LOG, "kappa": LOG, "yield_stress": LOG, "viscosity": SOFTPLUS, "cohesion": SOFTPLUS,
+    "nu": _scaled_sigmoid(NU_MAX, (0.0, NU_MAX)), "friction_angle": _scaled_sigmoid(ANGLE_MAX, (0.0, ANGLE_MAX)),
+}  # fmt: skip
+"""Every parameter a prior may name, SI units; friction_angle in degrees, cohesion a strain."""
+GIVES = {"E": ("mu", "lam"), "nu": (), "friction_angle": ("friction_alpha",)}
+"""What the simulator takes in place of a parameter; others are taken by their own name."""
+STIFFNESS = ("E", "mu", "kappa")
 
 
 class Material(nn.Module):
-    """Parameters of one prior law. law: name in `mosa.physics`; parameters: initial physical values (SI, friction_angle in
-    degrees); frozen: names that are not learned; modulated: names the heterogeneity factor multiplies (the stiffness).
+    """Parameters of one prior law.
 
-    Errors: ConfigError naming the parameter, its range and the value found.
+    law: name in `mosa.physics`; parameters: initial physical values (SI, friction_angle in degrees); frozen: names that are not
+    learned; modulated: names the heterogeneity factor multiplies, by default the stiffness (E, or mu and kappa together).
+    A parameter that starts on a bound of its range is held there.
+    Errors: ConfigError naming the parameter, what was expected and what was found.
     """
 
     def __init__(
         self, law: str, parameters: Mapping[str, float], frozen: Sequence[str] = (), modulated: Sequence[str] | None = None
     ) -> None:
         super().__init__()
-        unknown = sorted(set(parameters) - set(FORM_OF))
-        if unknown:
-            raise ConfigError(f"prior.parameters: unknown {unknown}; known are {', '.join(FORM_OF)}")
-        for name in [*frozen, *(modulated or ())]:
-            if name not in parameters:
-                raise ConfigError(f"prior: {name!r} is frozen or modulated but not among the parameters {sorted(parameters)}")
+        self._check_names(law, parameters, frozen, modulated)
         self.law, self.names = law, tuple(parameters)
         self.stiffness = "E" if "E" in parameters else "kappa"
-        self.modulated = tuple(modulated) if modulated is not None else tuple(n for n in ("E", "mu", "kappa") if n in parameters)
+        self.modulated = tuple(modulated) if modulated is not None else tuple(n for n in STIFFNESS if n in parameters)
         self.raw = nn.ParameterDict()
+        self.held: list[str] = []
         for name, value in parameters.items():
-            value = float(value)
-            if name in AT_BOUND and value == AT_BOUND[name]:
-                self.register_buffer(f"held_{name}", torch.tensor(value))
-                continue
-            inverse, _, valid = FORMS[FORM_OF[name]]
-            if not valid(value):
-                raise ConfigError(f"prior.parameters.{name}: {value} is outside its range")
-            self.raw[name] = nn.Parameter(torch.tensor(inverse(value)), requires_grad=name not in frozen)
+            self._add(name, value, name not in frozen)
+
+    def _check_names(self, law: str, parameters, frozen, modulated) -> None:
+        if unknown := sorted(set(parameters) - set(FORMS)):
+            raise ConfigError(f"prior.parameters: expected names among {', '.join(FORMS)}, found {', '.join(unknown)}")
+        for key, names in (("frozen", frozen), ("modulated", modulated or ())):
+            if strange := sorted(set(names) - set(parameters)):
+                raise ConfigError(f"prior.{key}: expected names among {', '.join(parameters)}, found {', '.join(strange)}")
+        if ("E" in parameters) != ("nu" in parameters):
+            raise ConfigError(f"prior.parameters: E and nu go together, found {', '.join(parameters)}")
+        if "E" not in parameters and "kappa" not in parameters:
+            raise ConfigError(f"prior.parameters: expected E with nu, or kappa with mu, found {', '.join(parameters)}")
+        known = law_named(law)
+        takes = {name for name in known.parameters if name != known.reference}
+        gives = {taken for name in parameters for taken in GIVES.get(name, (name,))}
+        if takes != gives:
+            raise ConfigError(
+                f"prior.parameters: law {law} takes {', '.join(sorted(takes))}; {', '.join(parameters)} give "
+                f"{', '.join(sorted(gives))} (mu, lam come from E, nu; friction_alpha from friction_angle)"
+            )
+
+    def _add(self, name: str, value: float, learned: bool) -> None:
+        form = FORMS[name]
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise ConfigError(f"prior.parameters.{name}: expected a number, found {value!r}")
+        value = float(value)
+        if value in form.held:
+            self.held.append(name)
+            self.register_buffer(f"held_{name}", torch.tensor(value))
+        elif form.low < value < form.high:
+            self.raw[name] = nn.Parameter(torch.tensor(form.inverse(value)), requires_grad=learned)
+        else:
+            raise ConfigError(
+                f"prior.parameters.{name}: expected a number between {form.low:g} and {form.high:g}, found {value:g}"
+            )
 
     def physical(self) -> dict[str, Tensor]:
         """Constrained global values, scalars, in SI units (friction_angle in degrees)."""
-        return {n: FORMS[FORM_OF[n]][1](self.raw[n]) if n in self.raw else getattr(self, f"held_{n}") for n in self.names}
+        return {n: getattr(self, f"held_{n}") if n in self.held else FORMS[n].physical(self.raw[n]) for n in self.names}
 
-    def per_particle(self, factor: Tensor) -> dict[str, Tensor]:
-        """Values the simulator takes; factor: (N,) heterogeneity of the modulated parameters."""
+    def per_particle(self, factor: Tensor | float = 1.0) -> dict[str, Tensor]:
+        """Values the simulator takes, by the law's own names; factor: (N,) heterogeneity of the modulated parameters, or 1.
+
+        Modulated values are (N,), the others ().
+        """
         values = {n: v * factor if n in self.modulated else v for n, v in self.physical().items()}
-        result = {n: v for n, v in values.items() if n not in ("E", "nu", "friction_angle")}
+        result = {n: v for n, v in values.items() if n not in GIVES}
         if "E" in values:
             result["mu"], result["lam"] = lame(values["E"], values["nu"])
         if "friction_angle" in values:
             result["friction_alpha"] = friction_alpha(values["friction_angle"])
         return result
 
-    def max_modulus(self, factor: Tensor) -> Tensor:
-        """Largest M = lam + 2 mu (kappa + 4 mu / 3 where the law has no E) over the particles [Pa], for the time step."""
-        p = self.per_particle(factor.detach())
-        return (p["lam"] + 2 * p["mu"] if "lam" in p else p["kappa"] + 4 * p["mu"] / 3).detach().max()
+    def max_modulus(self, factor: Tensor | float = 1.0) -> Tensor:
+        """Largest P wave modulus over the particles [Pa], (): lam + 2 mu, or kappa + 4 mu/3. For the time step; no gradient."""
+        factor = factor.detach() if isinstance(factor, Tensor) else factor
+        p = {n: v.detach() for n, v in self.per_particle(factor).items()}
+        return (p["lam"] + 2 * p["mu"] if "lam" in p else p["kappa"] + 4 * p["mu"] / 3).max()
 
     def reference_modulus(self) -> Tensor:
-        """E, or kappa where the law has no E [Pa]: what the adapter's stress is measured in."""
+        """E, or kappa where the law has no E [Pa], (), without gradient: the unit the adapter measures stress in."""
         return self.physical()[self.stiffness].detach()
+
+
+def material_states(law: str, parameters: Mapping[str, Tensor | float], **options) -> Callable[[Tensor], MaterialState]:
+    """Function of F (M, 3, 3) float64 to what an adapter reads there (in float64), under `law` with scalar `parameters`.
+
+    parameters: physical values by the law's own names (`Material.per_particle()`); options: of `Simulator`.
+    """
+    simulator = Simulator(law, dx=1.0, substeps=1, frame_dt=1.0, dtype=torch.float64, **options)
+    values = {name: torch.as_tensor(value).detach().double().cpu() for name, value in parameters.items()}
+    return lambda F: simulator.material_state(F, torch.zeros_like(F), values)

@@ -1,6 +1,6 @@
 """The redistribution operator: four LU-parametrised 3x3 corrections assembled into one 6x6 operator on Voigt stress.
 
-Steps 2 to 4 of method.md, section 4; appendix on the microplane parametrisation in the paper. vech order: xx, yy, zz, yz, zx, xy.
+Steps 2 to 4 of method.md, section 4; the paper's appendix on microplanes. vech order: xx, yy, zz, yz, zx, xy.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Steps 1 to 5 of the progressive stress adaptation (method.md, section 4): what the four networks give for one symmetric tensor."""
+"""Steps 1 to 5 of the progressive stress adaptation (method.md, section 4): the four networks on one symmetric tensor."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from mosa.modules.networks import TwoHiddenLayers, zero_outputs
 
 
 class Correction(NamedTuple):
-    """What corrects s (N, 6): s3 = (I + G)(s + pre) + post. G: (N, 6, 6); pre, post: (N, 6); C: (N, 4, 3, 3), C_x C_y C_z C_xyz."""
+    """What corrects s (N, 6): s3 = (I + G)(s + pre) + post. G: (N, 6, 6); pre, post: (N, 6);
+    C: (N, 4, 3, 3), the corrections C_x, C_y, C_z, C_xyz."""
 
     G: Tensor
     pre: Tensor
@@ -23,7 +24,7 @@ class Correction(NamedTuple):
 class ProgressiveOperator(nn.Module):
     """Four networks on a dimensionless symmetric tensor s (N, 6) and the stretch w = vech(W - I) (N, 6).
 
-    alpha: bound of the entries of the LU factors; l_max: of L_pre and L_post, None leaves them linear (the paper's literal form);
+    alpha: bound of the entries of the LU factors; l_max: of L_pre and L_post, None leaves them linear (the paper's form);
     state_dependence: full | constant (the four matrices are learned numbers, not functions of the state);
     major_symmetry: (A + C0 A^T C0^-1)/2 in place of A, needs `poisson` of C0;
     no_prior_stress: s1 = L_pre instead of s + L_pre. The output is exactly 0 at initialisation.
@@ -108,8 +109,8 @@ class ProgressiveOperator(nn.Module):
         return Correction(G, pre, post, torch.cat([planes, normal[:, None]], 1))
 
     def stepwise(self, w: Tensor, s: Tensor) -> Tensor:
-        """s3 (N, 6) in the paper's order, nothing assembled. Not for major_symmetry, which is a property of the 6x6 operator."""
-        pre, s1, kw = self.first(w, s)
+        """s3 (N, 6) in the paper's order, nothing assembled; without major_symmetry, which is one of the 6x6 operator."""
+        _, s1, kw = self.first(w, s)
         planes, l1 = self.plane_corrections(kw, s1)
         n, shears = microplane.stepwise_planes(s1, planes)
         normal, l2 = self.normal_correction(l1, n)

@@ -1,7 +1,8 @@
 """Motion cues: deformation of each particle's rest neighbourhood by weighted least squares, and rotation and stretch from it.
 
-Source: method.md, section 7. With isotropic Gaussians their rotation is not identifiable from images (only F F^T is), so beside the
-paper's cue (`gaussian`) there is `neighbourhood`, which fits F to the reconstructed displacements of the nearest rest neighbours.
+Source: method.md, section 7. With isotropic Gaussians their rotation is not identifiable from images (only F F^T is),
+so beside the paper's cue (`gaussian`) there is `neighbourhood`, which fits F to the reconstructed displacements of the
+nearest rest neighbours.
 """
 
 from __future__ import annotations
@@ -120,7 +121,7 @@ def neighbourhood_cues(positions: Tensor, covariances: Tensor, around: Neighbour
 def gaussian_cues(positions: Tensor, covariances: Tensor, splats: Splats, scales: Tensor, rotations: Tensor) -> MotionCues:
     """The paper's cues: change of each Gaussian's own scale and rotation since frame 0.
 
-    scales: (T, N, 3) [m] after activation; rotations: (T, N, 4) wxyz. stretch = S_t / S_0 per axis, sorted; weight 1 everywhere.
+    scales: (T, N, 3) [m] after activation; rotations: (T, N, 4) wxyz. stretch = S_t / S_0 per axis, sorted; weight 1.
     """
     rest = quaternion_rotation(splats.rotations)
     rotation = quaternion_rotation(rotations) @ rest.transpose(-1, -2)

@@ -1,8 +1,8 @@
-"""Dynamic stage: the motion of the filled scaffold through all frames, fitted to the images by rendering (method.md, section 7).
+"""Dynamic stage: the motion of the filled scaffold through all frames, fitted to the images by rendering.
 
-First every frame is tracked from the one before it at half resolution, starting from the displacement of the visual hulls'
-centres; then all frames are refined together at full resolution. The interior, which no camera sees, follows the surface through
-the smooth modes and a weak elastic energy.
+Source: method.md, section 7. First every frame is tracked from the one before it, starting from the displacement of the
+visual hulls' centres; then all frames are refined together. The interior, which no camera sees, follows the surface
+through the smooth modes, their bending energy and a weak elastic energy.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from mosa.reconstruction.uniform_adam import UniformAdam
 from mosa.rendering.rasterizer import rasterize
 from mosa.types import Splats
 
-
 Motion = ModalMotion | MotionBasisNetwork
 
 
@@ -41,12 +40,16 @@ class Scaffold:
 class DynamicSettings:
     """model: `modes` (amplitudes of smooth modes per frame) or `network` (motion bases, GIC).
 
-    carriers: Gaussians that are compared with the images, `static` (those of the static stage, moved by the same motion: finer,
-    3 times less motion error than coarse particles) or `particles` (the paper); modes: number of modes; free_shape: Gaussians' scale and rotation are free instead of following the deformation (always so for
-    the network); track_iterations: per frame and for the first fit at half resolution; track_views: images per such step;
-    iterations: steps of the joint refinement, each sees `views` images of every frame; lr: Adam step of an amplitude in units of
-    the object's radius; elastic, bending: weights of the regularisers; poisson: Poisson ratio of the elastic energy; hidden,
-    basis_layers, coefficient_layers, bases: size of the network, lr_network its Adam step.
+    carriers: Gaussians that are compared with the images: `particles` (the paper) or `static`, those of the static stage
+    moved by the same motion. They are finer: the built-in rabbit's particles had an RMS error of
+    0.92 mm against 1.17 mm (network with 600 iterations: 3.5 mm).
+    modes: number of modes; free_shape: Gaussians' scale and rotation are free instead of following the deformation (always
+    so for the network); track_iterations, track_views, lr_track: steps per frame of the first pass, images per step, step;
+    iterations: steps of the joint refinement, each sees `views` images of every frame; lr: its step. Steps are in units of
+    the object's radius, for all amplitudes of a frame together.
+    elastic: weight of the mean St. Venant-Kirchhoff energy, poisson its Poisson ratio; bending: weight of the modes' mean
+    squared curvature (in units of the body's size: it does not depend on spacing or number of modes).
+    bases, hidden, basis_layers, coefficient_layers, lr_network: size and Adam step of the network.
     """
 
     model: str = "modes"
@@ -178,9 +181,9 @@ def fit_motion(
 ) -> Motion:
     """Motion through all frames of `windows`.
 
-    scaffold: the N filled particles; carried: the Gaussians that are rendered, the particles themselves or the static Gaussians,
-    which show more detail; offsets: (T, 3) [m] first guess of the object's centre per frame; reach [m]: radius of the object, the
-    unit of displacements.
+    scaffold: the N filled particles; carried: the Gaussians that are rendered, the particles themselves or the static
+    Gaussians; offsets: (T, 3) [m] first guess of the object's centre per frame; reach [m]: radius of the object, the unit
+    of displacements.
     """
     generator = torch.Generator().manual_seed(seed)
     moving = list(range(1, len(offsets)))

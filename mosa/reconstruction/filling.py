@@ -71,8 +71,9 @@ def body_volume(volume: Volume, *, threshold: float = 0.5) -> float:
     return float(_body(volume, threshold).sum()) * volume.pitch**3
 
 
-def _keep_thin_features(kept: np.ndarray, count: np.ndarray, cell: np.ndarray, voxels: np.ndarray, centres: np.ndarray,
-                        reach: float) -> None:
+def _keep_thin_features(
+    kept: np.ndarray, count: np.ndarray, cell: np.ndarray, voxels: np.ndarray, centres: np.ndarray, reach: float
+) -> None:
     """Keeps further cells, the fullest first, until no voxel is farther than `reach` from a kept cell's centre.
 
     kept, count: per cell; cell: (M,) cell of each voxel; voxels: (M, 3); centres: of all cells. Changes `kept`.
@@ -88,9 +89,10 @@ def _keep_thin_features(kept: np.ndarray, count: np.ndarray, cell: np.ndarray, v
 def fill(volume: Volume, *, spacing: float, threshold: float = 0.5, smallest_part: float = 0.25) -> Particles:
     """Particles on a lattice of `spacing` [m] inside the 0.5 level of an occupancy volume (pitch well below the spacing).
 
-    The fullest cells hold a particle each, as many as volume / spacing^3, but none filled by less than `smallest_part`. Each voxel of the body belongs to the particle of its
-    cell or, where that has none, to the nearest one; a particle's volume is that of its voxels and it sits at their centroid: so
-    total volume, centre of mass and, nearly, moments of inertia are those of the body, and the interior is a regular lattice.
+    The fullest cells hold a particle each, as many as volume / spacing^3, but none filled by less than `smallest_part`.
+    Each voxel of the body belongs to the particle of its cell or, where that has none, to the nearest one; a particle's
+    volume is that of its voxels and it sits at their centroid: so total volume, centre of mass and, nearly, moments of
+    inertia are those of the body, and the interior is a regular lattice.
     Features thinner than the lattice keep particles of their own. Raises DataError for an empty volume.
     """
     body = _body(volume, threshold)
@@ -107,16 +109,15 @@ def fill(volume: Volume, *, spacing: float, threshold: float = 0.5, smallest_par
     full = (spacing / volume.pitch) ** 3
     smallest = max(np.partition(count, -min(wanted, len(count)))[-min(wanted, len(count))], smallest_part * full)
     kept = count >= smallest
-    to_cell = lambda i: np.stack(np.unravel_index(i, shape), -1)  # noqa: E731
-    _keep_thin_features(kept, count, flat, voxels, (to_cell(np.arange(len(count))) + low + 0.5) * spacing + centre, 1.5 * spacing)
+    centres = (np.stack(np.unravel_index(np.arange(len(count)), shape), -1) + low + 0.5) * spacing + centre
+    _keep_thin_features(kept, count, flat, voxels, centres, 1.5 * spacing)
     names = np.flatnonzero(kept)
     owner = np.full(len(count), -1)
     owner[names] = np.arange(len(names))
     owner = owner[flat]
     stray = owner < 0
-    corner = (to_cell(names) + low + 0.5) * spacing + centre
     if stray.any():
-        owner[stray] = cKDTree(corner).query(voxels[stray])[1]
+        owner[stray] = cKDTree(centres[names]).query(voxels[stray])[1]
     held = np.bincount(owner, minlength=len(names))
     positions = np.stack([np.bincount(owner, voxels[:, a], len(names)) for a in range(3)], -1) / held[:, None]
     solid = np.zeros(shape + 2, bool)

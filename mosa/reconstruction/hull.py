@@ -1,4 +1,4 @@
-"""Visual hull: where every matte sees the object. An upper bound of the body, exact on silhouettes, sub-pixel on soft mattes."""
+"""Visual hull: where every matte sees the object. An upper bound of the body, exact on silhouettes."""
 
 from __future__ import annotations
 
@@ -86,8 +86,9 @@ def hull_bounds(mattes: Tensor, cameras: Cameras, box: Tensor, *, resolution: in
         inside = points[occupancy(points, grown, cameras) > 0.5]
         if len(inside) == 0:
             raise DataError(
-                f"visual hull: no point of the box {bounds.tolist()} lies inside all {len(cameras)} mattes; check scene.box, the "
-                f"cameras' axes and the mattes (smallest matte covers {float(mattes.mean((1, 2)).min()):.2%} of its image)"
+                f"visual hull: no point of the box {bounds.tolist()} lies inside all {len(cameras)} mattes; check "
+                "scene.box, the cameras' axes and the mattes (the smallest matte covers "
+                f"{float(mattes.mean((1, 2)).min()):.2%} of its image)"
             )
         bounds = torch.stack([inside.amin(0) - pitch, inside.amax(0) + pitch])
     return bounds
@@ -112,10 +113,10 @@ def hull_centroid(mattes: Tensor, cameras: Cameras, box: Tensor, *, resolution: 
 def shave_ridges(volume: Volume, cameras: Cameras, *, passes: int = 24, sigma: float = 2.0) -> Volume:
     """The hull with its ridges rounded where no silhouette asks for them; returns 0 or 1 per voxel.
 
-    A hull of few views sticks out where the cones of two silhouettes meet (3 to 10 % of the volume for 8 to 12 cameras, measured, of which
-    this takes half to two thirds). Each pass moves the surface by its mean curvature (Gaussian of `sigma` voxels, threshold 0.5), never
-    outwards of the hull, and then gives back the hull's voxels on every ray of a silhouette that nothing covers any more: the
-    silhouettes stay what they are.
+    A hull of few views sticks out where the cones of two silhouettes meet: by 3 to 10 % of the volume for 8 to 12 cameras,
+    of which this takes a third to all (measured). Each pass moves the surface by its mean curvature (Gaussian of `sigma`
+    voxels, threshold 0.5), never outwards of the hull, and then gives back the hull's voxels on every ray of a silhouette
+    that nothing covers any more: the silhouettes stay what they are.
     """
     hull = (volume.values > 0.5).cpu().numpy()
     index = np.argwhere(hull)
@@ -124,7 +125,8 @@ def shave_ridges(volume: Volume, cameras: Cameras, *, passes: int = 24, sigma: f
     for K, w2c in zip(cameras.K.double().cpu(), cameras.w2c.double().cpu()):
         seen = points @ w2c[:3, :3].T + w2c[:3, 3]
         pixel = seen @ K.T
-        # bins of 0.75 voxels: fine enough not to lose a skin of the silhouette, coarse enough that a column of voxels leaves no hole
+        # bins of 0.75 voxels: fine enough not to lose a skin of the silhouette, coarse enough that a column of voxels
+        # leaves no hole
         column, row = (pixel[:, :2] / pixel[:, 2:] / (0.75 * volume.pitch * K[0, 0] / seen[:, 2].mean())).long().unbind(1)
         rays.append(np.unique((row * (column.max() + 1) + column).numpy(), return_inverse=True)[1])
     current, flat = hull.astype(np.float32), np.ravel_multi_index(index.T, hull.shape)

@@ -1,8 +1,8 @@
 """Smooth deformation modes of a particle set: the softest patterns of a moving-least-squares bending energy.
 
-Displacements u = sum_k mode_k a_k. The energy sum_ij w_ij |u_j - u_i - F_i d_ij|^2 with F_i the least-squares gradient vanishes
-exactly for affine motions and grows with wiggles, so the first four modes span affine motion and the next are ever finer; inside
-the body, which no camera sees, they continue the motion of the surface smoothly.
+Displacements u = sum_k mode_k a_k. The energy sum_ij w_ij |u_j - u_i - F_i d_ij|^2 with F_i the least-squares gradient
+vanishes exactly for affine motions and grows with wiggles, so the first four modes span affine motion and the next are ever
+finer; inside the body, which no camera sees, they continue the motion of the surface smoothly.
 """
 
 from __future__ import annotations

@@ -15,8 +15,8 @@ from mosa.types import Splats
 @dataclass(frozen=True)
 class MotionSample:
     """S frames of a moving Gaussian set. positions: (S, N, 3) [m]; covariances: (S, N, 3, 3) [m^2]; deformation: (S, N, 3, 3);
-    scales: (S, N, 3) [m]; rotations: (S, N, 4) quaternions wxyz of the Gaussians (None where the shape follows the deformation).
-    deformation is None where the network is evaluated without neighbourhoods.
+    scales: (S, N, 3) [m]; rotations: (S, N, 4) quaternions wxyz of the Gaussians, None where their shape follows the
+    deformation. deformation is None where the network is evaluated without neighbourhoods.
     """
 
     positions: Tensor
@@ -50,8 +50,9 @@ def shape_covariances(scales: Tensor, rotations: Tensor) -> Tensor:
 class ModalMotion(nn.Module):
     """Displacement of frame t = offset_t + sum_k modes_k amplitude_tk (in units `reach` [m] times a factor that falls with k).
 
-    Frame 0 is the rest frame. With `free_shape` the Gaussians' scale and rotation have amplitudes of their own (the paper's free
-    scale and rotation); otherwise A_t = F_t A_0 F_t^T with F_t the gradient of the displacement, as in the simulation.
+    Frame 0 is the rest frame. With `free_shape` the Gaussians' scale and rotation have amplitudes of their own (the
+    paper's free scale and rotation); otherwise A_t = F_t A_0 F_t^T with F_t the deformation gradient, as in the
+    simulation.
     offsets: (T, 3) [m] first guess of the translation of each frame.
     """
 
@@ -119,8 +120,8 @@ def _mlp(inputs: int, hidden: int, layers: int, outputs: int) -> nn.Sequential:
 class MotionBasisNetwork(nn.Module):
     """Deformation = mean over `bases` of coefficient_b(x, t) basis_b(t), after GIC (rendering.md, "Dynamic stage").
 
-    basis_b: time to 10 numbers (translation 3 in units of `reach` [m], quaternion 4, log scale 3); coefficient_b: position and
-    time to a number. The value at t = 0 is subtracted, so that frame 0 is the rest frame. Gaussians have free scale and rotation.
+    basis_b: time to 10 numbers (translation 3 in units of `reach` [m], quaternion 4, log scale 3); coefficient_b: position
+    and time to a number. The value at t = 0 is subtracted, so that frame 0 is the rest frame. Scale and rotation are free.
     """
 
     def __init__(

@@ -14,7 +14,7 @@ from mosa.types import Cameras, Scene
 
 @dataclass(frozen=True)
 class Windows:
-    """B windows. images: (B, h, w, 3); mattes: (B, h, w); cameras: B of them, shifted to their window; view, frame: (B,) long."""
+    """B windows. images: (B, h, w, 3); mattes: (B, h, w); cameras: B, shifted to their window; view, frame: (B,) long."""
 
     images: Tensor
     mattes: Tensor
@@ -71,8 +71,9 @@ def object_windows(scene: Scene, views: list[int], frames: list[int], *, margin:
     occupied = mattes > 0.5
     for b in (~occupied.flatten(1).any(1)).nonzero()[:, 0].tolist():
         raise DataError(
-            f"scene {scene.name}: the matte of camera {scene.cameras.names[view[b]]} at frame {int(frame[b])} is empty; the object "
-            "has to be seen by every training camera at every training frame (else put the camera into scene.holdout_cameras)"
+            f"scene {scene.name}: the matte of camera {scene.cameras.names[view[b]]} at frame {int(frame[b])} is empty; the "
+            "object has to be seen by every training camera at every training frame (else put the camera into "
+            "scene.holdout_cameras)"
         )
     left, right = _extent(occupied.any(1))
     top, bottom = _extent(occupied.any(2))
@@ -84,12 +85,11 @@ def object_windows(scene: Scene, views: list[int], frames: list[int], *, margin:
     pad = max(width, height)
     mattes = F.pad(mattes, (pad, pad, pad, pad))
     images = torch.stack([F.pad(images[..., c], (pad, pad, pad, pad), value=float(scene.background[c])) for c in range(3)], -1)
-    cut = lambda a: torch.stack(
-        [
-            a[b, y + pad : y + pad + height, x + pad : x + pad + width]  # noqa: E731
-            for b, (x, y) in enumerate(zip(x0.tolist(), y0.tolist()))
-        ]
-    )
+    corners = list(enumerate(zip(x0.tolist(), y0.tolist())))
+
+    def cut(padded: Tensor) -> Tensor:
+        return torch.stack([padded[b, y + pad : y + pad + height, x + pad : x + pad + width] for b, (x, y) in corners])
+
     K = scene.cameras.K[view].clone()
     K[:, 0, 2] -= x0
     K[:, 1, 2] -= y0

@@ -1,4 +1,4 @@
-"""Reconstruction of a sequence: hull -> static Gaussians -> filling -> appearance -> motion -> cues; each stage cached on disk."""
+"""Reconstruction of a sequence: hull -> static Gaussians -> filling -> appearance -> motion -> cues; every stage is cached."""
 
 from __future__ import annotations
 
@@ -32,9 +32,10 @@ CACHE_VERSION = 1
 
 @dataclass(frozen=True)
 class ReconstructionSettings:
-    """resolution: voxels along the object's longest side in the hull; ridge_passes: hull.shave_ridges; carve: empty what lies in
-    front of the static Gaussians' depth by more than carve_tolerance [spacings]; points: static Gaussians; neighbours: of the
-    least-squares deformation; cue: neighbourhood | gaussian (method.md, section 7); margin: px of the windows around mattes."""
+    """resolution: voxels along the object's longest side in the hull; ridge_passes: hull.shave_ridges; carve: empty what
+    lies in front of the static Gaussians' depth by more than carve_tolerance [spacings]; points: static Gaussians;
+    neighbours: of the least-squares deformation; cue: neighbourhood | gaussian (method.md, section 7); margin: px of the
+    windows around mattes."""
 
     resolution: int = 80
     ridge_passes: int = 24
@@ -182,9 +183,10 @@ def reconstruct(
 ) -> Reconstruction:
     """Particles at frame 0 with their appearance, and their motion through the training frames, from images alone.
 
-    scene: only its training cameras and training frames are read, never its truth. spacing [m] of the particles; cache_dir: root
-    of the cache, None for no cache. A stopped run goes on with the first stage that is not stored. Returns tensors on the CPU;
-    cues cover the training frames, in order. Errors: DataError (empty mattes, empty hull), ConfigError.
+    scene: only its training cameras and training frames are read, never its truth. spacing [m] of the particles;
+    cache_dir: root of the cache, None for no cache. A stopped run goes on with the first stage that is
+    not stored. Returns tensors on the CPU; cues cover the training frames, in order.
+    Errors: DataError (empty mattes, empty hull), ConfigError.
     """
     if spacing <= 0:
         raise ConfigError(f"reconstruct: spacing must be positive, found {spacing}")

@@ -214,7 +214,8 @@ def initial_velocity(
     motion[6:9] = (times @ fallen) / times.square().sum()
     for target_px, iterations in ((40, 8), (None, 6)):
         level = make_level(images, mattes, cameras, start.center[0], target_px)
-        motion = fit_flight(body, level, start, motion, times, gravity, background, iterations=iterations)
+        last = target_px is None
+        motion = fit_flight(body, level, start, motion, times, gravity, background, iterations=iterations, central=last)
     return motion[6:9], motion[9:]
 
 
@@ -228,13 +229,15 @@ def fit_flight(
     background: Tensor,
     *,
     iterations: int,
+    central: bool,
 ) -> Tensor:
     """`motion` (12,) after damped Gauss-Newton steps over all frames of the level."""
     frame = torch.arange(len(times), device=times.device)
     damping = torch.full((1,), 1e-3).to(motion)
     best, trial, state = motion, motion, None
     for _ in range(iterations):
-        cost, gradient, matrix = normal_equations(body, level, flight(start, trial, times, gravity), background, frame)
+        poses = flight(start, trial, times, gravity)
+        cost, gradient, matrix = normal_equations(body, level, poses, background, frame, central=central)
         J = flight_jacobian(trial, times, body.radius)
         new = (
             cost.mean(),

@@ -142,7 +142,7 @@ def _relocate(parameters: dict[str, Tensor], optimizer: torch.optim.Adam, genera
         return
     chance = torch.where(opacity < 0.02, torch.zeros_like(opacity), opacity * parameters["log_scale"].exp() ** 2)
     target = torch.multinomial(chance.cpu(), len(dead), replacement=True, generator=generator).to(dead.device)
-    for name, value in parameters.items():
+    for value in parameters.values():
         value.data[dead] = value.data[target]
         for moment in ("exp_avg", "exp_avg_sq"):
             if value in optimizer.state:

@@ -7,8 +7,9 @@ from torch import Tensor
 
 
 class UniformAdam(torch.optim.Optimizer):
-    """Adam whose second moment is the sum over all axes but the first (one per frame); after Nicolet et al. 2021, "Large steps".
+    """Adam whose second moment is the sum over all axes but the first (one per frame).
 
+    Source: Nicolet et al. 2021, "Large steps in inverse rendering of geometry", where one serves all numbers.
     Directions keep the proportions that the gradient gives them, so a preconditioned parametrisation (smooth modes with units
     that fall with their wave number) stays preconditioned; plain Adam would equalise all of them.
     """

@@ -9,8 +9,6 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError, DataError
-from mosa.rendering.covariance import covariance_from as covariance_from
-from mosa.rendering.covariance import quaternion_to_matrix as quaternion_to_matrix
 from mosa.types import Cameras
 
 
@@ -47,9 +45,7 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
     forward = target - eye
     right = torch.linalg.cross(forward, up.to(forward).expand_as(forward))
     if bool((right.norm(dim=-1) <= 1e-9 * forward.norm(dim=-1)).any()) or bool((forward.norm(dim=-1) == 0).any()):
-        raise ConfigError(
-            "look_at: eye and target coincide or the line of sight is parallel to up; choose another eye or up"
-        )
+        raise ConfigError("look_at: eye and target coincide or the line of sight is parallel to up; choose another eye or up")
     forward = forward / forward.norm(dim=-1, keepdim=True)
     right = right / right.norm(dim=-1, keepdim=True)
     R = torch.stack((right, torch.linalg.cross(forward, right), forward), -2)
@@ -84,10 +80,7 @@ def crop_images(images: Tensor, x0: Tensor, y0: Tensor, width: int, height: int,
     """The windows of `crop_cameras` cut from images (V, ..., H, W, ...) whose rows are dimension `axis` and columns
     the next."""
     return torch.stack(
-        [
-            image.narrow(axis - 1, y, height).narrow(axis, x, width)
-            for image, x, y in zip(images, x0.tolist(), y0.tolist())
-        ]
+        [image.narrow(axis - 1, y, height).narrow(axis, x, width) for image, x, y in zip(images, x0.tolist(), y0.tolist())]
     )
 
 
@@ -113,9 +106,7 @@ def crop_boxes(
         highs.append(high)
     empty = highs[0] <= lows[0]
     if bool(empty.all()):
-        raise DataError(
-            f"crop_boxes: none of the {views} mattes has a pixel above {threshold}; the object is not seen at all"
-        )
+        raise DataError(f"crop_boxes: none of the {views} mattes has a pixel above {threshold}; the object is not seen at all")
     starts, sizes = [], []
     for low, high, limit in zip(lows, highs, (W, H)):
         size = int((high - low)[~empty].max()) + 2 * margin

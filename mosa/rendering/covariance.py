@@ -68,11 +68,7 @@ def project_gaussians(means: Tensor, covariances: Tensor, cameras: Cameras) -> t
     jx = sx.clamp(-cx / fx - CLAMP_MARGIN * half_x, (cameras.width - cx) / fx + CLAMP_MARGIN * half_x)
     jy = sy.clamp(-cy / fy - CLAMP_MARGIN * half_y, (cameras.height - cy) / fy + CLAMP_MARGIN * half_y)
     rows = R.unbind(-2)
-    first = (
-        (fx / z)[..., None] * rows[0]
-        + (skew / z)[..., None] * rows[1]
-        - ((fx * jx + skew * jy) / z)[..., None] * rows[2]
-    )
+    first = (fx / z)[..., None] * rows[0] + (skew / z)[..., None] * rows[1] - ((fx * jx + skew * jy) / z)[..., None] * rows[2]
     second = (fy / z)[..., None] * rows[1] - (fy * jy / z)[..., None] * rows[2]
     half_first = (covariances * first[..., None, :]).sum(-1)
     half_second = (covariances * second[..., None, :]).sum(-1)

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import torch
 import warp as wp
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from mosa.errors import ConfigError
+from mosa.errors import ConfigError, DataError
 from mosa.rendering.covariance import CLAMP_MARGIN
 from mosa.rendering.projection_kernels import projection_kernels
 from mosa.rendering.raster_kernels import raster_kernels
@@ -89,9 +90,7 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means: Tensor, covariances: Tensor, opacities: Tensor, features: Tensor, geometry: _Geometry):
         g, preset = geometry, geometry.preset
-        means, covariances, opacities, features = (
-            x.detach().contiguous() for x in (means, covariances, opacities, features)
-        )
+        means, covariances, opacities, features = (x.detach().contiguous() for x in (means, covariances, opacities, features))
         images, count, channels = len(g.state_index), means.shape[1], features.shape[-1]
         arrays, device = _Arrays(means.dtype), wp.device_from_torch(means.device)
         centers, conics = means.new_zeros(images, count, 2), means.new_zeros(images, count, 3)
@@ -137,9 +136,7 @@ class _Rasterize(torch.autograd.Function):
         if g.scan == "gaussian":
             lists = ()
             kernel, _ = raster_kernels(arrays.scalar, channels)
-            wp.launch(
-                kernel, dim=images, inputs=[_integers(order), *shared, rects_wp, *tail], outputs=outputs, device=device
-            )
+            wp.launch(kernel, dim=images, inputs=[_integers(order), *shared, rects_wp, *tail], outputs=outputs, device=device)
         else:
             lists = tile_lists(order, rects, g.width, g.height)
             kernel, _ = tile_kernels(arrays.scalar, channels)
@@ -157,10 +154,9 @@ class _Rasterize(torch.autograd.Function):
         return image, 1 - transmittance
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, grad_image: Tensor, grad_alpha: Tensor):
-        means, covariances, opacities, features, centers, conics, weights, rects, order, final, ends, *lists = (
-            ctx.saved_tensors
-        )
+        means, covariances, opacities, features, centers, conics, weights, rects, order, final, ends, *lists = ctx.saved_tensors
         g, preset = ctx.geometry, ctx.geometry.preset
         images, count, channels = len(g.state_index), means.shape[1], features.shape[-1]
         arrays, device = _Arrays(means.dtype), wp.device_from_torch(means.device)
@@ -250,13 +246,13 @@ def _check(
         if tuple(value.shape) not in shapes or 0 in value.shape:
             raise ConfigError(f"rasterize: {name} has shape {tuple(value.shape)}, expected one of {shapes}, none empty")
         if value.device != means.device:
-            raise ConfigError(
-                f"rasterize: {name} is on {value.device}, means on {means.device}; move all to one device"
-            )
+            raise ConfigError(f"rasterize: {name} is on {value.device}, means on {means.device}; move all to one device")
         if name != "state_index" and (value.dtype != means.dtype or value.dtype not in _SCALARS):
-            raise ConfigError(
-                f"rasterize: {name} is {value.dtype}, means {means.dtype}; use one of float32, float64 for all"
-            )
+            raise ConfigError(f"rasterize: {name} is {value.dtype}, means {means.dtype}; use one of float32, float64 for all")
+    for name, value in (("means", means), ("covariances", covariances), ("opacities", opacities), ("features", features)):
+        if not bool(value.detach().isfinite().all()):
+            where = (~value.detach().isfinite()).nonzero()[0].tolist()
+            raise DataError(f"rasterize: {name}{where} is not finite; it would silently vanish from the image")
     if not means.is_cuda and (int(state_index.min()) < 0 or int(state_index.max()) >= states):
         raise ConfigError(f"rasterize: state_index reaches outside the {states} states")
 

@@ -22,9 +22,7 @@ def visible_covariance(mean: Tensor, covariance: Tensor, K: Tensor, w2c: Tensor,
     tx = z * torch.clamp(p[:, 0] / z, -cx / fx - 0.3 * tan_x, (width - cx) / fx + 0.3 * tan_x)
     ty = z * torch.clamp(p[:, 1] / z, -cy / fy - 0.3 * tan_y, (height - cy) / fy + 0.3 * tan_y)
     zero = torch.zeros_like(z)
-    J = torch.stack(
-        (torch.stack((fx / z, zero, -fx * tx / z**2), -1), torch.stack((zero, fy / z, -fy * ty / z**2), -1)), -2
-    )
+    J = torch.stack((torch.stack((fx / z, zero, -fx * tx / z**2), -1), torch.stack((zero, fy / z, -fy * ty / z**2), -1)), -2)
     T = J @ w2c[:3, :3]
     symmetric = 0.5 * (covariance + covariance.transpose(-1, -2))
     center = torch.stack((fx * p[:, 0] / z + cx, fy * p[:, 1] / z + cy), -1)

@@ -68,9 +68,7 @@ def tile_lists(order: Tensor, rects: Tensor, width: int, height: int) -> tuple[T
         outputs=[wp.from_torch(tiles), wp.from_torch(entries)],
         device=wp.device_from_torch(order.device),
     )
-    tiles, index = tiles[:total].sort(
-        stable=True
-    )  # emitted in depth order, and stable sorting keeps it inside each tile
+    tiles, index = tiles[:total].sort(stable=True)  # emitted in depth order, and stable sorting keeps it inside each tile
     marks = torch.arange(images * rows * columns + 1, dtype=torch.int32, device=order.device)
     starts = torch.searchsorted(tiles, marks).to(torch.int32)
     return order.view(-1), entries[:total][index] if total else entries, starts

@@ -25,8 +25,21 @@ def block_scene(views: int = 3, frames: int = 5, size: int = 32) -> Scene:
     images = color * mattes[..., None] + 1 - mattes[..., None]
     rig = ring_of_cameras(views, size, target=(0, 0.2, 0), distance=1.5, elevations=(0.2, 0.6), field=0.3, turn=0.4)
     up = torch.tensor([0.0, 1.0, 0.0])
-    return Scene("blocks", "train", images, mattes, rig, torch.arange(frames) / 24, -9.8 * up, up, Ground(0.0),
-                 torch.tensor(BOX), 1000.0, torch.ones(3), True)
+    return Scene(
+        "blocks",
+        "train",
+        images,
+        mattes,
+        rig,
+        torch.arange(frames) / 24,
+        -9.8 * up,
+        up,
+        Ground(0.0),
+        torch.tensor(BOX),
+        1000.0,
+        torch.ones(3),
+        True,
+    )
 
 
 @pytest.fixture(scope="session")

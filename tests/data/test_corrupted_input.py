@@ -78,12 +78,12 @@ CORRUPTIONS = {
     "pose scaled": (listing(lambda d: [e.update(c2w=(2 * np.array(e["c2w"])).tolist()) for e in d]), "expected a rotation"),
     "camera moves": (listing(lambda d: d[3]["c2w"][0].__setitem__(3, 9.0)), "camera 0 has another pose"),
     "time NaN": (listing(lambda d: d[1].update(time=float("nan"))), "entry 1, time: expected a finite number"),
-    "time mismatch": (listing(lambda d: first_with(d, "r_1_3.png").update(time=0.2)), "frame 3 has time 0.200000 s, but 0.125000 s"),
+    "time mismatch": (listing(lambda d: first_with(d, "r_1_3.png").update(time=0.2)), "frame 3 has time 0.200000 s, but 0.125"),
     "time uneven": (
         listing(lambda d: [e.update(time=0.5) for e in d if e["file_path"].endswith("_4.png")]), "expected one frame rate",
     ),
     "time backwards": (
-        listing(lambda d: [e.update(time=0.01) for e in d if e["file_path"].endswith("_4.png")]), "expected increasing frame times",
+        listing(lambda d: [e.update(time=0.01) for e in d if e["file_path"].endswith("_4.png")]), "increasing frame times",
     ),
     "view missing": (delete("data/a_1_2.png"), "a_1_2.png: image not found"),
     "frame missing": (delete("data/a_0_2.png", "data/a_1_2.png", "data/a_2_2.png"), r"frames \[2\] are missing"),
@@ -94,7 +94,7 @@ CORRUPTIONS = {
     "no alpha": (image("a_2_1.png", lambda p: p[..., :3]), "a_2_1.png: expected RGBA"),
     "no mattes": (raw_only, "matting|no mattes.*background plate"),
     "no images": (lambda f: shutil.rmtree(f / "data"), "found none"),
-    "matte empty": (image("a_1_0.png", lambda p: p * np.array([1, 1, 1, 0], np.uint8)), "camera 1: the matte of the first frame is empty"),
+    "matte empty": (image("a_1_0.png", lambda p: p * np.array([1, 1, 1, 0], np.uint8)), "camera 1: the matte .* is empty"),
     "resolution": (
         listing(lambda d: [e["intrinsic"][0].__setitem__(2, 400.0) for e in d]), "principal point .* outside",
     ),
@@ -130,16 +130,17 @@ TRANSFORMS = {
     "frame twice": (entries(lambda d: d["frames"].append(d["frames"][0])), "camera 0 has two images at 0.000000 s"),
     "camera moves": (entries(lambda d: d["frames"][3]["transform_matrix"][0].__setitem__(3, 5.0)), "camera 0 has another pose"),
     "one moving camera": (
-        entries(lambda d: [(e.pop("camera"), e["transform_matrix"][1].__setitem__(3, 0.1 * i)) for i, e in enumerate(d["frames"])]),
+        entries(lambda d: [(e.pop("camera"), e["transform_matrix"][1].__setitem__(3, i)) for i, e in enumerate(d["frames"])]),
         "a single moving camera cannot be used",
     ),
     "distorted": (entries(lambda d: d.update(k1=0.05)), "lens distortion .* undistort"),
     "size": (entries(lambda d: d.update(w=1920)), "intrinsics are for w = 1920 px"),
     "no matte": (
-        lambda f: iio.imwrite(f / "images/0_000.png", np.array(iio.imread(f / "images/0_000.png"))[..., :3]), "no matte: expected an alpha",
+        lambda f: iio.imwrite(f / "images/0_000.png", np.array(iio.imread(f / "images/0_000.png"))[..., :3]),
+        "no matte: expected an alpha",
     ),
     "opaque": (
-        lambda f: [iio.imwrite(p, np.array(iio.imread(p)) | np.array([0, 0, 0, 255], np.uint8)) for p in (f / "images").glob("0_*")],
+        lambda f: [iio.imwrite(p, iio.imread(p) | np.array([0, 0, 0, 255], np.uint8)) for p in (f / "images").glob("0_*")],
         "the footage has no matte",
     ),
 }  # fmt: skip
@@ -179,7 +180,10 @@ PARTICLES = {
     "NaN": (nan_particle, "003.ply: expected finite positions, found NaN or infinity in 1 of 9, first at 4"),
     "truncated": (cut_particles, "002.ply: expected a PLY file"),
     "too few": (lambda f: export_particles(torch.rand(4, 9, 3), f), "expected 5 PLY files, one per frame, found 4"),
-    "no PLY": (lambda f: (f.mkdir(), [(f / f"{t}.ply").write_text("hello") for t in range(5)]), "0.ply: expected a PLY file"),
+    "no PLY": (
+        lambda f: (f.mkdir(), [(f / f"{t}.ply").write_text("hello") for t in range(5)]),
+        "0.ply: expected a PLY file",
+    ),
     "gone": (lambda f: None, "folder not found"),
 }
 
@@ -229,9 +233,16 @@ def test_mistaken_keys(pacnerf_folder, keys, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda s: replace(s, images=s.images.masked_fill(torch.arange(5)[None, :, None, None, None] == 3, float("nan"))),
-         "images: NaN or infinite pixels in camera 0, frame 3"),
-        (lambda s: replace(s, mattes=s.mattes[:, :4]), r"mattes: expected shape \(3, 5, 32, 32\), found \(3, 4, 32, 32\)"),
+        (
+            lambda s: replace(
+                s, images=s.images.masked_fill(torch.arange(5)[None, :, None, None, None] == 3, float("nan"))
+            ),
+            "images: NaN or infinite pixels in camera 0, frame 3",
+        ),
+        (
+            lambda s: replace(s, mattes=s.mattes[:, :4]),
+            r"mattes: expected shape \(3, 5, 32, 32\), found \(3, 4, 32, 32\)",
+        ),
         (lambda s: replace(s, times=s.times[:2]), r"times: expected shape \(5,\)"),
         (lambda s: replace(s, cameras=replace(s.cameras, w2c=-s.cameras.w2c)), "expected a rotation"),
     ],

@@ -135,8 +135,10 @@ def test_particles_are_ordered_by_number(blocks, pacnerf_folder, tmp_path):
 def test_fingerprint_follows_everything_learning_depends_on(pacnerf_folder):
     plain = pacnerf(pacnerf_folder).fingerprint
     assert pacnerf(pacnerf_folder).fingerprint == plain
-    changed = [pacnerf(pacnerf_folder, **k).fingerprint for k in (
-        {"holdout_cameras": [1]}, {"frames": [0, 3]}, {"fps": 25.0}, {"density": 900.0}, {"scale": 0.5})]
+    changed = [
+        pacnerf(pacnerf_folder, **k).fingerprint
+        for k in ({"holdout_cameras": [1]}, {"frames": [0, 3]}, {"fps": 25.0}, {"density": 900.0}, {"scale": 0.5})
+    ]
     file = pacnerf_folder / "data" / "a_2_4.png"
     pixels = np.array(iio.imread(file))
     pixels[20, 15, 0] ^= 1
@@ -153,7 +155,9 @@ def test_the_real_bird(reference_data):
     """Its README: 11 cameras, 14 frames at 24 per second, f = 965.68 px of 800; up is +y and the ground is y = 0."""
     if not (reference_data / "pacnerf" / "bird" / "data").is_dir():
         pytest.skip("no pacnerf/bird in the reference data")
-    scene = load_scene(format="pacnerf", root=str(reference_data), path="pacnerf/bird", frames=[0, 6], scale=0.125, **WORLD)
+    scene = load_scene(
+        format="pacnerf", root=str(reference_data), path="pacnerf/bird", frames=[0, 6], scale=0.125, **WORLD
+    )
     assert scene.images.shape == (11, 7, 100, 100, 3)
     assert torch.allclose(scene.times.diff(), torch.full((6,), 1 / 24), atol=1e-6)
     assert scene.cameras.K[0, 0, 0].item() == pytest.approx(965.68 / 8, rel=1e-4)

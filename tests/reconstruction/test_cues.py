@@ -121,7 +121,11 @@ def test_modes_at_other_points_are_affine_exact_and_close_in_between():
     modes = deformation_modes(rest, neighbourhood(rest), count=20)
     between = rest[::5] * 0.93 + 0.0021
     there = modes.at(between, rest)
-    linear = torch.linalg.lstsq(torch.cat([torch.ones(len(rest), 1, dtype=torch.float64), rest], 1), modes.values[:, :4]).solution
-    assert torch.allclose(there.values[:, :4], torch.cat([torch.ones(len(between), 1).double(), between], 1) @ linear, atol=1e-9)
+    linear = torch.linalg.lstsq(
+        torch.cat([torch.ones(len(rest), 1, dtype=torch.float64), rest], 1), modes.values[:, :4]
+    ).solution
+    assert torch.allclose(
+        there.values[:, :4], torch.cat([torch.ones(len(between), 1).double(), between], 1) @ linear, atol=1e-9
+    )
     at_particles = modes.at(rest, rest, neighbours=8)
     assert (at_particles.values - modes.values)[:, :12].abs().mean() < 0.05

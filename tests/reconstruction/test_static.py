@@ -37,8 +37,15 @@ def still(squashed):
 
 def rendered(splats, windows):
     state = torch.zeros(len(windows), dtype=torch.long)
-    return rasterize(splats.means[None], isotropic_covariances(splats.scales[:, 0])[None], splats.opacities, splats.colors[None],
-                     windows.cameras, state, torch.ones(3))
+    return rasterize(
+        splats.means[None],
+        isotropic_covariances(splats.scales[:, 0])[None],
+        splats.opacities,
+        splats.colors[None],
+        windows.cameras,
+        state,
+        torch.ones(3),
+    )
 
 
 def psnr(a, b):

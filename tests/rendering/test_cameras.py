@@ -92,9 +92,7 @@ def test_quaternions_agree_with_scipy():
     product = quaternion_multiply(q[:5], q[5:])
     torch.testing.assert_close(quaternion_to_matrix(product), wanted[:5] @ wanted[5:])
     scales = torch.rand(10, 3, dtype=torch.float64)
-    torch.testing.assert_close(
-        covariance_from(scales, q), wanted @ torch.diag_embed(scales**2) @ wanted.transpose(1, 2)
-    )
+    torch.testing.assert_close(covariance_from(scales, q), wanted @ torch.diag_embed(scales**2) @ wanted.transpose(1, 2))
 
 
 def test_projected_gaussians_are_those_of_the_rasteriser():

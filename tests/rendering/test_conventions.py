@@ -91,9 +91,7 @@ def test_front_to_back_by_depth(scan):
 @pytest.mark.parametrize("scan", ["gaussian", "tile"])
 def test_stop_before_the_gaussian_that_exhausts_the_light(scan):
     """0.9 four times leaves 1e-4: the fourth is not added, nor is the faint fifth behind it."""
-    image, alpha = shoot(
-        [(24.5, 24.5)] * 5, [2.0] * 5, [0.9, 0.9, 0.9, 0.905, 0.2], [1.0, 2.0, 3.0, 4.0, 5.0], scan=scan
-    )
+    image, alpha = shoot([(24.5, 24.5)] * 5, [2.0] * 5, [0.9, 0.9, 0.9, 0.905, 0.2], [1.0, 2.0, 3.0, 4.0, 5.0], scan=scan)
     assert image[24, 24].tolist() == pytest.approx([0.9, 0.09, 0.009, 0.0, 0.0], rel=1e-9)
     assert float(alpha[24, 24]) == pytest.approx(0.999, rel=1e-12)
 

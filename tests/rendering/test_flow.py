@@ -19,8 +19,7 @@ def exact_flow(means, covariances, opacities, camera, b):
     """sum_i w_i [B_2 B_1^-1 (u - m_1) + m_2 - u] at every pixel centre u of camera b; states 0 to 1: (H, W, 2)
     [px]."""
     sides = [
-        visible_covariance(means[s], covariances[s], camera.K[b], camera.w2c[b], camera.width, camera.height)
-        for s in (0, 1)
+        visible_covariance(means[s], covariances[s], camera.K[b], camera.w2c[b], camera.width, camera.height) for s in (0, 1)
     ]
     (m1, M1, depth), (m2, M2, _) = sides
     order = depth.argsort()

@@ -6,7 +6,7 @@ import pytest
 import torch
 from drawn_splats import NAMES, draw, gradients, objective, render
 
-from mosa.errors import ConfigError
+from mosa.errors import ConfigError, DataError
 from mosa.rendering.rasterizer import expected_depth, rasterize
 from mosa.rendering.reference import alphas, rasterize_reference, visible_covariance
 
@@ -44,14 +44,10 @@ def thresholds(scene):
         center, M, z = visible_covariance(scene.means[s], scene.covariances[s], K, w2c, width, height)
         order = z.argsort()[(z.sort().values > 0.01)]
         d = pixels - center[order]
-        raw = scene.opacities[order] * torch.exp(
-            -0.5 * (d * torch.linalg.solve(M[order], d[..., None])[..., 0]).sum(-1)
-        )
+        raw = scene.opacities[order] * torch.exp(-0.5 * (d * torch.linalg.solve(M[order], d[..., None])[..., 0]).sum(-1))
         alpha = alphas(center[order], M[order], scene.opacities[order], width, height)
         after = torch.cumprod(1 - torch.where(alpha >= 1 / 255, alpha, 0), 1)
-        gaps += [
-            float((value / limit - 1).abs().min()) for value, limit in ((raw, 1 / 255), (raw, 0.999), (after, 1e-4))
-        ]
+        gaps += [float((value / limit - 1).abs().min()) for value, limit in ((raw, 1 / 255), (raw, 0.999), (after, 1e-4))]
         capped |= bool((raw > 0.999).any())
         stopped |= bool((after < 1e-4).any())
     return min(gaps), capped, stopped
@@ -166,6 +162,16 @@ def test_wrong_input_is_named(name, value, message):
     scene = draw(5, images=3)
     setattr(scene, name, value)
     with pytest.raises(ConfigError, match=message):
+        render(scene, rasterize)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_number_that_is_none_is_named(name):
+    scene = draw(5, images=3)
+    value = getattr(scene, name).clone()
+    value.view(-1)[-1] = float("nan")
+    setattr(scene, name, value)
+    with pytest.raises(DataError, match=f"{name}.*4.* is not finite"):
         render(scene, rasterize)
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import torch
 
 from mosa.data.builtin.drop import GRAVITY
-from mosa.data.builtin.make import cameras_of, make, pictures_to_footage
 from mosa.data.builtin.objects import object_named
+from mosa.data.builtin.takes import cameras_of, make, pictures_to_footage
 from mosa.data.footage import Footage, frame_range
 from mosa.data.images import scaled_size
 from mosa.data.scene import assemble
@@ -55,11 +55,25 @@ def load_builtin(
     chosen = frame_range(list(range(film.frames)), frames, f"{name}/{sequence}")
     images, mattes = pictures_to_footage(take.pictures[:, chosen], size)
     if chosen[0] != 0:
-        raise ConfigError(f"scene.frames: built-in sequences start at frame 0, where their pose is known; found {list(frames)}")
-    footage = Footage(scale_cameras(cameras_of(body, seed), scale), tuple(chosen), torch.tensor(chosen) / film.fps, images, mattes,
-                      torch.ones(3))
+        raise ConfigError(
+            f"scene.frames: built-in sequences start at frame 0, where their pose is known; found {list(frames)}"
+        )
+    footage = Footage(
+        scale_cameras(cameras_of(body, seed), scale),
+        tuple(chosen),
+        torch.tensor(chosen) / film.fps,
+        images,
+        mattes,
+        torch.ones(3),
+    )
     tensor = lambda a: torch.tensor(a, dtype=torch.float32)  # noqa: E731
-    truth = Truth(tensor(take.rest), tensor(take.positions[chosen]), tensor(take.rotation), tensor(take.velocity), hidden.summary())
+    truth = Truth(
+        tensor(take.rest),
+        tensor(take.positions[chosen]),
+        tensor(take.rotation),
+        tensor(take.velocity),
+        hidden.summary(),
+    )
     return assemble(
         footage, name=name, gravity=GRAVITY, box=BOX, ground=Ground(0.0, "sticky"), density=hidden.density, sequence=sequence,
         last_free_frame=last_free_frame, holdout_cameras=holdout_cameras, holdout_frames=holdout_frames, truth=truth,

@@ -1,4 +1,4 @@
-"""The truth: a body with its hidden material, simulated from one drop on a finer grid and a smaller step than the learner uses."""
+"""The truth: a body with its hidden material, simulated from one drop on a finer grid, in smaller steps than the learner's."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from mosa.physics.time_step import required_substeps
 from mosa.types import Ground, ParticleState
 
 GRAVITY = (0.0, -9.8, 0.0)
-# A grid stops a body's surface this many cells above the plane (measured on the rabbit at impact speeds of 3 to 4 m/s). The truth
-# is simulated that much higher, so that in the pictures the body touches the ground at height 0.
+# A grid stops a body's surface this many cells above the plane (measured on the rabbit at impact speeds of 3 to 4 m/s).
+# The truth is simulated that much higher, so that in the pictures the body touches the ground at height 0.
 CONTACT_CELLS = 0.4
 # share of the sound-speed bound on the time step that is used: squashed, the material is stiffer than at rest
 COURANT = 0.3

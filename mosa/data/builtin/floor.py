@@ -17,8 +17,8 @@ from mosa.types import ParticleState, Scene
 def floor_rollout(body, scene: Scene, world) -> Tensor:
     """Positions (T, N, 3) [m] of the body's particles under the hidden material of a built-in scene.
 
-    body: `mosa.modules.body.Body`; its particles, volumes, grid and learned contact height are used, its law is not. What is left
-    between this and the truth is the learner's discretisation: differences below it mean nothing.
+    body: `mosa.modules.body.Body`; its particles, volumes, grid and learned contact height are used, its law is not. What is
+    left between this and the truth is the learner's discretisation: differences below it mean nothing.
     Errors: ConfigError where the scene is not a built-in one; SimulationDiverged.
     """
     truth = scene.truth
@@ -31,10 +31,22 @@ def floor_rollout(body, scene: Scene, world) -> Tensor:
     start = (rest - truth.rest.mean(0)) @ Q.T + truth.positions[0].mean(0)
     speed = float(truth.velocity.norm()) + float(world.gravity.norm()) * frame_dt * scene.frames
     substeps = required_substeps(
-        hidden.wave_modulus(), hidden.density, frame_dt, settings.dx, v_max=speed, courant=min(settings.courant, 0.3), limit=5000
+        hidden.wave_modulus(),
+        hidden.density,
+        frame_dt,
+        settings.dx,
+        v_max=speed,
+        courant=min(settings.courant, 0.3),
+        limit=5000,
     )
     simulator = Simulator(
-        LAW, dx=settings.dx, substeps=substeps, frame_dt=frame_dt, gravity=world.gravity, up=world.up, ground=world.ground
+        LAW,
+        dx=settings.dx,
+        substeps=substeps,
+        frame_dt=frame_dt,
+        gravity=world.gravity,
+        up=world.up,
+        ground=world.ground,
     )
     n, gravity, up = len(rest), world.gravity.float().cpu(), world.up.float().cpu()
     lift = body.contact().detach().float().cpu() * up

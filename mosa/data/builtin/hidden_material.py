@@ -1,4 +1,4 @@
-"""The material of the built-in scenes, which no prior of the learner can express: fibres and a stiffness that varies in space."""
+"""The material of the built-in scenes, which no prior of the learner can express: fibres, and stiffness that varies."""
 
 import math
 from dataclasses import dataclass
@@ -35,7 +35,9 @@ def fibre_energy(F: Tensor, mu: Tensor, lam: Tensor, kf: Tensor, fibre: Tensor) 
     return 0.5 * mu * ((F * F).sum((-2, -1)) - 3) - mu * log_J + 0.5 * lam * log_J**2 + 0.5 * kf * (stretch - 1) ** 2
 
 
-register_law(LAW, fibre_neo_hookean, {"mu": 1, "lam": 1, "kf": 1, "fibre": 3}, needs_positive_J=True, energy=fibre_energy)
+register_law(
+    LAW, fibre_neo_hookean, {"mu": 1, "lam": 1, "kf": 1, "fibre": 3}, needs_positive_J=True, energy=fibre_energy
+)
 
 
 def fibre_stiffness(E: float, nu: float, ratio: float) -> float:
@@ -94,5 +96,11 @@ class HiddenMaterial:
         """Numbers for Truth.parameters: E, nu of the matrix, moduli along and across the fibre [Pa], their ratio."""
         k = 4 * fibre_stiffness(self.E, self.nu, self.ratio)
         across = self.E / (1 - self.nu**2 * k / (self.E + k))
-        return {"E": self.E, "nu": self.nu, "E_along": self.E + k, "E_across": across, "ratio": self.ratio,
-                "heterogeneity": self.amplitude}
+        return {
+            "E": self.E,
+            "nu": self.nu,
+            "E_along": self.E + k,
+            "E_across": across,
+            "ratio": self.ratio,
+            "heterogeneity": self.amplitude,
+        }

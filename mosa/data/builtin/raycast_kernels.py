@@ -22,7 +22,7 @@ def cast(
     """One thread per pixel of a window at (column, row), `samples` squared rays each. image: straight RGB and coverage."""
     i, j = wp.tid()
     color = wp.vec3(0.0, 0.0, 0.0)
-    hits = 0.0
+    hits = wp.float32(0.0)
     eye = wp.vec3(camera_to_world[0, 3], camera_to_world[1, 3], camera_to_world[2, 3])
     for a in range(samples):
         for b in range(samples):

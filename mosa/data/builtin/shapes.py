@@ -1,7 +1,7 @@
 """Bodies of the built-in scenes: signed distances of their parts, smoothly joined, and the colours painted on them.
 
-A shape lives in its own frame: y up, the ground at y = 0, looking along +x; lengths in metres. Distances are exact for spheres and
-(tapered) capsules, first order near the surface for ellipsoids, and grow a little inside a blend.
+A shape lives in its own frame: y up, the ground at y = 0, looking along +x; lengths in metres. Distances are exact for spheres
+and capsules, first order near the surface for ellipsoids, and grow a little inside a blend.
 """
 
 from __future__ import annotations
@@ -77,7 +77,9 @@ def waves(points: np.ndarray, rng: np.random.Generator, wavelength: float, count
     return np.sqrt(2 / count) * np.cos(points @ numbers.T + phases).sum(-1)
 
 
-def coat(points: np.ndarray, rng: np.random.Generator, base, first, second, *, patch: float, grain: float) -> np.ndarray:
+def coat(
+    points: np.ndarray, rng: np.random.Generator, base, first, second, *, patch: float, grain: float
+) -> np.ndarray:
     """Patches of two colours on a base, with a finer mottle over all: a texture in which every turn and stretch shows."""
     color = np.broadcast_to(np.asarray(base, dtype=float), points.shape).copy()
     color = blend(color, first, step(waves(points, rng, patch), 0.45, 0.35))
@@ -112,7 +114,9 @@ def rabbit_distance(points: np.ndarray) -> np.ndarray:
     feet = capsule(both, (0.000, 0.022, 0.054), (0.060, 0.020, 0.048), 0.022, 0.020)
     paws = capsule(both, (0.050, 0.085, 0.032), (0.078, 0.040, 0.026), 0.024, 0.020)
     body = join(join(body, feet, 0.020), paws, 0.016)
-    head = join(ellipsoid(points, (0.036, 0.145, 0.0), (0.062, 0.052, 0.058)), sphere(both, (0.080, 0.132, 0.012), 0.024), 0.020)
+    head = join(
+        ellipsoid(points, (0.036, 0.145, 0.0), (0.062, 0.052, 0.058)), sphere(both, (0.080, 0.132, 0.012), 0.024), 0.020
+    )
     body = join(body, head, 0.030)
     for start, end in (LEFT_EAR, RIGHT_EAR):
         body = join(body, ear(points, start, end), 0.016)
@@ -134,7 +138,9 @@ def rabbit_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     color = blend(color, (0.30, 0.18, 0.13), step(-ear(points, *RIGHT_EAR, margin=0.004), 0.0, 0.008))
     for start, end in (LEFT_EAR, RIGHT_EAR):
         front = np.array([0.020, 0.004, 0.0])
-        color = blend(color, pink, step(-ear(points, np.add(start, front), np.add(end, front), margin=-0.008), 0.0, 0.006))
+        color = blend(
+            color, pink, step(-ear(points, np.add(start, front), np.add(end, front), margin=-0.008), 0.0, 0.006)
+        )
     color = blend(color, pink, step(-sphere(points, (0.105, 0.141, 0.0), 0.0110), 0.0, 0.004))
     color = blend(color, (0.07, 0.05, 0.05), step(-sphere(both, (0.080, 0.162, 0.040), 0.0125), 0.0, 0.004))
     color = blend(color, (1.0, 1.0, 1.0), step(-sphere(both, (0.0875, 0.1685, 0.0405), 0.0045), 0.0, 0.002))
@@ -144,20 +150,27 @@ def rabbit_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 # --- peanut ---------------------------------------------------------------------------------------------------------------
 
 
+def upright(points: np.ndarray) -> np.ndarray:
+    """Points of the lying peanut in a frame where its long axis is y, from 0 to 0.26 m."""
+    return np.stack([0.066 - points[:, 1], points[:, 0] + 0.13, points[:, 2]], -1)
+
+
 def peanut_distance(points: np.ndarray) -> np.ndarray:
-    """A peanut in its shell, 0.26 m long, standing a little askew: two bulbs, a waist, a bent axis, ribs along it."""
-    bent = points - np.stack([0.012 * np.sin(np.pi * points[:, 1] / 0.26), 0 * points[:, 0], 0 * points[:, 0]], -1)
+    """A peanut in its shell, 0.26 m long, lying along x: two bulbs, a waist, a bent axis, ribs along it."""
+    stood = upright(points)
+    bent = stood - np.array([1.0, 0.0, 0.0]) * 0.012 * np.sin(np.pi * stood[:, 1:2] / 0.26)
     lower = ellipsoid(bent, (0.0, 0.075, 0.0), (0.066, 0.075, 0.062))
-    upper = ellipsoid(bent, (0.0, 0.190, 0.008), (0.055, 0.066, 0.057))
+    upper = ellipsoid(bent, (0.0, 0.190, 0.008), (0.055, 0.070, 0.057))
     angle = np.arctan2(bent[:, 2], bent[:, 0])
     away = np.hypot(bent[:, 0], bent[:, 2]) / 0.05
-    ribs = 0.0016 * np.cos(9 * angle) * np.clip(away, 0, 1) * np.cos(2 * np.pi * bent[:, 1] / 0.045) ** 2
+    ribs = 0.0012 * np.cos(9 * angle) * np.clip(away, 0, 1) * np.cos(2 * np.pi * bent[:, 1] / 0.045) ** 2
     return join(lower, upper, 0.035) - ribs
 
 
 def peanut_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """A painted shell: ochre with patches of green and dark red, a pale band round the waist on one side."""
     color = coat(points, rng, (0.86, 0.66, 0.36), (0.28, 0.52, 0.42), (0.58, 0.20, 0.16), patch=0.11, grain=0.028)
+    points = upright(points)
     band = step(0.016 - np.abs(points[:, 1] - 0.135 - 0.2 * points[:, 0]), 0.0, 0.008) * step(points[:, 2], -0.02, 0.04)
     color = blend(color, (0.95, 0.90, 0.80), band)
     color = blend(color, (0.20, 0.28, 0.55), step(-sphere(points, (0.05, 0.215, 0.02), 0.022), 0.0, 0.006))
@@ -166,5 +179,5 @@ def peanut_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 SHAPES = {
     "rabbit": Shape(rabbit_distance, rabbit_color, np.array([[-0.15, -0.01, -0.10], [0.13, 0.27, 0.10]])),
-    "peanut": Shape(peanut_distance, peanut_color, np.array([[-0.09, -0.01, -0.09], [0.10, 0.28, 0.09]])),
+    "peanut": Shape(peanut_distance, peanut_color, np.array([[-0.15, -0.03, -0.09], [0.15, 0.16, 0.09]])),
 }

@@ -24,12 +24,14 @@ class Surface:
 
 
 def extract_surface(shape: Shape, pitch: float, rng: np.random.Generator) -> Surface:
-    """Marching cubes on a grid of `pitch` [m], vertices moved onto the zero level by one Newton step, coloured in the rest shape."""
+    """Marching cubes on a grid of `pitch` [m], vertices moved onto the zero level by one Newton step."""
     low, high = shape.bounds[0] - 2 * pitch, shape.bounds[1] + 2 * pitch
     axes = [np.arange(a, b, pitch) for a, b in zip(low, high)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     values = shape.distance(grid.reshape(-1, 3)).reshape(grid.shape[:3])
-    vertices, indices = wp.geometry.IsoSurfaceMarchingCubes.extract(wp.array(values.astype(np.float32), device="cpu"), 0.0)
+    vertices, indices = wp.geometry.IsoSurfaceMarchingCubes.extract(
+        wp.array(values.astype(np.float32), device="cpu"), 0.0
+    )
     vertices = vertices.numpy().astype(np.float64) * pitch + low
     gradient = level_gradient(shape, vertices)
     vertices -= shape.distance(vertices)[:, None] * gradient / np.maximum((gradient**2).sum(-1, keepdims=True), 0.25)
@@ -90,5 +92,7 @@ def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Unit normals (M, 3), area-weighted means over the triangles around each vertex."""
     corner = vertices[triangles]
     facing = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normals = np.stack([np.bincount(triangles.ravel(), np.repeat(facing[:, d], 3), len(vertices)) for d in range(3)], -1)
+    normals = np.stack(
+        [np.bincount(triangles.ravel(), np.repeat(facing[:, d], 3), len(vertices)) for d in range(3)], -1
+    )
     return normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)

@@ -18,6 +18,8 @@ from mosa.data.builtin.objects import OBJECTS, BuiltinObject, drop_named, object
 from mosa.data.builtin.renderer import render_surface, ring_of_cameras
 from mosa.data.builtin.shapes import SHAPES
 from mosa.data.builtin.surface import bind, extract_surface, fill
+from mosa.data.footage import WHITE
+from mosa.data.images import composite, resize
 from mosa.errors import ConfigError
 from mosa.types import Cameras
 
@@ -28,8 +30,8 @@ TRUTH_PARTICLES = 8000
 
 @dataclass(frozen=True)
 class Take:
-    """A filmed sequence. pictures: (V, T, H, W, 4) uint8, straight alpha; rest: (M, 3), positions: (T, M, 3) [m] of at most 8000
-    of the truth's particles; rotation: (3, 3); velocity: (3,) [m/s]."""
+    """A filmed sequence. pictures: (V, T, H, W, 4) uint8, straight alpha; rest: (M, 3), positions: (T, M, 3) [m] of at most
+    8000 of the truth's particles; rotation: (3, 3); velocity: (3,) [m/s]."""
 
     pictures: np.ndarray
     rest: np.ndarray
@@ -54,7 +56,13 @@ def cameras_of(body: BuiltinObject, seed: int) -> Cameras:
 
 
 def make(
-    name: str, sequence: str, *, material: str = "anisotropic", seed: int = 0, cache: str | Path | None = None, progress: bool = True
+    name: str,
+    sequence: str,
+    *,
+    material: str = "anisotropic",
+    seed: int = 0,
+    cache: str | Path | None = None,
+    progress: bool = True,
 ) -> Take:
     """The take of a sequence, from the cache folder where it lies there. Equal arguments give equal bytes.
 
@@ -72,7 +80,9 @@ def make(
     try:
         write_take(file, take)
     except OSError as error:
-        raise ConfigError(f"scene.cache: cannot write {file} ({error.strerror}); choose a folder with scene.cache=") from error
+        raise ConfigError(
+            f"scene.cache: cannot write {file} ({error.strerror}); choose a folder with scene.cache="
+        ) from error
     return take
 
 
@@ -85,7 +95,9 @@ def film_drop(name: str, sequence: str, material: str, seed: int, progress: bool
     particles = fill(shape, body.spacing, np.random.default_rng([seed, 2]))
     skin = bind(surface.vertices, particles, body.spacing)
     label = f"{name}/{sequence} (synthetic, {material})"
-    with tqdm(total=film.frames - 1, desc=f"{label}: simulate", unit="frame", disable=not progress, dynamic_ncols=True) as bar:
+    with tqdm(
+        total=film.frames - 1, desc=f"{label}: simulate", unit="frame", disable=not progress, dynamic_ncols=True
+    ) as bar:
         fall = simulate(
             body, body.material.variant(material), particles, surface.vertices, drop, body.drops["train"],
             progress=lambda frame: bar.update(),
@@ -97,7 +109,8 @@ def film_drop(name: str, sequence: str, material: str, seed: int, progress: bool
     ]
     chosen = np.sort(np.random.default_rng([seed, 3]).permutation(len(particles))[:TRUTH_PARTICLES])
     return Take(
-        np.stack(pictures, 1), fall.rest[chosen].astype(np.float32), fall.positions[:, chosen].astype(np.float32), fall.rotation,
+        np.stack(pictures, 1), fall.rest[chosen].astype(np.float32), fall.positions[:, chosen].astype(np.float32),
+        fall.rotation,
         fall.velocity,
     )  # fmt: skip
 
@@ -128,9 +141,6 @@ def write_take(file: Path, take: Take) -> None:
 
 def pictures_to_footage(pictures: np.ndarray, size: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
     """Images (V, T, h, w, 3) on white and mattes (V, T, h, w), area averages of RGBA pictures (V, T, H, W, 4)."""
-    from mosa.data.footage import WHITE
-    from mosa.data.images import composite, resize
-
     V, T = pictures.shape[:2]
     images, mattes = np.empty((V, T, size[1], size[0], 3), np.float32), np.empty((V, T, size[1], size[0]), np.float32)
     for v in range(V):

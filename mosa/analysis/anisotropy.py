@@ -1,0 +1,168 @@
+"""Directions of a learned law (evaluation.md, last item): its redistribution w(n) and its directional modulus E(n).
+
+Everything is in the material frame and in Mandel scaling, where the double contraction of symmetric tensors is a dot product; in
+plain 6-vectors even an isotropic law would look anisotropic.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from mosa.errors import ConfigError, SimulationDiverged
+from mosa.modules.adapter import Adapter
+from mosa.modules.microplane import MANDEL
+from mosa.physics.rollout import MaterialState
+
+States = Callable[[Tensor], MaterialState]
+"""From F (M, 3, 3) float64 to what an adapter reads there: `mosa.modules.material.material_states`."""
+
+_PLACES = [[0, 5, 4], [5, 1, 3], [4, 3, 2]]
+
+
+def mandel(vech: Tensor) -> Tensor:
+    """(..., 6) in Mandel scaling from vech components xx, yy, zz, yz, zx, xy."""
+    return vech * torch.tensor(MANDEL).to(vech)
+
+
+def mandel_matrix(operator: Tensor) -> Tensor:
+    """(..., 6, 6) operator on Mandel vectors from one on vech components."""
+    scale = torch.tensor(MANDEL).to(operator)
+    return scale[:, None] * operator / scale
+
+
+def dyads(directions: Tensor) -> Tensor:
+    """(K, 6) n n^T in Mandel scaling of unit vectors (K, 3)."""
+    n = directions
+    pairs = ((0, 0), (1, 1), (2, 2), (1, 2), (2, 0), (0, 1))
+    return mandel(torch.stack([n[:, i] * n[:, j] for i, j in pairs], -1))
+
+
+def directions_in_plane(first: Sequence[float], second: Sequence[float], count: int = 37) -> tuple[Tensor, Tensor]:
+    """(angles (K,) [rad] from 0 to pi, unit vectors (K, 3)) from `first` towards `second`, orthogonalised. float64."""
+    a, b = (torch.tensor(v, dtype=torch.float64) for v in (first, second))
+    b = b - (b @ a) / (a @ a) * a
+    if not (float(a.norm()) > 0 and float(b.norm()) > 1e-9):
+        raise ConfigError(f"plane: expected two directions that differ, found {list(first)} and {list(second)}")
+    angles = torch.linspace(0, math.pi, count, dtype=torch.float64)
+    return angles, torch.cos(angles)[:, None] * a / a.norm() + torch.sin(angles)[:, None] * b / b.norm()
+
+
+def directions_on_sphere(count: int = 200) -> Tensor:
+    """(K, 3) unit vectors spread over the half sphere z >= 0 (spiral of the golden angle). float64."""
+    z = (torch.arange(count, dtype=torch.float64) + 0.5) / count
+    turn = torch.arange(count, dtype=torch.float64) * math.pi * (3 - 5**0.5)
+    r = torch.sqrt(1 - z**2)
+    return torch.stack([r * torch.cos(turn), r * torch.sin(turn), z], -1)
+
+
+def in_double(adapter: Adapter) -> Adapter:
+    """A copy of the adapter in float64 on the CPU, without gradients of its weights. Errors: ConfigError where it is not on."""
+    adapter.check_on()
+    return copy.deepcopy(adapter).double().cpu().requires_grad_(False)
+
+
+def stress_jacobian(adapter: Adapter, w: Tensor, s: Tensor) -> Tensor:
+    """d tau_hat/d tau_iso at held stretch, (N, 6, 6) on vech components, I where the law is the prior.
+
+    w, s: (N, 6) dimensionless states vech(W - I) and vech(R^T tau R)/E_ref. The networks' dependence on the stress is included.
+    """
+    adapter = in_double(adapter)
+    s = s.detach().double().cpu().requires_grad_(True)
+    with torch.enable_grad():
+        d = adapter.increment(w.detach().double().cpu(), s)
+        # rows of different particles are independent: one backward pass per component serves all of them
+        rows = [torch.autograd.grad(d[:, i].sum(), s, retain_graph=True)[0] for i in range(6)]
+    return torch.stack(rows, 1) + torch.eye(6, dtype=torch.float64)
+
+
+def redistribution_response(jacobian: Tensor, directions: Tensor) -> Tensor:
+    """w(n) = |(d tau_hat/d tau_iso - I) : n n^T| (..., K) of (..., 6, 6) on vech components; 0 for the prior alone.
+
+    directions: (K, 3) unit vectors. The paper's formula lacks the - I, with which its text ('near zero') fits.
+    """
+    change = mandel_matrix(jacobian) - torch.eye(6).to(jacobian)
+    return (change @ dyads(directions).to(jacobian).T).norm(dim=-2)
+
+
+def response_of(states: States, adapter: Adapter | None) -> Callable[[Tensor], Tensor]:
+    """Corrected stress (M, 6) [Pa] in Mandel scaling, in the material frame, as a function of the Hencky strain (M, 6), Mandel."""
+    adapter = None if adapter is None else in_double(adapter)
+
+    def response(strain: Tensor) -> Tensor:
+        plain = strain / torch.tensor(MANDEL).to(strain)
+        W = torch.matrix_exp(plain[:, _PLACES])
+        state = states(W)
+        stress = state.stress
+        if adapter is not None:
+            answer = adapter(state)
+            stress = stress + (answer.G @ stress[..., None])[..., 0] + answer.h
+        return mandel(stress)
+
+    return response
+
+
+def uniaxial_stress(response: Callable[[Tensor], Tensor], directions: Tensor, strain: float, iterations: int = 20) -> Tensor:
+    """Axial stress (K,) [Pa] at Hencky strain `strain` along each of (K, 3), all other stress components zero.
+
+    Newton's method on the strain and the axial stress. Errors: SimulationDiverged naming the direction without an equilibrium.
+    """
+    N = dyads(directions).double()
+    K = len(N)
+    H, axial = strain * N, torch.zeros(K, dtype=torch.float64)
+    for _ in range(iterations):
+        H = H.detach().requires_grad_(True)
+        with torch.enable_grad():
+            stress = response(H)
+            tangent = torch.stack([torch.autograd.grad(stress[:, i].sum(), H, retain_graph=True)[0] for i in range(6)], 1)
+        stress = stress.detach()
+        residual = torch.cat([stress - axial[:, None] * N, ((N * H).sum(-1) - strain)[:, None].detach()], -1)
+        matrix = torch.zeros(K, 7, 7, dtype=torch.float64)
+        matrix[:, :6, :6], matrix[:, :6, 6], matrix[:, 6, :6] = tangent, -N, N
+        # in units of the stiffness, or the strain equation would drown in the stress equations
+        unit = tangent.abs().amax((1, 2)).clamp(min=1e-30)
+        matrix[:, :6, :6] /= unit[:, None, None]
+        residual[:, :6] /= unit[:, None]
+        step, singular = torch.linalg.solve_ex(matrix, residual[..., None])
+        H, axial = H.detach() - step[:, :6, 0], axial - unit * step[:, 6, 0]
+        off = residual.abs().amax(-1)
+        if bool((singular == 0).all()) and float(off.max()) < 1e-10 * abs(strain):
+            return axial
+    worst = int(torch.where(torch.isfinite(off), off, torch.full_like(off, torch.inf)).argmax())
+    raise SimulationDiverged(
+        f"uniaxial stretch: no equilibrium at strain {strain:g} along direction {worst} {directions[worst].tolist()}: "
+        "the learned law has lost its stiffness there"
+    )
+
+
+def directional_modulus(states: States, adapter: Adapter | None, directions: Tensor, strain: float = 5e-3) -> Tensor:
+    """E(n) (K,) [Pa] along (K, 3): central difference of the uniaxial stress at +-strain, lateral stress free.
+
+    states: of the prior at its global parameters; adapter: None for the prior alone, whose E(n) is Young's modulus.
+    """
+    response = response_of(states, adapter)
+    tension, compression = (uniaxial_stress(response, directions, e) for e in (strain, -strain))
+    return (tension - compression) / (2 * strain)
+
+
+def modulus_ratio(states: States, adapter: Adapter | None, axis: Sequence[float], strain: float = 5e-3) -> float:
+    """E along `axis` over the mean of E across it (18 directions); 1 for an isotropic law."""
+    along = torch.tensor(axis, dtype=torch.float64)
+    along = along / along.norm()
+    helper = torch.eye(3, dtype=torch.float64)[int(along.abs().argmin())]
+    first = torch.linalg.cross(along, helper)
+    _, across = directions_in_plane(first.tolist(), torch.linalg.cross(along, first).tolist(), 19)
+    modulus = directional_modulus(states, adapter, torch.cat([along[None], across[:-1]]), strain)
+    return float(modulus[0] / modulus[1:].mean())
+
+
+def stiffest_axis(states: States, adapter: Adapter | None, count: int = 200, strain: float = 5e-3) -> tuple[Tensor, float]:
+    """(unit vector (3,) of the largest E(n), E_max/E_min) over a half sphere of `count` directions: which way a learned law is
+    stiff, to be compared with a known fibre."""
+    directions = directions_on_sphere(count)
+    modulus = directional_modulus(states, adapter, directions, strain)
+    return directions[int(modulus.argmax())], float(modulus.max() / modulus.min())

@@ -1,0 +1,218 @@
+"""Built-in scenes: repeatable, cached, true to their physics, and filmed where the truth is."""
+
+import shutil
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from mosa.data.builtin import sequences, takes
+from mosa.data.builtin.drop import CONTACT_CELLS, COURANT
+from mosa.data.builtin.floor import floor_rollout
+from mosa.data.builtin.objects import OBJECTS
+from mosa.data.builtin.renderer import render_surface, ring_of_cameras
+from mosa.data.builtin.shapes import SHAPES
+from mosa.data.builtin.surface import Surface, bind, extract_surface, fill
+from mosa.data.scene import held_out_sequences, load_scene
+from mosa.errors import ConfigError
+from mosa.rendering.cameras import project
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+def tiny(cache, **keys):
+    return load_scene(format="builtin", name="tiny", cache=str(cache), **keys)
+
+
+@pytest.fixture(scope="module")
+def training(cache):
+    return tiny(cache)
+
+
+@pytest.fixture(scope="module")
+def held_out(cache):
+    return held_out_sequences(format="builtin", name="tiny", cache=str(cache))
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_shapes_have_their_height_and_closed_surfaces(name):
+    surface = extract_surface(SHAPES[name], 0.005, np.random.default_rng(0))
+    height = np.ptp(surface.vertices[:, 1])
+    assert height == pytest.approx(next(o.height for o in OBJECTS.values() if o.shape == name), abs=1.5e-3)
+    assert np.abs(SHAPES[name].distance(surface.vertices)).max() < 5e-4
+    edges = np.sort(surface.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), -1)
+    _, count = np.unique(edges, axis=0, return_counts=True)
+    assert (count == 2).all()
+    corner = surface.vertices[surface.triangles]
+    volume = (np.cross(corner[:, 0], corner[:, 1]) * corner[:, 2]).sum() / 6
+    assert volume == pytest.approx(len(fill(SHAPES[name], 0.004, np.random.default_rng(0))) * 0.004**3, rel=0.01)
+
+
+def test_colours_do_not_repeat_under_mirroring_so_that_a_pose_can_be_told():
+    surface = extract_surface(SHAPES["rabbit"], 0.006, np.random.default_rng(0))
+    mirrored = surface.vertices * [1, 1, -1]
+    nearest = np.linalg.norm(surface.vertices[None, ::7] - mirrored[::7, None], axis=-1).argmin(1)
+    assert np.abs(surface.colors[::7] - surface.colors[::7][nearest]).mean() > 0.1
+
+
+def test_a_skin_reproduces_affine_motion():
+    shape = SHAPES["rabbit"]
+    particles = fill(shape, 0.012, np.random.default_rng(0))
+    points = extract_surface(shape, 0.01, np.random.default_rng(0)).vertices
+    skin = bind(points, particles, 0.012)
+    A = np.array([[1.1, 0.3, -0.2], [0.1, 0.7, 0.2], [0.0, -0.4, 1.2]])
+    moved = skin.follow(particles @ A.T + [0.2, -0.1, 0.3])
+    assert np.abs(moved - (points @ A.T + [0.2, -0.1, 0.3])).max() < 1e-6
+
+
+def test_rays_hit_a_sphere_where_it_is():
+    """Coverage of a sphere seen from far is its silhouette's ellipse: area pi r^2 f^2/(d^2 - r^2) to first order."""
+    angle = np.linspace(0, np.pi, 65)[:, None], np.linspace(0, 2 * np.pi, 129)[None, :-1]
+    ball = 0.1 * np.stack(
+        [np.sin(angle[0]) * np.cos(angle[1]), np.cos(angle[0]) + 0 * angle[1], np.sin(angle[0]) * np.sin(angle[1])], -1
+    )
+    index = np.arange(65 * 128).reshape(65, 128)
+    a, b = index[:-1], index[1:]
+    quads = [np.stack([a, np.roll(a, -1, 1), b], -1), np.stack([np.roll(a, -1, 1), np.roll(b, -1, 1), b], -1)]
+    triangles = np.concatenate([q.reshape(-1, 3) for q in quads]).astype(np.int32)
+    vertices = ball.reshape(-1, 3) + np.array([0.02, 0.01, 0.0])
+    surface = Surface(vertices, triangles, np.full_like(vertices, 0.5))
+    cameras = ring_of_cameras(2, 96, target=(0, 0, 0), distance=2.0, elevations=(0.0,), field=0.3, turn=0.3)
+    pictures = render_surface(surface, vertices, cameras)
+    matte = torch.from_numpy(pictures[..., 3] / 255.0)
+    grid = torch.arange(96) + 0.5
+    for v in range(2):
+        f, d = (
+            float(cameras.K[v, 0, 0]),
+            float((cameras.w2c[v, :3, :3] @ torch.tensor([0.02, 0.01, 0.0]) + cameras.w2c[v, :3, 3])[2]),
+        )
+        assert float(matte[v].sum()) == pytest.approx(np.pi * 0.01 * f * f / (d * d - 0.01), rel=0.01)
+        center = torch.stack([(matte[v] * grid).sum(), (matte[v] * grid[:, None]).sum()]) / matte[v].sum()
+        pixel, _ = project(torch.tensor([[0.02, 0.01, 0.0]]), cameras.select([v]))
+        assert (center - pixel[0, 0]).abs().max() < 0.1
+
+
+def test_a_take_is_repeatable_and_comes_from_the_cache(training, cache, tmp_path, monkeypatch):
+    again = tiny(tmp_path)
+    assert again.fingerprint == training.fingerprint
+    assert torch.equal(again.truth.positions, training.truth.positions)
+    monkeypatch.setattr(takes, "film_drop", lambda *a: pytest.fail("made again although cached"))
+    assert tiny(cache).fingerprint == training.fingerprint
+
+
+def test_a_damaged_cache_is_made_again(training, cache, tmp_path, capsys):
+    shutil.copytree(cache / "builtin", tmp_path / "builtin")
+    file = next((tmp_path / "builtin").glob("tiny-train-anisotropic-0-*"))
+    file.write_bytes(file.read_bytes()[:5000])
+    assert tiny(tmp_path).fingerprint == training.fingerprint
+    assert "damaged cache file" in capsys.readouterr().out
+    assert tiny(tmp_path).fingerprint == training.fingerprint
+    assert not list((tmp_path / "builtin").glob("tmp*"))
+
+
+def test_seed_changes_the_footage_and_material_changes_the_motion_alone(training, cache, tmp_path):
+    other = tiny(tmp_path, seed=1)
+    assert other.fingerprint != training.fingerprint
+    assert not torch.allclose(other.cameras.w2c, training.cameras.w2c)
+    twin = tiny(cache, material="isotropic")
+    assert torch.equal(twin.cameras.w2c, training.cameras.w2c)
+    assert torch.equal(twin.truth.rest, training.truth.rest)
+    assert torch.equal(twin.images[:, 0], training.images[:, 0])
+    assert torch.allclose(twin.truth.positions[1], training.truth.positions[1], atol=2e-6)
+    difference = (twin.truth.positions[-1] - training.truth.positions[-1]).norm(dim=-1)
+    assert difference.mean() > 2e-3
+
+
+def test_rest_is_frame_0_of_training_and_held_out_starts_are_turned_copies_of_it(training, held_out):
+    truth = training.truth
+    assert torch.allclose(truth.rest, truth.positions[0], atol=1e-6)
+    assert torch.equal(truth.rotation, torch.eye(3))
+    assert [s.sequence for s in held_out] == ["test_60", "test_40"]
+    for scene, degrees in zip(held_out, (60.0, 40.0)):
+        assert torch.equal(scene.truth.rest, truth.rest)
+        Q = scene.truth.rotation
+        assert torch.rad2deg(torch.acos((Q.trace() - 1) / 2)).item() == pytest.approx(degrees, abs=1e-3)
+        arms = truth.rest - truth.rest.mean(0)
+        start = scene.truth.positions[0] - scene.truth.positions[0].mean(0)
+        assert torch.allclose(start, arms @ Q.T, atol=2e-6)
+    assert held_out_sequences(format="builtin", name="tiny", sequence="test_60") == []
+
+
+def test_free_flight_follows_the_parabola_until_contact_and_then_does_not(training, held_out):
+    for scene in (training, *held_out):
+        truth = scene.truth
+        t = scene.times[:, None]
+        parabola = truth.positions[0].mean(0) + truth.velocity * t + 0.5 * scene.gravity * t**2
+        center = truth.positions.mean(1)
+        assert torch.allclose(center[1], parabola[1], atol=2e-6)
+        assert (center[-1] - parabola[-1]).norm() > 0.05
+        # nothing sinks into the ground by more than the grid's reach, and something comes near it
+        lowest = truth.positions[..., 1].amin()
+        assert -0.01 < lowest < 0.01
+
+
+def test_the_pictures_show_the_truth_and_nothing_is_cut_off(training, held_out):
+    for scene in (training, *held_out):
+        m = scene.mattes
+        border = torch.stack([m[..., 0, :].amax(), m[..., -1, :].amax(), m[..., 0].amax(), m[..., -1].amax()])
+        assert border.amax() == 0
+        for t in (0, scene.frames - 1):
+            pixel, depth = project(scene.truth.positions[t], scene.cameras)
+            assert depth.min() > 0
+            index = pixel.long()
+            inside = torch.stack([m[v, t, index[v, :, 1], index[v, :, 0]] for v in range(len(m))])
+            assert (inside > 0).float().mean() > 0.995
+            covered = torch.zeros_like(m[:, t], dtype=torch.bool)
+            for v in range(len(m)):
+                covered[v, index[v, :, 1], index[v, :, 0]] = True
+            grown = torch.nn.functional.max_pool2d(covered.float()[:, None], 5, 1, 2)[:, 0] > 0
+            assert (m[:, t] * ~grown).sum() / m[:, t].sum() < 0.03
+
+
+def test_keys_of_built_in_scenes(cache, training):
+    assert sequences("rabbit") == ("train", "test_60", "test_40")
+    scene = tiny(cache, holdout_cameras=[5], holdout_frames=1, scale=0.25)
+    assert scene.images.shape == (6, 5, 32, 32, 3)
+    assert scene.training_cameras == [0, 1, 2, 3, 4]
+    assert scene.training_frames == [0, 1, 2, 3]
+    assert scene.synthetic
+    assert scene.known_parameters == {"E": 2e5, "nu": 0.3}
+    assert scene.truth.parameters["E_along"] / scene.truth.parameters["E_across"] == pytest.approx(1.6)
+    for keys, message in (
+        ({"sequence": "test_90"}, "scene.sequence: tiny has train, test_60, test_40, not 'test_90'"),
+        ({"material": "wood"}, "scene.material"), ({"seed": -1}, "scene.seed"), ({"seed": 0.5}, "scene.seed"),
+        ({"frames": [1, 4]}, r"scene\.frames: built-in sequences start at frame 0"),
+        ({"density": 900.0}, "scene.density: not a key"),
+    ):  # fmt: skip
+        with pytest.raises(ConfigError, match=message):
+            tiny(cache, **keys)
+    with pytest.raises(ConfigError, match=r"scene\.name: expected one of the built-in"):
+        load_scene(format="builtin", name="teapot")
+
+
+def test_a_cache_folder_that_cannot_be_written_is_named(tmp_path, training, monkeypatch):
+    (tmp_path / "file").write_text("")
+    take = takes.make("tiny", "train", cache=None if training is None else tmp_path / "ok", progress=False)
+    monkeypatch.setattr(takes, "film_drop", lambda *a: take)
+    with pytest.raises(ConfigError, match=r"scene\.cache: cannot write"):
+        tiny(tmp_path / "file")
+
+
+def test_the_floor_is_the_truth_itself_on_the_truth_s_own_particles_and_grid(training, held_out):
+    """float32 rounding over about 240 substeps, grown by contact, stays far below the millimetres that a floor measures."""
+    spacing = OBJECTS["tiny"].spacing
+    scene = held_out[0]
+    world = SimpleNamespace(ground=scene.ground, gravity=scene.gravity, up=scene.up, box=scene.box)
+    rest = training.truth.rest
+    body = SimpleNamespace(
+        rest=rest, volume=torch.full((len(rest),), spacing**3), contact=lambda: torch.tensor(CONTACT_CELLS * 2 * spacing),
+        settings=SimpleNamespace(dx=2 * spacing, courant=COURANT),
+    )  # fmt: skip
+    found = floor_rollout(body, scene, world)
+    assert (found - scene.truth.positions).norm(dim=-1).max() < 1e-4
+    body.settings.dx *= 2
+    assert (floor_rollout(body, scene, world) - scene.truth.positions).norm(dim=-1).max() > 1e-3

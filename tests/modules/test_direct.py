@@ -1,0 +1,56 @@
+"""The black-box comparison has the adapter's interface, bounds and start."""
+
+import inspect
+from pathlib import Path
+
+import pytest
+import torch
+from drawn_adapters import E_REF, drawn_states, material_state, randomise
+from omegaconf import OmegaConf
+
+from mosa.errors import ConfigError
+from mosa.modules.adapter import StressAdapter
+from mosa.modules.direct import DirectAdapter
+
+CONF = Path(__file__).parents[2] / "conf" / "adapter"
+
+
+def test_it_starts_as_the_prior_and_is_bounded_and_stress_free_at_rest():
+    adapter = DirectAdapter()
+    adapter.switch_on(E_REF)
+    w, s = drawn_states(30, size=1e3, dtype=torch.float32)
+    assert torch.equal(adapter(material_state(w, s)).h, torch.zeros(30, 6))
+    randomise(adapter, 10.0)
+    answer = adapter(material_state(w, s))
+    assert torch.equal(answer.G, torch.zeros(30, 6, 6))
+    assert 0 < answer.h.abs().max() <= 2 * 0.1 * E_REF  # within l_max, and the same of what it subtracts at rest
+    zero = torch.zeros(30, 6)
+    assert torch.equal(adapter(material_state(zero, zero)).h, zero)
+
+
+def test_increment_and_redistribution_say_the_same():
+    adapter = DirectAdapter().double()
+    randomise(adapter)
+    adapter.switch_on(E_REF)
+    w, s = drawn_states(10)
+    A, b = adapter.redistribution(w, s)
+    torch.testing.assert_close((A @ s[..., None])[..., 0] - s + b, adapter.increment(w, s), rtol=0, atol=1e-14)
+    torch.testing.assert_close(adapter(material_state(w, s)).h, E_REF * b, rtol=1e-14, atol=0)
+
+
+@pytest.mark.parametrize("switch", ["no_C", "no_pre", "no_post", "no_prior_stress"])
+def test_an_ablation_it_has_no_part_for_is_an_error(switch):
+    with pytest.raises(ConfigError, match=switch):
+        DirectAdapter(**{switch: True})
+
+
+@pytest.mark.parametrize(("name", "kind"), [("mosa", StressAdapter), ("direct", DirectAdapter)])
+def test_the_file_lists_the_arguments_with_their_defaults(name, kind):
+    """One YAML = one class with explicit keyword arguments."""
+    keys = OmegaConf.to_container(OmegaConf.load(CONF / f"{name}.yaml"))
+    module, _, found = keys.pop("_target_").rpartition(".")
+    assert (module, found) == (kind.__module__, kind.__name__)
+    arguments = {n: p.default for n, p in inspect.signature(kind).parameters.items()}
+    assert keys == {n: arguments[n] for n in keys}
+    switches = {"no_C", "no_pre", "no_post", "no_prior_stress"}
+    assert set(arguments) - set(keys) == (switches if name == "direct" else set())

@@ -1,0 +1,129 @@
+"""Global parameters: unconstrained forms, ranges, what the simulator gets, and what a mistake says."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
+
+from mosa.errors import ConfigError
+from mosa.modules.material import ANGLE_MAX, FORMS, NU_MAX, Material
+from mosa.physics.laws import law_named
+
+CONF = Path(__file__).parents[2] / "conf" / "prior"
+ELASTIC = {"E": 1e5, "nu": 0.4}
+SAND = {**ELASTIC, "friction_angle": 30.0, "cohesion": 0.0}
+
+
+@pytest.mark.parametrize("file", sorted(CONF.glob("*.yaml")), ids=lambda f: f.stem)
+def test_every_prior_starts_at_the_values_of_its_file(file):
+    keys = OmegaConf.to_container(OmegaConf.load(file))
+    keys.pop("options", None)
+    material = Material(**keys)
+    assert material.law == file.stem
+    for name, value in material.physical().items():
+        assert float(value) == pytest.approx(keys["parameters"][name], rel=1e-5), name
+    law = law_named(material.law)
+    assert set(material.per_particle(torch.ones(4))) == {n for n in law.parameters if n != law.reference}
+
+
+def test_lame_parameters_and_friction_follow_from_the_physical_ones():
+    values = Material("drucker_prager", SAND).per_particle()
+    assert float(values["mu"]) == pytest.approx(1e5 / 2.8, rel=1e-5)
+    assert float(values["lam"]) == pytest.approx(1e5 * 0.4 / (1.4 * 0.2), rel=1e-5)
+    assert float(values["friction_alpha"]) == pytest.approx((2 / 3) ** 0.5 * 2 * 0.5 / (3 - 0.5), rel=1e-5)
+    assert float(values["cohesion"]) == 0.0
+
+
+def test_heterogeneity_multiplies_the_stiffness_alone():
+    factor = torch.tensor([0.8, 1.0, 1.2])
+    material = Material("von_mises", {**ELASTIC, "yield_stress": 5e3})
+    values = material.per_particle(factor)
+    torch.testing.assert_close(values["mu"], factor * material.per_particle()["mu"])
+    torch.testing.assert_close(values["lam"], factor * material.per_particle()["lam"])
+    assert values["yield_stress"].shape == ()
+    named = Material("von_mises", {**ELASTIC, "yield_stress": 5e3}, modulated=["yield_stress"]).per_particle(factor)
+    torch.testing.assert_close(named["yield_stress"], factor * 5e3)
+    assert named["mu"].shape == ()
+
+
+def test_largest_modulus_is_that_of_the_stiffest_particle():
+    material = Material("neo_hookean", ELASTIC)
+    p = material.per_particle()
+    expected = 1.15 * float(p["lam"] + 2 * p["mu"])
+    modulus = material.max_modulus(torch.tensor([0.9, 1.15, 1.0], requires_grad=True))
+    assert float(modulus) == pytest.approx(expected, rel=1e-6) and not modulus.requires_grad
+    assert float(material.reference_modulus()) == pytest.approx(1e5, rel=1e-5)
+
+
+def test_gradient_reaches_every_parameter_that_is_learned():
+    material = Material("drucker_prager", {**SAND, "cohesion": 0.01}, frozen=["nu"])
+    sum(v.sum() for v in material.per_particle(torch.ones(3)).values()).backward()
+    assert material.raw["nu"].grad is None and not material.raw["nu"].requires_grad
+    assert all(material.raw[n].grad.abs() > 0 for n in ("E", "friction_angle", "cohesion"))
+
+
+def test_stiffness_is_learned_as_a_logarithm():
+    material = Material("corotated", ELASTIC)
+    with torch.no_grad():
+        material.raw["E"].add_(0.1)
+    assert float(material.physical()["E"]) == pytest.approx(1e5 * 2.718281828**0.1, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("law", "parameters", "name"),
+    [
+        ("drucker_prager", SAND, "cohesion"), ("neo_hookean", {"E": 1e5, "nu": 0.0}, "nu"),
+        ("neo_hookean", {"E": 1e5, "nu": NU_MAX}, "nu"), ("drucker_prager", {**SAND, "friction_angle": 0.0}, "friction_angle"),
+    ],
+)  # fmt: skip
+def test_a_parameter_that_starts_on_its_bound_is_held_there(law, parameters, name):
+    material = Material(law, parameters)
+    assert name not in material.raw
+    assert float(material.physical()[name]) == pytest.approx(parameters[name], abs=1e-7)
+    other = Material(law, parameters)
+    other.load_state_dict(material.state_dict())
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.sampled_from(sorted(FORMS)), st.floats(-60, 60))
+def test_no_step_of_an_optimiser_leaves_the_range(name, raw):
+    value = float(FORMS[name].physical(torch.tensor(raw, dtype=torch.float64)))
+    assert FORMS[name].low < value <= FORMS[name].high
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.sampled_from(sorted(FORMS)), st.floats(0.001, 0.999))
+def test_unconstrained_form_and_back(name, place):
+    form = FORMS[name]
+    value = form.high * place if form.high < 1e9 else 10 ** (10 * place - 3)
+    back = form.physical(torch.tensor(form.inverse(value), dtype=torch.float64))
+    assert float(back) == pytest.approx(value, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("jelly", ELASTIC), "expected one of .*found 'jelly'"),
+        (("corotated", {**ELASTIC, "stifness": 1.0}), "found stifness"),
+        (("corotated", {"E": -1.0, "nu": 0.4}), "prior.parameters.E: expected a number between 0 and inf, found -1"),
+        (("corotated", {"E": 1e5, "nu": 0.5}), "prior.parameters.nu: expected a number between 0 and 0.49, found 0.5"),
+        (("drucker_prager", {**SAND, "friction_angle": 95.0}), "friction_angle: expected a number between 0 and 89"),
+        (("corotated", {"E": "soft", "nu": 0.4}), "prior.parameters.E: expected a number, found 'soft'"),
+        (("corotated", {"E": 1e5}), "E and nu go together"),
+        (("corotated", {}), "expected E with nu, or kappa with mu"),
+        (("von_mises", ELASTIC), "takes lam, mu, yield_stress"),
+        (("corotated", {**ELASTIC, "yield_stress": 1e3}), "law corotated takes lam, mu"),
+        (("corotated", ELASTIC, ["mu"]), "prior.frozen: expected names among E, nu, found mu"),
+        (("corotated", ELASTIC, [], ["kappa"]), "prior.modulated: expected names among E, nu, found kappa"),
+    ],
+)
+def test_a_mistake_is_named(arguments, message):
+    with pytest.raises(ConfigError, match=message):
+        Material(*arguments)
+
+
+def test_largest_angle_is_below_a_right_angle():
+    assert ANGLE_MAX < 90  # at 90 degrees the cone's slope is finite, but sin has no gradient there

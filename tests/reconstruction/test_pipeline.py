@@ -1,0 +1,161 @@
+"""The whole reconstruction on a scene with a known motion: accuracy, cache, resumption, and what it must not read."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import squashed_body
+import torch
+import yaml
+
+from mosa.errors import ConfigError
+from mosa.reconstruction import pipeline
+from mosa.reconstruction.pipeline import build_settings, reconstruct, spacing_for
+
+CONF = Path(__file__).parents[2] / "conf" / "reconstruction"
+SETTINGS = build_settings(
+    resolution=56, points=1200, static={"iterations": 120}, appearance={"iterations": 100},
+    dynamic={"modes": 40, "track_iterations": 30, "track_views": 3, "iterations": 40},
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def spacing(squashed):
+    return spacing_for(squashed, 700, SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="module")
+def found(squashed, spacing, cache):
+    # the truth is taken away: reading it would be an error
+    return reconstruct(replace(squashed, truth=None), settings=SETTINGS, spacing=spacing, cache_dir=cache, progress=False)
+
+
+def true_positions(squashed, particles):
+    last = float(squashed.times[-1])
+    rest = squashed_body.backward(particles.double().numpy(), 0.0, last)
+    return torch.as_tensor(np.stack([squashed_body.forward(rest, float(t), last) for t in squashed.times]), dtype=torch.float32)
+
+
+def test_particles_fill_the_body(squashed, found, spacing):
+    true = 4 / 3 * np.pi * np.prod(squashed_body.RADII)
+    assert float(found.volume.sum()) == pytest.approx(true, rel=0.05)
+    assert len(found.volume) == pytest.approx(700, rel=0.05)
+    mass = found.volume[:, None]
+    centre = (found.splats.means * mass).sum(0) / mass.sum()
+    assert (centre - torch.tensor([0.02, 0.30, 0.01])).norm() < 0.002
+    assert found.spacing == spacing
+
+
+def test_particle_motion_against_truth(squashed, found):
+    """A tenth of a pixel is 0.5 mm here (5 mm per pixel); the body is 0.22 m tall."""
+    true = true_positions(squashed, found.splats.means)
+    error = (found.cues.positions - true).norm(dim=-1)[1:]
+    assert float(error.pow(2).mean().sqrt()) < 2e-3
+    assert float((found.cues.positions.mean(1) - true.mean(1)).norm(dim=-1).max()) < 1.5e-3
+
+
+def test_cues_against_truth(squashed, found):
+    from mosa.reconstruction.cues import neighbourhood, neighbourhood_cues
+
+    true = true_positions(squashed, found.splats.means)
+    expected = neighbourhood_cues(true, found.cues.covariances, neighbourhood(found.splats.means))
+    turn = expected.rotation.transpose(-1, -2) @ found.cues.rotation
+    angle = torch.rad2deg(torch.acos(((turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1)))
+    assert float(angle[1:].median()) < 3.0
+    signal = (expected.stretch[-1] - 1).pow(2).mean().sqrt()
+    assert float(signal) > 0.08
+    assert float((expected.stretch[-1] - found.cues.stretch[-1]).pow(2).mean().sqrt()) < 0.5 * float(signal)
+    assert torch.equal(found.cues.rotation[0], torch.eye(3).expand_as(found.cues.rotation[0])) or torch.allclose(
+        found.cues.rotation[0], torch.eye(3).expand_as(found.cues.rotation[0]), atol=1e-5
+    )
+
+
+def test_free_fall_gives_the_velocity(squashed, found):
+    """Frames 0 to 1 are free flight: the mean velocity between them, without gravity's share, is the initial one."""
+    mass = found.volume[:, None]
+    centre = (found.cues.positions * mass).sum(1) / mass.sum()
+    dt = float(squashed.times[1])
+    velocity = (centre[1] - centre[0]) / dt + torch.tensor([0, 0.5 * 9.8 * dt, 0])
+    # the rotation about the origin of the rest frame adds to the centre's displacement as well: none, its centre is the origin
+    assert (velocity - torch.tensor([0.3, -1.6, 0.0])).norm() < 0.06
+
+
+def test_results_come_from_the_cache(squashed, found, spacing, cache, monkeypatch):
+    monkeypatch.setattr(pipeline, "fit_splats", None)
+    monkeypatch.setattr(pipeline, "fit_motion", None)
+    again = reconstruct(squashed, settings=SETTINGS, spacing=spacing, cache_dir=cache, progress=False)
+    assert torch.equal(again.cues.positions, found.cues.positions) and torch.equal(again.splats.colors, found.splats.colors)
+    folders = list((cache / "reconstruction").iterdir())
+    assert len(folders) == 1
+    names = {p.name for p in folders[0].iterdir()}
+    assert {"static.png", "particles.png", "motion.png", "key.json", "motion.pt"} <= names
+    assert not any(n.endswith(".tmp") for n in names)
+
+
+def test_a_damaged_stage_is_computed_again_and_the_rest_kept(squashed, found, spacing, cache, monkeypatch):
+    folder = next((cache / "reconstruction").iterdir())
+    (folder / "hull.pt").write_bytes(b"half a file")
+    monkeypatch.setattr(pipeline, "fit_motion", None)
+    again = reconstruct(squashed, settings=SETTINGS, spacing=spacing, cache_dir=cache, progress=False)
+    assert torch.equal(again.cues.positions, found.cues.positions)
+    assert (folder / "hull.pt").stat().st_size > 1000
+
+
+def test_held_out_cameras_and_frames_have_no_influence(squashed):
+    """Garbage in held-out images and mattes leaves the result bit-equal."""
+    quick = build_settings(resolution=32, ridge_passes=4, points=200, static={"iterations": 3}, appearance={"iterations": 3},
+                           dynamic={"modes": 8, "track_iterations": 2, "iterations": 2})  # fmt: skip
+    held = replace(squashed, holdout_cameras=(2,), holdout_frames=(4,))
+    images, mattes = squashed.images.clone(), squashed.mattes.clone()
+    images[2], mattes[2], images[:, 4], mattes[:, 4] = 0.1, 0.0, 0.9, 0.0
+    spoiled = replace(held, images=images, mattes=mattes)
+    results = [
+        reconstruct(s, settings=quick, spacing=spacing_for(s, 200, quick), cache_dir=None, progress=False)
+        for s in (held, spoiled)
+    ]
+    assert results[0].cues.positions.shape[0] == 4
+    assert torch.equal(results[0].cues.positions, results[1].cues.positions)
+    assert torch.equal(results[0].splats.colors, results[1].splats.colors)
+
+
+def test_gaussian_cues_come_from_free_shapes(squashed):
+    quick = {"resolution": 32, "ridge_passes": 4, "points": 200, "static": {"iterations": 3}, "appearance": {"iterations": 3}}
+    dynamic = {"modes": 8, "track_iterations": 2, "iterations": 2}
+    with pytest.raises(ConfigError, match="free_shape=true"):
+        build_settings(**quick, cue="gaussian", dynamic=dynamic)
+    settings = build_settings(**quick, cue="gaussian", dynamic=dynamic | {"free_shape": True})
+    scene = replace(squashed, holdout_frames=(3, 4))
+    cues = reconstruct(scene, settings=settings, spacing=spacing_for(scene, 200, settings), cache_dir=None, progress=False).cues
+    assert torch.allclose(cues.stretch[0], torch.ones_like(cues.stretch[0]), atol=1e-5)
+    assert float((cues.stretch[1] - 1).abs().max()) > 1e-6 and cues.weight.min() == 1
+    assert torch.allclose(torch.linalg.det(cues.rotation), torch.ones_like(cues.weight), atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["fast", "paper"])
+def test_presets_build(name):
+    settings = build_settings(**yaml.safe_load((CONF / f"{name}.yaml").read_text()))
+    assert settings.cue == ("neighbourhood" if name == "fast" else "gaussian")
+
+
+def test_wrong_keys_are_named():
+    with pytest.raises(ConfigError, match=r"reconstruction: unknown key 'pointz'"):
+        build_settings(pointz=3)
+    with pytest.raises(ConfigError, match=r"reconstruction.dynamic: unknown key 'mode'"):
+        build_settings(dynamic={"mode": 3})
+    with pytest.raises(ConfigError, match="cue: expected neighbourhood or gaussian"):
+        build_settings(cue="flow")
+
+
+def test_wrong_spacing_is_an_error(squashed):
+    with pytest.raises(ConfigError, match="spacing must be positive"):
+        reconstruct(squashed, settings=SETTINGS, spacing=0.0, cache_dir=None)
+    with pytest.raises(ConfigError, match="at least 8, found 2"):
+        spacing_for(squashed, 2)
