@@ -24,14 +24,19 @@ States = Callable[[Tensor], MaterialState]
 _PLACES = [[0, 5, 4], [5, 1, 3], [4, 3, 2]]
 
 
+def mandel_scale(like: Tensor) -> Tensor:
+    """(6,) factors of vech components; not by way of single precision, which would leave 2e-8 in everything."""
+    return torch.tensor(MANDEL, dtype=like.dtype, device=like.device)
+
+
 def mandel(vech: Tensor) -> Tensor:
     """(..., 6) in Mandel scaling from vech components xx, yy, zz, yz, zx, xy."""
-    return vech * torch.tensor(MANDEL).to(vech)
+    return vech * mandel_scale(vech)
 
 
 def mandel_matrix(operator: Tensor) -> Tensor:
     """(..., 6, 6) operator on Mandel vectors from one on vech components."""
-    scale = torch.tensor(MANDEL).to(operator)
+    scale = mandel_scale(operator)
     return scale[:, None] * operator / scale
 
 
@@ -94,7 +99,7 @@ def response_of(states: States, adapter: Adapter | None) -> Callable[[Tensor], T
     adapter = None if adapter is None else in_double(adapter)
 
     def response(strain: Tensor) -> Tensor:
-        plain = strain / torch.tensor(MANDEL).to(strain)
+        plain = strain / mandel_scale(strain)
         W = torch.matrix_exp(plain[:, _PLACES])
         state = states(W)
         stress = state.stress

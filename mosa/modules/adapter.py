@@ -69,7 +69,8 @@ class Adapter(nn.Module):
         """Fix E_ref [Pa] and the Poisson number of C0 to the calibrated prior's. They never change afterwards: a moving unit
         would make dL/dE wrong and the law irreproducible from its weights. Errors: ConfigError on a second, other value."""
         for name, value in (("E_ref", reference_modulus), ("poisson", poisson)):
-            buffer, value = getattr(self, name), float(torch.as_tensor(value).detach())
+            buffer = getattr(self, name)
+            value = float(value.detach() if isinstance(value, Tensor) else value)
             if not torch.isnan(buffer) and abs(float(buffer) - value) > 1e-6 * abs(value):
                 raise ConfigError(
                     f"adapter: {name} is fixed at {float(buffer):.6g} already, found {value:.6g}: build a new adapter"

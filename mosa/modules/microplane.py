@@ -101,7 +101,7 @@ def isotropic_stiffness(poisson: Tensor) -> Tensor:
 
 def major_symmetric(G: Tensor, poisson: Tensor) -> Tensor:
     """(G + C0 G^T C0^-1)/2 in Mandel scaling, (..., 6, 6) on vech: then (I + G) C0 is symmetric and the law has an energy."""
-    scale = torch.tensor(MANDEL).to(G)
+    scale = G.new_tensor(MANDEL)
     C0 = isotropic_stiffness(poisson.to(G))
 
     def project(A: Tensor) -> Tensor:

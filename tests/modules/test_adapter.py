@@ -42,7 +42,6 @@ def test_at_initialisation_it_is_the_prior_bit_for_bit(options, dtype):
         assert value is None or torch.equal(value, torch.zeros_like(value))
     assert (answer.plastic_G is not None) == options.get("plastic", False)
     increment = adapter.increment(w.float(), s.float())
-    # the stepwise order subtracts s again: exact only where nothing was assembled from averages, and those are exact in binary
     assert torch.equal(increment, torch.zeros(50, 6))
 
 
@@ -76,9 +75,10 @@ def test_major_symmetry_is_a_property_of_the_operator_the_simulator_gets():
     assert off[0] > 1e-2 and off[1] < 1e-13
 
 
-@pytest.mark.parametrize("adapter", [drawn_adapter(dtype=torch.float32), drawn_adapter(dtype=torch.float32, no_prior_stress=True)])
+@pytest.mark.parametrize("no_prior_stress", [False, True])
 @pytest.mark.parametrize("count", [1, 3, 1001])
-def test_a_body_at_rest_is_stress_free_exactly(adapter, count):
+def test_a_body_at_rest_is_stress_free_exactly(no_prior_stress, count):
+    adapter = drawn_adapter(dtype=torch.float32, no_prior_stress=no_prior_stress)
     zero = torch.zeros(count, 6)
     assert torch.equal(adapter(material_state(zero, zero)).h, zero)
     w, s = drawn_states(count, dtype=torch.float32)
@@ -101,7 +101,8 @@ def test_gradients_against_differences(at_rest, options):
     w, s = (torch.zeros(2, 6).double() if at_rest else a for a in drawn_states(2))
     direction = torch.randn(2, 12, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     parameters = [p for p in adapter.parameters() if p.requires_grad]
-    weights = [torch.randn(p.shape, generator=torch.Generator().manual_seed(i), dtype=torch.float64) for i, p in enumerate(parameters)]
+    generator = torch.Generator().manual_seed(7)
+    weights = [torch.randn(p.shape, generator=generator, dtype=torch.float64) for p in parameters]
     probe = torch.randn(2, 6, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
 
     def value(t: float) -> torch.Tensor:
@@ -117,7 +118,8 @@ def test_gradients_against_differences(at_rest, options):
 
     a, b = w.clone().requires_grad_(), s.clone().requires_grad_()
     G, offset, _ = adapter.affine(adapter.operator, a, b)
-    grads = torch.autograd.grad((probe * ((G @ b[..., None])[..., 0] + offset)).sum(), [a, b, *parameters], allow_unused=True)
+    result = (probe * ((G @ b[..., None])[..., 0] + offset)).sum()
+    grads = torch.autograd.grad(result, [a, b, *parameters], allow_unused=True)
     directions = [direction[:, :6], direction[:, 6:], *weights]
     slope = sum((g * d).sum() for g, d in zip(grads, directions) if g is not None)
     h = 1e-4
@@ -134,7 +136,7 @@ def test_bounds_hold_for_any_input_and_any_weights(seed, input_power, weight_pow
     adapter = drawn_adapter(seed, size=10.0**weight_power, dtype=dtype, alpha=alpha, l_max=l_max)
     w, s = drawn_states(8, seed, size=10.0**input_power / 4, dtype=dtype)
     with torch.no_grad():
-        _, _, pre, post, C = (*(None, None), *adapter.operator(w.clamp(-1e6, 1e6), s.clamp(-1e6, 1e6))[1:])
+        _, pre, post, C = adapter.operator(w.clamp(-1e6, 1e6), s.clamp(-1e6, 1e6))
     assert torch.isfinite(C).all() and torch.isfinite(pre).all() and torch.isfinite(post).all()
     assert max(pre.abs().max(), post.abs().max()) <= l_max * (1 + 1e-6)
     det = torch.linalg.det(torch.eye(3).double() + C.double())
@@ -152,7 +154,7 @@ def test_a_switch_removes_its_part_and_no_other(switch, part):
         assert torch.equal(ablated, torch.zeros_like(ablated)) == (index == part), name
 
 
-@pytest.mark.parametrize("switches", [{"no_C": True}, {"no_pre": True}, {"no_post": True}, {"no_C": True, "no_post": True}])
+@pytest.mark.parametrize("switches", [{}, {"no_C": True}, {"no_pre": True}, {"no_post": True}, {"no_C": True, "no_post": True}])
 def test_every_weight_that_is_learned_has_an_effect(switches):
     adapter = drawn_adapter(**switches)
     adapter(material_state(*drawn_states(10)))
@@ -197,7 +199,8 @@ def test_recomputing_changes_nothing_but_memory(plastic):
         answer = adapter(material_state(w, s))
         loss = sum(a.square().sum() for a in answer if a is not None) + adapter.statistics().mean_square
         loss.backward()
-        results.append([*(a.detach() for a in answer if a is not None), w.grad, s.grad, *(p.grad for p in adapter.parameters())])
+        values = [a.detach() for a in answer if a is not None]
+        results.append([*values, w.grad, s.grad, *(p.grad for p in adapter.parameters())])
     assert all(torch.equal(a, b) for a, b in zip(*results))
 
 
@@ -206,19 +209,21 @@ def test_statistics_are_those_of_the_outputs_and_pool_over_evaluations():
     w, s = drawn_states(40)
     adapter(material_state(w, s))
     whole = adapter.statistics()
-    part = adapter.operator(w, s)
-    assert whole.mean_abs_C == pytest.approx(float(part.C.abs().mean()), rel=1e-12)
+    with torch.no_grad():
+        part = adapter.operator(w, s)
+    assert float(whole.mean_abs_C.detach()) == pytest.approx(float(part.C.abs().mean()), rel=1e-12)
     entries = torch.cat([part.C.flatten(1), part.pre, part.post], 1)
-    assert float(whole.mean_square) == pytest.approx(float(entries.square().mean()), rel=1e-12)
-    assert float(whole.variance) == pytest.approx(float(entries.var(0, unbiased=False).mean()), rel=1e-12)
+    assert float(whole.mean_square.detach()) == pytest.approx(float(entries.square().mean()), rel=1e-12)
+    assert float(whole.variance.detach()) == pytest.approx(float(entries.var(0, unbiased=False).mean()), rel=1e-12)
     halves = []
     for chosen in (slice(0, 20), slice(20, 40)):
         adapter(material_state(w[chosen], s[chosen]))
         halves.append(adapter.statistics())
     pooled = pool(halves)
     for name in ("mean_abs_C", "mean_square", "variance"):
-        assert float(getattr(pooled, name)) == pytest.approx(float(getattr(whole, name)), rel=1e-12), name
-    assert float(torch.stack([h.variance for h in halves]).mean()) < 0.999 * float(pooled.variance)  # time counts as well
+        mine, theirs = (float(getattr(a, name).detach()) for a in (pooled, whole))
+        assert mine == pytest.approx(theirs, rel=1e-12), name
+    assert torch.stack([h.variance for h in halves]).mean() < 0.999 * pooled.variance  # time counts as well
     pooled.variance.backward()
     assert all(p.grad.abs().sum() > 0 for p in adapter.operator.planes.parameters())
 
@@ -261,7 +266,8 @@ def test_it_can_be_copied_and_pickled_while_a_graph_is_alive(kind):
     [
         ({"alpha": 0.0}, "adapter.alpha"), ({"alpha": 1.0}, "adapter.alpha"), ({"l_max": 0.0}, "adapter.l_max"),
         ({"input_scale": -1.0}, "adapter.input_scale"), ({"hidden": 0}, "adapter.hidden"),
-        ({"state_dependence": "some"}, "expected full or constant"), ({"no_prior_stress": True, "no_pre": True}, "no_pre=false"),
+        ({"state_dependence": "some"}, "expected full or constant"),
+        ({"no_prior_stress": True, "no_pre": True}, "no_pre=false"),
     ],
 )  # fmt: skip
 def test_a_value_out_of_range_is_named(options, message):

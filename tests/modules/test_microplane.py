@@ -50,7 +50,8 @@ def test_assembled_operator_is_the_steps_written_out():
 
 def test_shears_do_not_feel_the_normal_matrix():
     planes = drawn(3, 3, 3, 3)
-    with_, without = (microplane.redistribution(planes, normal) for normal in (drawn(3, 3, 3, seed=3), torch.zeros(3, 3, 3).double()))
+    normals = (drawn(3, 3, 3, seed=3), torch.zeros(3, 3, 3).double())
+    with_, without = (microplane.redistribution(planes, normal) for normal in normals)
     assert torch.equal(with_[:, 3:], without[:, 3:])
     assert not torch.equal(with_[:, :3], without[:, :3])
 
