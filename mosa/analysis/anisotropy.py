@@ -1,7 +1,7 @@
 """Directions of a learned law (evaluation.md, last item): its redistribution w(n) and its directional modulus E(n).
 
-Everything is in the material frame and in Mandel scaling, where the double contraction of symmetric tensors is a dot product; in
-plain 6-vectors even an isotropic law would look anisotropic.
+Everything is in the material frame and in Mandel scaling, where the double contraction of symmetric tensors is a dot
+product; in plain 6-vectors even an isotropic law would look anisotropic.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def redistribution_response(jacobian: Tensor, directions: Tensor) -> Tensor:
 
 
 def response_of(states: States, adapter: Adapter | None) -> Callable[[Tensor], Tensor]:
-    """Corrected stress (M, 6) [Pa] in Mandel scaling, in the material frame, as a function of the Hencky strain (M, 6), Mandel."""
+    """Corrected stress (M, 6) [Pa] as a function of the Hencky strain (M, 6): both Mandel, in the material frame."""
     adapter = None if adapter is None else in_double(adapter)
 
     def response(strain: Tensor) -> Tensor:

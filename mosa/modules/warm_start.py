@@ -1,4 +1,4 @@
-"""Start of the ablation without prior stress: L_pre learns to reproduce the prior, or the body would begin without stiffness."""
+"""Start of the ablation without prior stress: L_pre reproduces the prior, or the body would begin without stiffness."""
 
 from __future__ import annotations
 
@@ -24,12 +24,18 @@ def drawn_stretches(count: int, largest: float, generator: torch.Generator) -> T
 
 @torch.no_grad()
 def warm_start(
-    adapter: StressAdapter, states: Callable[[Tensor], MaterialState], *, strain: float = 0.3, samples: int = 8192, seed: int = 0
+    adapter: StressAdapter,
+    states: Callable[[Tensor], MaterialState],
+    *,
+    strain: float = 0.3,
+    samples: int = 8192,
+    seed: int = 0,
 ) -> float:
-    """Fit the last layer of Phi to the prior's stress over random stretches up to `strain`; returns the relative RMS error left.
+    """Fit the last layer of Phi to the prior's stress over random Hencky strains up to `strain`; (relative RMS error left).
 
-    states: of `mosa.modules.material.material_states`. The fit is linear least squares of relative errors, so that the stiffness at rest counts as
-    much as that at large strain, with L_pre(0, 0) = 0. Errors: ConfigError for an adapter that has the prior stress or no E_ref.
+    states: of `mosa.modules.material.material_states`. Linear least squares of relative errors, so that the stiffness at
+    rest counts as much as that at large strain, with L_pre(0, 0) = 0. To be called after `switch_on`, before any training.
+    Errors: ConfigError for an adapter that has the prior stress or no E_ref.
     """
     if not isinstance(adapter, StressAdapter) or not adapter.operator.no_prior_stress:
         raise ConfigError("warm_start: expected an adapter with no_prior_stress=true; the others start from the prior as it is")

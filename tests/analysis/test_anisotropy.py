@@ -200,7 +200,10 @@ def test_jacobian_against_differences():
     assert not torch.allclose(jacobian, EYE6.expand(4, 6, 6), atol=1e-2)
     double = anisotropy.in_double(adapter)
     for k in range(6):
-        f = lambda h, k=k: double.increment(w, s + h * EYE6[k])
+
+        def f(h: float, k: int = k) -> torch.Tensor:
+            return double.increment(w, s + h * EYE6[k])
+
         column = (8 * (f(1e-4) - f(-1e-4)) - (f(2e-4) - f(-2e-4))) / 12e-4 + EYE6[k]
         torch.testing.assert_close(jacobian[:, :, k], column, rtol=1e-6, atol=1e-9)
 

@@ -9,6 +9,8 @@ from mosa.modules.adapter import StressAdapter
 from mosa.modules.material import material_states
 from mosa.modules.warm_start import drawn_stretches, warm_start
 from mosa.physics.elasticity import lame
+from mosa.physics.rollout import Simulator
+from mosa.types import Ground, ParticleState
 
 E, NU = 8e4, 0.4
 
@@ -63,6 +65,30 @@ def test_rest_stays_exactly_stress_free(states):
     literal = adapter(rest_free=False)
     warm_start(literal, states)
     assert response_of(states, literal)(torch.zeros(3, 6, dtype=torch.float64)).abs().max() < 1e-5 * E
+
+
+def test_body_falls_and_bounces_like_the_prior(states):
+    """A block of 0.1 m dropped on the ground; asked at every substep, so that nothing but the fit differs."""
+    mu, lam = lame(torch.tensor(E, dtype=torch.float64), torch.tensor(NU, dtype=torch.float64))
+    spacing = 0.02
+    x = torch.cartesian_prod(*[0.2 + spacing * torch.arange(5, dtype=torch.float64)] * 3) + torch.tensor([0, 0.02, 0]).double()
+    eye = torch.eye(3, dtype=torch.float64).expand(len(x), 3, 3).contiguous()
+    v = torch.tensor([0, -1.5, 0], dtype=torch.float64).expand(len(x), 3).contiguous()
+    simulator = Simulator("neo_hookean", dx=0.04, substeps=80, frame_dt=0.02, ground=Ground(0.2), dtype=torch.float64)
+
+    def positions(model) -> torch.Tensor:
+        volume = torch.full((len(x),), spacing**3, dtype=torch.float64)
+        start = ParticleState(x, v, torch.zeros_like(eye), eye, eye)
+        return simulator.rollout(start, {"mu": mu, "lam": lam}, volume, 1000.0, 4, adapter=model).x
+
+    model = adapter()
+    with torch.no_grad():
+        wanted, soft = positions(None), positions(model)
+        warm_start(model, states)
+        found = positions(model)
+    apart = lambda a: (a - wanted).square().sum(-1).mean(1).sqrt().max()  # noqa: E731
+    assert apart(soft) > 0.02  # [m]: without a warm start it is a puddle
+    assert apart(found) < 0.001
 
 
 def test_only_the_last_layer_of_phi_moves_and_the_same_seed_gives_the_same(states):

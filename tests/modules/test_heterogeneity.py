@@ -36,6 +36,14 @@ def test_it_sees_positions_relative_to_the_object():
     torch.testing.assert_close(moved(3 * places() + 1), field(places()), rtol=1e-4, atol=1e-4)
 
 
+def test_the_network_reads_coordinates_between_minus_one_and_one():
+    field, seen = HeterogeneityField(LOW, HIGH), []
+    field.net.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    field(torch.stack([LOW, HIGH, (LOW + HIGH) / 2]))
+    torch.testing.assert_close(seen[0][:, :3], torch.tensor([-1.0, 1, 0])[:, None].expand(3, 3))
+    assert seen[0].shape == (3, 15) and seen[0].abs().max() <= 1 + 1e-6
+
+
 def test_its_last_layer_learns_from_the_first_step():
     field = HeterogeneityField(LOW, HIGH)
     (field.factor(places()) * places()[:, 0]).sum().backward()

@@ -1,0 +1,86 @@
+"""The adapter in the simulator: the prior at the start, one gradient from the motion to every weight."""
+
+import math
+
+import pytest
+import torch
+from drawn_adapters import randomise
+
+from mosa.modules.adapter import StressAdapter
+from mosa.physics.rollout import Simulator
+from mosa.types import Ground, ParticleState
+
+E, NU = 2e4, 0.3
+PARAMETERS = {"mu": E / (2 * (1 + NU)), "lam": E * NU / ((1 + NU) * (1 - 2 * NU))}
+DX, FRAME_DT, SUBSTEPS = 0.05, 5e-3, 25
+VOLUME = 0.025**3
+
+
+def body(dtype: torch.dtype) -> ParticleState:
+    """A block of 64 particles, turned by 20 degrees, sheared and spinning, just above the ground."""
+    axis = 0.0125 + 0.025 * torch.arange(4, dtype=torch.float64)
+    X = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    c, s = math.cos(math.radians(20)), math.sin(math.radians(20))
+    Q = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float64)
+    F = Q @ torch.tensor([[1.03, 0.04, 0], [0, 0.97, 0.02], [0, 0, 1.0]], dtype=torch.float64)
+    x = X @ F.T + torch.tensor([0.5, 0.0, 0.5])
+    x = x + torch.tensor([0, 0.12, 0]) - torch.tensor([0, 1.0, 0]) * x[:, 1].min()
+    spin = torch.tensor([[0, -3.0, 0], [3.0, 0, 1.0], [0, -1.0, 0]], dtype=torch.float64)
+    v = (x - x.mean(0)) @ spin.T + torch.tensor([0.2, -1.0, 0.1])
+    many = (F.expand(64, 3, 3), spin.expand(64, 3, 3))
+    F, C = (a.contiguous().to(dtype) for a in many)
+    return ParticleState(x.to(dtype), v.to(dtype), C, F, F)
+
+
+def simulator(dtype: torch.dtype, law: str = "neo_hookean", ground: bool = True) -> Simulator:
+    return Simulator(law, dx=DX, substeps=SUBSTEPS, frame_dt=FRAME_DT, dtype=dtype, ground=Ground(0.1) if ground else None)
+
+
+def roll(adapter, dtype: torch.dtype, frames: int, ground: bool = True, stride: int = 5):
+    volume, start = torch.full((64,), VOLUME, dtype=dtype), body(dtype)
+    return simulator(dtype, ground=ground).rollout(start, PARAMETERS, volume, 1000.0, frames, adapter=adapter, stride=stride)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_an_untrained_adapter_moves_the_body_as_the_prior_does_bit_for_bit(dtype):
+    """Check 8 of verification.md, where it matters: in the motion, through contact."""
+    adapter = StressAdapter()
+    adapter.switch_on(E, NU)
+    with torch.no_grad():
+        prior, adapted = roll(None, dtype, 5), roll(adapter, dtype, 5)
+        randomise(adapter, 0.3)
+        trained = roll(adapter, dtype, 5)
+    assert torch.equal(adapted.x, prior.x) and torch.equal(adapted.F, prior.F)
+    assert (trained.x - prior.x).abs().max() > 1e-5
+
+
+def test_gradient_in_the_weights_over_200_substeps_is_that_of_differences():
+    """Check 18 of verification.md, free flight of a vibrating body: one direction through all weights."""
+    adapter = StressAdapter(hidden=8).double()
+    randomise(adapter, 0.3)
+    adapter.switch_on(E, NU)
+    parameters = [p for p in adapter.parameters() if p.requires_grad]
+    generator = torch.Generator().manual_seed(2)
+    direction = [torch.randn(p.shape, generator=generator, dtype=torch.float64) for p in parameters]
+    probe = torch.randn(64, 3, generator=generator, dtype=torch.float64)
+
+    def value() -> torch.Tensor:
+        rollout = roll(adapter, torch.float64, 9, ground=False)
+        return (probe * rollout.x[-1]).sum() + 0.1 * rollout.F[-1].square().sum()
+
+    grads = torch.autograd.grad(value(), parameters)
+    slope = float(sum((g * d).sum() for g, d in zip(grads, direction)))
+
+    def at(t: float) -> float:
+        with torch.no_grad():
+            for p, d in zip(parameters, direction):
+                p.add_(t * d)
+            result = float(value())
+            for p, d in zip(parameters, direction):
+                p.sub_(t * d)
+        return result
+
+    h = 2e-4
+    difference = (8 * (at(h) - at(-h)) - (at(2 * h) - at(-2 * h))) / (12 * h)
+    assert abs(slope) > 1e-4
+    assert slope == pytest.approx(difference, rel=1e-6)
