@@ -135,12 +135,16 @@ class StressAdapter(Adapter):
         G, parts = part.G[:-1], Correction(*(p[:-1] for p in part))
         b = rested(b[:-1], b[-1:], w, s) if self.rest_free else b[:-1]
         if operator.no_prior_stress:
-            G = -torch.eye(6, dtype=w.dtype, device=w.device).expand_as(G)
+            # tau_hat = s3 at the state asked at. Held as an offset to the prior's stress, not as the stress itself: a stress
+            # frozen for a few substeps pumps energy (a dropped block was off by 21 mm at stride 8, 0.6 mm in this form)
+            G, b = torch.zeros_like(G), b - s
         return G, b, parts
 
     def redistribution(self, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """(A (N, 6, 6), b (N, 6)) with d(w, s) = (A - I) s + b; w, s: (N, 6) dimensionless. b carries L_pre, L_post, rest."""
         G, b, _ = self.affine(self.operator, w, s)
+        if self.operator.no_prior_stress:
+            return torch.zeros_like(G), b + s
         return G + torch.eye(6).to(G), b
 
     def increment(self, w: Tensor, s: Tensor) -> Tensor:

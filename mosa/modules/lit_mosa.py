@@ -11,9 +11,12 @@ from torch import Tensor
 from mosa import losses
 from mosa.data.datamodule import Observations
 from mosa.errors import ConfigError, SimulationDiverged
+from mosa.modules.adapter import pool
 from mosa.modules.body import Body, Start, World
+from mosa.modules.material import material_states
 from mosa.modules.observer import deformed_covariances, observe
 from mosa.modules.stages import Stage
+from mosa.modules.warm_start import warm_start
 from mosa.types import MotionCues, Rollout
 
 TERMS = ("image", "mask", "flow", "rotation", "stretch", "heterogeneity", "position", "operator", "operator_variance")
@@ -125,9 +128,14 @@ class LitMosa(L.LightningModule):
         body, weights, cues = self.body, self.weights, self.cues
         adapted = stage.name == "joint" and body.adapter is not None
         collected: list = []
+        penalised = weights.get("operator", 0.0) != 0 or weights.get("operator_variance", 0.0) != 0
+        def collect(adapter) -> None:
+            with torch.set_grad_enabled(penalised):
+                collected.append(adapter.statistics())
+
         rollout = body.simulate(
             self.start, self.world, frames, self.frame_dt, with_adapter=adapted, with_heterogeneity=stage.name != "prior",
-            collect=(lambda adapter: collected.append(adapter.statistics())) if adapted else None,
+            collect=collect if adapted else None,
         )
         def on(name: str) -> bool:
             return weights.get(name, 0.0) != 0
@@ -153,11 +161,12 @@ class LitMosa(L.LightningModule):
         if stage.name != "prior" and body.heterogeneity is not None and on("heterogeneity"):
             terms["heterogeneity"] = losses.heterogeneity_loss(body.heterogeneity(body.rest))
         if collected:
+            over_all = pool(collected)  # a variance over time as well as over particles
             if on("operator"):
-                terms["operator"] = torch.stack([s.mean_square for s in collected]).mean()
+                terms["operator"] = (over_all.mean_square + 1e-8).sqrt()
             if on("operator_variance"):
-                terms["operator_variance"] = torch.stack([s.variance for s in collected]).mean()
-            self.last["mean_abs_C"] = float(torch.stack([s.mean_abs_C.detach() for s in collected]).mean())
+                terms["operator_variance"] = over_all.variance
+            self.last["mean_abs_C"] = float(over_all.mean_abs_C.detach())
         return terms, rollout
 
     def gradient_norms(self, optimizer, stage: Stage, iteration: int) -> dict[str, float]:
@@ -177,9 +186,12 @@ class LitMosa(L.LightningModule):
         """What a stage starts from."""
         if stage.start is not None:
             self.body.thaw(stage.start)
-        if stage.name == "joint" and self.body.adapter is not None:
-            physical = self.body.material.physical()
-            self.body.adapter.switch_on(self.body.material.reference_modulus(), physical.get("nu", 0.3))
+        adapter, material = self.body.adapter, self.body.material
+        if stage.name == "joint" and adapter is not None:
+            adapter.switch_on(material.reference_modulus(), material.physical().get("nu", torch.tensor(0.3)).detach())
+            if getattr(getattr(adapter, "operator", None), "no_prior_stress", False):
+                parameters = {k: v.detach() for k, v in material.per_particle(1.0).items()}
+                warm_start(adapter, material_states(material.law, parameters))
 
     def finish(self, stage: Stage) -> None:
         """Keep the stage's result as a backbone and go on to the next; stop the trainer after the last."""
