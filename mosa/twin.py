@@ -45,7 +45,8 @@ class Twin:
         body = build_body(saved["config"], {k: state[k] for k in ("rest", "volume", "colors", "opacities", "covariances")})
         body.load_state_dict(state)
         start = Start(**{k: torch.tensor(v) for k, v in saved["start"].items()})
-        return cls(body.to(device).eval(), build_world(saved["config"]["world"]), saved["config"]["frame_dt"], saved["config"], start)
+        config = saved["config"]
+        return cls(body.to(device).eval(), build_world(config["world"]), config["frame_dt"], config, start)
 
     @torch.no_grad()
     def simulate(

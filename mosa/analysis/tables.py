@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 MODELS = (("floor", "floor/"), ("prior", "prior/"), ("prior + eta", "prior_eta/"), ("adapted", ""))
-UNITS = {"rms_m": ("rms [mm]", 1e3, 2), "cd_m": ("CD [mm]", 1e3, 2), "emd_m": ("EMD [mm]", 1e3, 1), "psnr_crop": ("PSNR crop", 1, 2),
+UNITS = {"rms_m": ("rms [mm]", 1e3, 2),
+         "cd_m": ("CD [mm]", 1e3, 2), "emd_m": ("EMD [mm]", 1e3, 1), "psnr_crop": ("PSNR crop", 1, 2),
          "ssim_crop": ("SSIM crop", 1, 4)}
 
 

@@ -16,7 +16,7 @@ from mosa.types import Cameras, Reconstruction, Scene
 
 @dataclass(frozen=True)
 class Observations:
-    """Training targets of V views: images (V, T, h, w, 3), mattes (V, T, h, w), flow (V, T - 1, h, w, 2) [px], cropped cameras."""
+    """Targets of V views: images (V, T, h, w, 3), mattes (V, T, h, w), flow (V, T - 1, h, w, 2) [px], cropped cameras."""
 
     images: Tensor
     mattes: Tensor
@@ -45,8 +45,8 @@ def training_observations(scene: Scene, reconstruction: Reconstruction, *, margi
                 flow=True).flow
         for v in range(len(views))
     ]
-    return Observations(crop_images(images, x0, y0, width, height, axis=2).to(device), crop_images(mattes, x0, y0, width, height, axis=2).to(device),
-                        torch.cat(flow), cameras, scene.cameras.width)
+    images, mattes = (crop_images(stack, x0, y0, width, height, axis=2).to(device) for stack in (images, mattes))
+    return Observations(images, mattes, torch.cat(flow), cameras, scene.cameras.width)
 
 
 class ViewSchedule(Dataset):

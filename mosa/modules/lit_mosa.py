@@ -226,8 +226,8 @@ class LitMosa(L.LightningModule):
         """(3, 2 h, T w) strip of one view: real above, rendered below, every frame from left to right."""
         frames = len(self.cues.positions)
         body = self.body
-        joint = self.stage is None or self.stage.name == "joint"
-        rollout = body.simulate(self.start, self.world, frames, self.frame_dt, with_adapter=joint and body.adapter is not None)
+        adapted = body.adapter is not None and body.adapter.is_on  # it is switched on when its stage begins
+        rollout = body.simulate(self.start, self.world, frames, self.frame_dt, with_adapter=adapted)
         targets = self.observations.select([view], frames)
         seen = observe(rollout.x, deformed_covariances(rollout.F_tot, body.covariances), body.opacities, body.colors,
                        targets.cameras, self.background)

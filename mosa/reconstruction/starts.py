@@ -54,7 +54,8 @@ def sequence_start(body: Body, splats: Splats, scene: Scene, *, register: bool) 
     views = scene.cameras.select(cameras)
     rotation, center = torch.eye(3), body.center.cpu()
     if register:
-        rotation, center = register_pose(splats, images[:, 0], mattes[:, 0], views, background=scene.background, rest_center=body.center)
+        rotation, center = register_pose(splats, images[:, 0], mattes[:, 0], views, background=scene.background,
+                                         rest_center=body.center)
     start = Start(rotation.to(body.rest), center.to(body.rest), torch.zeros(3).to(body.rest), torch.zeros(3).to(body.rest))
     count = 2
     while True:
