@@ -105,12 +105,12 @@ def train(cfg: DictConfig) -> float | None:
     body = body_of(reconstruction, config).to(device)
     with clock.measure("starts"):
         found = starts(body, reconstruction, scene, held_out)
-    contact = first_contact(body, found["train"], scene)
     config["starts"] = {k: {n: getattr(s, n).tolist() for n in ("rotation", "center", "velocity", "angular_velocity")}
                         for k, s in found.items()}
     world = build_world(config["world"])
     with clock.measure("fit"):
-        fit(cfg, scene, reconstruction, body, found["train"], world, contact, config, folder, device)
+        module, data = assemble_fit(cfg, scene, reconstruction, body, found["train"], config, device)
+        fit(cfg, module, data, folder, device)
     with clock.measure("evaluation"):
         figures, kept = evaluate(body, sequences(body, scene, held_out, found), world,
                                  samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
@@ -131,20 +131,29 @@ def body_of(reconstruction: Reconstruction, config: dict) -> Body:
                                "covariances": covariance_from(splats.scales, splats.rotations)})
 
 
-def fit(cfg, scene, reconstruction, body, start, world, contact, config, folder, device) -> None:
-    """The staged optimisation under Lightning; resumes from cfg.ckpt_path."""
-    frames = scene.training_frames
+def assemble_fit(cfg, scene, reconstruction, body, start, config, device) -> tuple[LitMosa, MultiViewDataModule]:
+    """What Lightning fits: the module with its targets and stages, and the schedule of views."""
+    frames = len(scene.training_frames)
     observations = training_observations(scene, reconstruction, margin=cfg.rendering.margin, device=device)
     cues = reconstruction.cues
     names = ("positions", "rotation", "stretch", "weight", "covariances")
-    cues = MotionCues(*(getattr(cues, n)[: len(frames)].to(device) for n in names))
-    plain_fit = plain(cfg.fit)
-    stages = build_stages(plain_fit, heterogeneity=body.heterogeneity is not None, adapter=body.adapter is not None)
-    module = LitMosa(body, start=start, world=world, observations=observations, cues=cues,
-                     background=scene.background.to(device), frame_dt=config["frame_dt"], first_contact=contact, stages=stages,
-                     weights=plain(cfg.losses), clip=plain_fit["clip"], config=config)
-    steps = sum(s.iterations for s in stages)
-    data = MultiViewDataModule(observations, views_per_step=plain_fit["views"], steps=steps, seed=cfg.seed)
+    settings = plain(cfg.fit)
+    stages = build_stages(settings, heterogeneity=body.heterogeneity is not None, adapter=body.adapter is not None)
+    module = LitMosa(
+        body, start=start, world=build_world(config["world"]), observations=observations,
+        cues=MotionCues(*(getattr(cues, n)[:frames].to(device) for n in names)), background=scene.background.to(device),
+        frame_dt=config["frame_dt"], first_contact=first_contact(body, start, scene), stages=stages,
+        weights=plain(cfg.losses), clip=settings["clip"], config=config,
+    )
+    data = MultiViewDataModule(observations, views_per_step=settings["views"], steps=sum(s.iterations for s in stages),
+                               seed=cfg.seed)
+    return module, data
+
+
+def fit(cfg, module: LitMosa, data: MultiViewDataModule, folder: Path, device: str) -> None:
+    """The staged optimisation under Lightning; resumes from cfg.ckpt_path. Errors: ConfigError for a missing checkpoint."""
+    if cfg.ckpt_path is not None and not Path(cfg.ckpt_path).is_file():
+        raise ConfigError(f"ckpt_path: no file {cfg.ckpt_path}; a run writes <run folder>/checkpoints/last.ckpt")
     logger = TensorBoardLogger(folder, name="tensorboard", version="") if cfg.logger.enabled else False
     callbacks = [KeepLast(folder / "checkpoints"), FitProgress()]
     if cfg.logger.enabled and cfg.logger.images_every:
@@ -153,12 +162,10 @@ def fit(cfg, scene, reconstruction, body, start, world, contact, config, folder,
                         callbacks=callbacks, plugins=[AtomicCheckpointIO()], enable_checkpointing=False,
                         enable_progress_bar=False, enable_model_summary=False, log_every_n_steps=1,
                         reload_dataloaders_every_n_epochs=1, default_root_dir=folder)
-    if cfg.ckpt_path is not None and not Path(cfg.ckpt_path).is_file():
-        raise ConfigError(f"ckpt_path: no file {cfg.ckpt_path}; a run writes <run folder>/checkpoints/last.ckpt")
     trainer.fit(module, datamodule=data, ckpt_path=cfg.ckpt_path, weights_only=True)
     if module.stage is not None:
         raise KeyboardInterrupt
-    body.to(device)
+    module.body.to(device)
 
 
 def start_figures(start: Start) -> dict[str, float]:

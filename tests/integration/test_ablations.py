@@ -1,0 +1,72 @@
+"""Each ablation changes the term or the parameters it names and leaves the others as they are at the first joint step."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+
+from mosa.config import run_config
+from mosa.pipeline import assemble_fit, body_of, plain, reconstruct_scene, scenes, starts
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def first_step(tmp_path_factory):
+    """Function ablation -> (loss terms of the first joint step, names of the trainable parameters)."""
+    cache, known = tmp_path_factory.mktemp("cache"), {}
+
+    def compute(ablation: str):
+        if ablation not in known:
+            with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+                cfg = compose("train", overrides=["debug=default", f"scene.cache={cache}", f"ablation={ablation}"])
+            scene, _ = scenes(cfg)
+            reconstruction, dx = reconstruct_scene(cfg, scene, "cpu")
+            config = run_config(plain(cfg), scene, dx)
+            body = body_of(reconstruction, config)
+            start = starts(body, reconstruction, scene, [])["train"]
+            module, _ = assemble_fit(cfg, scene, reconstruction, body, start, config, "cpu")
+            joint = module.stages[-1]
+            module.begin(joint)
+            with torch.no_grad():
+                terms, _ = module.terms(joint, [0, 1], scene.frames)
+            known[ablation] = ({k: float(v) for k, v in terms.items()},
+                               {n for n, p in body.named_parameters() if p.requires_grad})
+        return known[ablation]
+
+    return compute
+
+
+DROPPED_TERMS = {"no_flow": {"flow"}, "no_scale": {"stretch"}, "no_rot": {"rotation"},
+                 "no_motion": {"flow", "stretch", "rotation"}, "no_het": {"heterogeneity"}}
+
+
+@pytest.mark.parametrize("name", ["no_C", "no_pre", "no_post", "no_stress", *DROPPED_TERMS])
+def test_other_terms_are_equal_at_the_first_step(first_step, name):
+    full, _ = first_step("full")
+    terms, _ = first_step(name)
+    assert full.keys() - terms.keys() == DROPPED_TERMS.get(name, set())
+    assert terms == {k: v for k, v in full.items() if k in terms}
+
+
+@pytest.mark.parametrize(
+    ("name", "marks"),
+    [("no_C", ("operator.planes",)), ("no_pre", ("operator.phi",)), ("no_post", ("operator.theta",)),
+     ("no_stress", ("adapter.",)), ("no_het", ("heterogeneity.",)), ("no_flow", ()), ("no_rot", ())],
+)
+def test_the_parameters_it_names_stop_learning_and_no_others(first_step, name, marks):
+    _, full = first_step("full")
+    _, left = first_step(name)
+    assert left <= full
+    gone = full - left
+    assert all(any(m in n for m in marks) for n in gone), gone
+    assert bool(gone) == bool(marks)
+
+
+def test_no_prior_stress_starts_near_the_prior(first_step):
+    full, _ = first_step("full")
+    terms, _ = first_step("no_prior_stress")
+    assert terms.keys() == full.keys()
+    assert terms != full  # the stress now comes from a network
+    assert terms["position"] == pytest.approx(full["position"], rel=0.05)  # which was fitted to the prior's
