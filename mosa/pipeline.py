@@ -110,6 +110,7 @@ def train(cfg: DictConfig) -> float | None:
     world = build_world(config["world"])
     with clock.measure("fit"):
         module, data = assemble_fit(cfg, scene, reconstruction, body, found["train"], config, device)
+        print(fit_estimate(module))
         fit(cfg, module, data, folder, device)
     with clock.measure("evaluation"):
         figures, kept = evaluate(body, sequences(body, scene, held_out, found), world,
@@ -148,6 +149,25 @@ def assemble_fit(cfg, scene, reconstruction, body, start, config, device) -> tup
     data = MultiViewDataModule(observations, views_per_step=settings["views"], steps=sum(s.iterations for s in stages),
                                seed=cfg.seed)
     return module, data
+
+
+BACKWARD = 3.5  # cost of a step with gradients over one without, measured on the rabbit
+ADAPTER_COST, ADAPTER_BYTES = 1.8, 4.8e3  # of a step with networks over one without; per particle and evaluation
+
+
+def fit_estimate(module: LitMosa) -> str:
+    """One line on how long the fit will take and what its networks will keep in memory, from one timed step without gradients."""
+    body, stages = module.body, module.stages
+    frames = len(module.cues.positions)
+    began = time.perf_counter()
+    with torch.no_grad():
+        module.terms(stages[0], [0, min(1, len(module.observations.cameras) - 1)], frames)
+    step = BACKWARD * (time.perf_counter() - began)
+    seconds = sum(s.iterations * step * (ADAPTER_COST if s.name == "joint" and body.adapter is not None else 1) for s in stages)
+    evaluations = (frames - 1) * body.last_substeps / body.settings.stride
+    memory = evaluations * len(body.rest) * ADAPTER_BYTES if body.adapter is not None else 0
+    return (f"fit: {len(body.rest)} particles, {frames} frames of {body.last_substeps} substeps, at most "
+            f"{sum(s.iterations for s in stages)} steps, about {seconds / 60:.0f} minutes and {0.8 + memory / 1e9:.1f} GB")
 
 
 def fit(cfg, module: LitMosa, data: MultiViewDataModule, folder: Path, device: str) -> None:
@@ -195,23 +215,23 @@ def write_outputs(folder: Path, cfg: DictConfig, body: Body, evaluated: list[Seq
     (folder / "metrics.json").write_text(json.dumps(dict(sorted(figures.items())), indent=1))
     save_rollout(folder / "rollout.npz", {prefix: variants["adapted"] for prefix, variants in kept.items()})
     if cfg.evaluation.video:
-        frames = comparison(body, evaluated[-1], kept[evaluated[-1].prefix])
-        write_video(folder / "video.mp4", frames, fps=6)
-        write_strip(folder / "strip.png", frames, every=max(1, len(frames) // 5))
+        columns = comparison(body, evaluated[-1], kept[evaluated[-1].prefix])
+        enlarge = max(1, round(320 / max(columns["real"].shape[1:3])))
+        write_video(folder / "video.mp4", side_by_side(columns, enlarge), fps=6)
+        write_strip(folder / "strip.png", columns, enlarge=max(1, enlarge - 1))
     table = results_table(figures) + "\n\n" + parameter_table(figures)
     (folder / "results.md").write_text(table + "\n")
     print(f"\n{table}\n\nrun folder: {folder}")
 
 
-def comparison(body: Body, shown: Sequence, variants: dict, size: int = 320) -> list:
-    """Frames real | prior | adapted from the first camera, cut to where the object goes and enlarged to about `size` px."""
+def comparison(body: Body, shown: Sequence, variants: dict) -> dict:
+    """Images (T, h, w, 3) of real, prior and adapted from the first camera, cut to where the object goes."""
     scene = shown.scene
     camera = [(scene.training_cameras or [0])[0]]
     x0, y0, width, height = crop_boxes(scene.mattes[camera], margin=12)
     columns = {"real": scene.images[camera]}
     columns |= {title: render(body, variants[v], scene, camera) for v, title in (("prior", "prior"), ("adapted", "adapted (MoSA)"))}
-    columns = {title: crop_images(images, x0, y0, width, height, axis=2)[0] for title, images in columns.items()}
-    return side_by_side(columns, enlarge=max(1, round(size / max(width, height))))
+    return {title: crop_images(images, x0, y0, width, height, axis=2)[0] for title, images in columns.items()}
 
 
 def optimized(figures: dict[str, float], wanted: str) -> float | None:

@@ -48,8 +48,16 @@ def write_video(path: str | Path, frames: list[np.ndarray], fps: float = 12.0) -
     return path
 
 
-def write_strip(path: str | Path, frames: list[np.ndarray], every: int = 1) -> Path:
-    """PNG of some frames under each other."""
+def write_strip(path: str | Path, columns: dict[str, Tensor], frames: int = 6, enlarge: int = 1) -> Path:
+    """PNG with one captioned row per entry of `columns` (name -> (T, H, W, 3)) and about `frames` frames from left to right."""
     path = Path(path)
-    imageio.imwrite(path, np.concatenate(frames[::every]))
+    count = min(len(c) for c in columns.values())
+    chosen = np.unique(np.linspace(0, count - 1, frames).round().astype(int))
+    rows = []
+    for name, images in columns.items():
+        row = np.concatenate([to_uint8(images[t]) for t in chosen], 1)
+        if enlarge > 1:
+            row = cv2.resize(row, None, fx=enlarge, fy=enlarge, interpolation=cv2.INTER_CUBIC)
+        rows.append(label(row, name))
+    imageio.imwrite(path, np.concatenate(rows))
     return path

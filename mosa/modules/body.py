@@ -192,7 +192,7 @@ class Body(nn.Module):
         material, contact, heterogeneity, adapter = self.parts(variant)
         if not with_heterogeneity:
             heterogeneity = None
-        if not with_adapter:
+        if not with_adapter or (adapter is not None and not adapter.is_on):  # before its stage an adapter is the prior
             adapter = None
         dtype = torch.float64 if self.settings.precision == 64 else torch.float32
         factor = self.factor(heterogeneity)
@@ -203,6 +203,7 @@ class Body(nn.Module):
         speed += float(start.angular_velocity.detach().norm()) * self.size
         # one time step for all variants of a body: their difference is then the law's, not the integrator's
         substeps = self.substeps(float(material.max_modulus(factor.detach())), frame_dt, speed, self.adapter is not None)
+        self.last_substeps = substeps
         simulator = self.simulator(material.law, substeps, frame_dt, world)
         state = self.initial_state(start, frame_dt / substeps, gravity)
         lift = contact() * up
