@@ -91,7 +91,7 @@ class LitMosa(L.LightningModule):
             groups.append({"params": list(body.heterogeneity.parameters()), "rate": stage.lr_networks, "name": "heterogeneity"})
         if stage.name == "joint" and body.adapter is not None:
             params = [p for p in body.adapter.parameters() if p.requires_grad]
-            groups.append({"params": params, "rate": stage.lr_networks, "name": "adapter"})
+            groups.append({"params": params, "rate": stage.lr_adapter, "name": "adapter"})
         return [{**g, "lr": g["rate"]} for g in groups if g["params"]]
 
     # ---------------------------------------------------------------- one step

@@ -14,7 +14,7 @@ STAGES = ("prior", "prior_eta", "joint")
 class Stage:
     """One stage of the fit.
 
-    lr: global parameters; lr_networks: heterogeneity field and adapter; lr_contact [cells]: contact offset;
+    lr: global parameters; lr_networks: heterogeneity field; lr_adapter: adapter; lr_contact [cells]: contact offset;
     converged: relative change of the mean loss of 10 iterations below which the stage ends (0: run all iterations);
     start: backbone whose parameters the stage starts from (joint: prior | prior_eta).
     """
@@ -23,6 +23,7 @@ class Stage:
     iterations: int
     lr: float
     lr_networks: float = 0.0
+    lr_adapter: float = 0.0
     lr_contact: float = 0.0
     converged: float = 0.0
     start: str | None = None
