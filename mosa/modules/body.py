@@ -232,6 +232,6 @@ class Body(nn.Module):
                 law, dx=self.settings.dx, substeps=substeps, frame_dt=frame_dt, gravity=world.gravity, up=world.up,
                 ground=world.ground, box=world.box, dtype=dtype, device=self.rest.device, **self.law_options,
             )
-            self._simulator_key = key
+            self._simulator_key, self._simulator_world = key, world  # held, so that its id is not given to another world
         return self._simulator
 

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from mosa.reconstruction.cues import Neighbourhood, quaternion_rotation
 from mosa.reconstruction.modes import Modes
+from mosa.rendering.covariance import quaternion_multiply
 from mosa.types import Splats
 
 
@@ -24,21 +25,6 @@ class MotionSample:
     deformation: Tensor | None
     scales: Tensor | None = None
     rotations: Tensor | None = None
-
-
-def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton product of quaternions (..., 4) wxyz."""
-    aw, ax, ay, az = a.unbind(-1)
-    bw, bx, by, bz = b.unbind(-1)
-    return torch.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        -1,
-    )
 
 
 def shape_covariances(scales: Tensor, rotations: Tensor) -> Tensor:
@@ -94,7 +80,7 @@ class ModalMotion(nn.Module):
         shape = modes.values @ (moving * self.shape_amplitude[frames] * self.turn[:, None])
         scales = splats.scales * shape[..., :3].exp()
         half = 0.5 * shape[..., 3:]
-        rotations = quaternion_product(
+        rotations = quaternion_multiply(
             torch.cat([torch.ones_like(half[..., :1]), half], -1), splats.rotations.expand(len(frames), -1, -1)
         )
         rotations = nn.functional.normalize(rotations, dim=-1)
@@ -161,7 +147,7 @@ class MotionBasisNetwork(nn.Module):
         raw = raw[1:] - raw[:1]
         positions = splats.means + self.reach * raw[..., :3] + self.offsets[frames][:, None]
         change = raw[..., 3:7] + raw.new_tensor([1.0, 0.0, 0.0, 0.0])
-        rotations = quaternion_product(nn.functional.normalize(change, dim=-1), splats.rotations.expand(len(frames), -1, -1))
+        rotations = quaternion_multiply(nn.functional.normalize(change, dim=-1), splats.rotations.expand(len(frames), -1, -1))
         scales = splats.scales * raw[..., 7:].exp()
         deformation = around.deformation(positions) if around is not None else None
         return MotionSample(positions, shape_covariances(scales, rotations), deformation, scales, rotations)

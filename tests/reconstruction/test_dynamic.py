@@ -9,9 +9,10 @@ from mosa.errors import ConfigError
 from mosa.reconstruction.cues import neighbourhood, quaternion_rotation
 from mosa.reconstruction.dynamic import DynamicSettings, Scaffold, elastic_energy, fit_motion
 from mosa.reconstruction.modes import deformation_modes
-from mosa.reconstruction.motion import ModalMotion, MotionBasisNetwork, quaternion_product, shape_covariances
+from mosa.reconstruction.motion import ModalMotion, MotionBasisNetwork, shape_covariances
 from mosa.reconstruction.observed import object_windows
 from mosa.reconstruction.uniform_adam import UniformAdam
+from mosa.rendering.covariance import quaternion_multiply
 from mosa.types import Splats
 
 
@@ -53,7 +54,7 @@ def test_quaternion_product_composes_rotations():
     generator = torch.Generator().manual_seed(0)
     a, b = torch.nn.functional.normalize(torch.randn(2, 5, 4, generator=generator, dtype=torch.float64), dim=-1)
     composed = quaternion_rotation(a) @ quaternion_rotation(b)
-    assert torch.allclose(quaternion_rotation(quaternion_product(a, b)), composed, atol=1e-12)
+    assert torch.allclose(quaternion_rotation(quaternion_multiply(a, b)), composed, atol=1e-12)
 
 
 def test_modal_motion_is_at_rest_in_frame_0_and_carries_shapes_along(scaffold):
