@@ -26,22 +26,28 @@ class Poses(NamedTuple):
     angular: Tensor
 
 
-def rotation_of(value: Tensor | Sequence) -> Tensor:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad]; matrices are passed on. float64, differentiable.
+def exponential(vectors: Tensor) -> Tensor:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad], differentiable."""
+    zero = torch.zeros_like(vectors[..., 0])
+    x, y, z = vectors.unbind(-1)
+    return torch.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3)))
+
+
+def rotation_matrices(value: Tensor | Sequence, leading: int = 0) -> Tensor:
+    """(..., 3, 3) float64 of rotation vectors (..., 3) [rad] or matrices, with `leading` dimensions before. Differentiable.
 
     Errors: ConfigError for another shape, or matrices that are not rotations (1e-4).
     """
     value = torch.as_tensor(value, dtype=torch.float64)
-    if value.shape[-2:] == (3, 3):
-        defect = (value.detach() @ value.detach().mT - torch.eye(3, dtype=torch.float64)).abs().max()
-        if not (float(defect) < 1e-4 and bool((torch.linalg.det(value.detach()) > 0).all())):
-            raise ConfigError(f"rotation: expected rotation matrices (R R^T = I, det R = 1), found a defect of {float(defect):.3g}")
-        return value
-    if value.shape[-1:] != (3,):
-        raise ConfigError(f"rotation: expected rotation vectors (..., 3) or matrices (..., 3, 3), found shape {tuple(value.shape)}")
-    zero = torch.zeros_like(value[..., 0])
-    x, y, z = value.unbind(-1)
-    return torch.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3)))
+    if value.ndim == leading + 1 and value.shape[-1] == 3:
+        return exponential(value)
+    if value.ndim != leading + 2 or value.shape[-2:] != (3, 3):
+        expected = "(K, 3) or (K, 3, 3)" if leading else "(3,) or (3, 3)"
+        raise ConfigError(f"rotation: expected rotation vectors or matrices {expected}, found shape {tuple(value.shape)}")
+    defect = (value.detach() @ value.detach().mT - torch.eye(3, dtype=torch.float64, device=value.device)).abs().max()
+    if not (float(defect) < 1e-4 and bool((torch.linalg.det(value.detach()) > 0).all())):
+        raise ConfigError(f"rotation: expected rotation matrices (R R^T = I, det R = 1), found a defect of {float(defect):.3g}")
+    return value
 
 
 def rotation_vector(R: Tensor) -> Tensor:
@@ -91,8 +97,7 @@ class Motion:
         count = len(times)
         if times.ndim != 1 or count < 2 or not bool((times.diff() > 0).all()):
             raise ConfigError(f"motion: waypoints: times: expected at least two ascending numbers, found {times.tolist()}")
-        turns = torch.zeros(count, 3) if rotations is None else rotations
-        R = rotation_of(turns)
+        R = rotation_matrices(torch.zeros(count, 3) if rotations is None else rotations, 1)
         if len(positions) != count or len(R) != count:
             raise ConfigError(
                 f"motion: waypoints: expected one position and rotation for each of {count} times, found {len(positions)} and "
@@ -113,7 +118,7 @@ class Motion:
     def sample(self, frames: int, substeps: int, dt: float, start: float = 0.0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """(position (S, 3), rotation (S, 3, 3), linear (S, 3), angular (S, 3)) float64 at S = frames * substeps substeps of dt [s]
         from time `start`. Errors: ConfigError naming the field."""
-        position, R0 = _vectors("position", self.position)[0].cpu(), rotation_of(self.rotation).cpu()
+        position, R0 = _vectors("position", self.position)[0].cpu(), rotation_matrices(self.rotation).cpu()
         linear, angular = _vectors("velocity", self.velocity).cpu(), _vectors("angular_velocity", self.angular_velocity).cpu()
         times, count = self._pieces(frames, substeps, dt, max(len(linear), len(angular)))
         for name, value in (("velocity", linear), ("angular_velocity", angular)):
@@ -122,7 +127,7 @@ class Motion:
         linear, angular = linear.expand(count, 3), angular.expand(count, 3)
         interval = times.diff()[:, None]
         knots = torch.cat([position[None], position + ((linear[:-1] * interval).cumsum(0))])
-        turns = rotation_of(angular[:-1] * interval)
+        turns = exponential(angular[:-1] * interval)
         attitudes = [R0]
         for turn in turns:
             attitudes.append(turn @ attitudes[-1])
@@ -134,7 +139,7 @@ class Motion:
         piece = piece.clamp_min(0)
         since = torch.where(resting, torch.zeros(()), (t - times[piece])[:, None])
         x = knots[piece] + since * linear[piece]
-        R = rotation_of(since * angular[piece]) @ attitudes[piece]
+        R = exponential(since * angular[piece]) @ attitudes[piece]
         return x, R, linear[piece] * ~resting, angular[piece] * ~resting
 
     def _pieces(self, frames: int, substeps: int, dt: float, count: int) -> tuple[Tensor, int]:
@@ -174,7 +179,7 @@ class Trajectory:
     def sample(self, frames: int, substeps: int, dt: float, start: float = 0.0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """As `Motion.sample`; `start` must be a whole number of substeps into the trajectory."""
         first, count = round(start / dt), frames * substeps
-        values = (self.position, rotation_of(self.rotation), self.velocity, self.angular_velocity)
+        values = (self.position, rotation_matrices(self.rotation, 1), self.velocity, self.angular_velocity)
         if any(len(v) < first + count for v in values) or not math.isclose(first * dt, start, abs_tol=1e-6 * dt):
             raise ConfigError(
                 f"trajectory: expected poses and velocities of substeps {first} to {first + count}, found "

@@ -17,7 +17,7 @@ from mosa.errors import ConfigError
 from mosa.physics import collider_shapes as packing
 from mosa.physics.boundary import MODES, Plane
 from mosa.physics.collider_mesh import SignedDistanceField, field_of_mesh
-from mosa.physics.collider_motion import Motion, Trajectory, rotation_of
+from mosa.physics.collider_motion import Motion, Trajectory, exponential
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,7 @@ def _motion(item: dict) -> Motion:
         points = motion.pop("waypoints")
         if motion or item.get("position") is not None:
             raise ConfigError("motion: waypoints stand alone, without position, velocity or angular_velocity")
-        turns = [rotation_of(_axis_degrees(p["rotation"]) if p.get("rotation") is not None else rotation) for p in points]
+        turns = [exponential(_axis_degrees(p["rotation"]) if p.get("rotation") is not None else rotation) for p in points]
         return Motion.waypoints([p["time"] for p in points], [p["position"] for p in points], torch.stack(turns))
     if unknown := [key for key in motion if key not in ("velocity", "angular_velocity", "times")]:
         raise ConfigError(f"motion: unknown: {', '.join(unknown)}; expected velocity, angular_velocity, times, or waypoints")
