@@ -7,8 +7,6 @@ with `collide` of `boundary` and w = 1 inside (tolerance 1e-6 m as for planes), 
 Colliders act in the order given, after the planes. The pose is the one at the start of the substep.
 """
 
-# ruff: noqa: UP018
-
 from functools import cache
 from types import SimpleNamespace
 

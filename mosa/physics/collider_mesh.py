@@ -93,9 +93,8 @@ def field_of_triangles(
         raise ConfigError(f"mesh: a lattice of {dims.tolist()} nodes at spacing {spacing:.3g} m is too large: use a larger spacing")
     axes = [low[i] + spacing * np.arange(dims[i]) for i in range(3)]
     lattice = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    return SignedDistanceField(
-        torch.from_numpy(_signed_distance(points, index, lattice)).reshape(*dims.tolist()), tuple(low.tolist()), float(spacing), margin
-    )
+    values = torch.from_numpy(_signed_distance(points, index, lattice)).reshape(*dims.tolist())
+    return SignedDistanceField(values, tuple(low.tolist()), float(spacing), margin)
 
 
 def _signed_distance(points: np.ndarray, index: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -117,9 +116,7 @@ def _welded(points: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return unique, inverse.reshape(-1)[index]
 
 
-def field_of_mesh(
-    path: Path, spacing: float | None = None, margin: float | None = None, scale: float = 1.0
-) -> SignedDistanceField:
+def field_of_mesh(path: Path, spacing: float | None = None, margin: float | None = None, scale: float = 1.0) -> SignedDistanceField:
     """Signed distances to the mesh of an OBJ or PLY file (faces with more corners are cut into fans), times `scale` to metres.
 
     Errors: ConfigError naming the file.

@@ -66,7 +66,9 @@ class Collider:
 
     thickness [m]: over this distance above the surface the contact fades in (0: a node is in contact or not, as for planes). The
     result is then differentiable in the collider's position also where its surface is flat; with 0 a node that changes sides is a
-    jump that no gradient sees, and positions act through curvature, lever arms and velocities only.
+    jump that no gradient sees, and positions act through curvature, lever arms and velocities only. The fade is per substep: a node
+    of small weight still comes to a stop within as many substeps as its weight is small.
+    A grid contact is felt, and lets go, up to about half a cell off the surface: strokes should be many cells long.
     """
 
     shape: Shape
@@ -114,8 +116,8 @@ def pack_colliders(colliders: Sequence[Collider], dtype: torch.dtype, device: to
         if isinstance(shape, SignedDistanceField):
             if shape.margin < collider.thickness:
                 raise ConfigError(
-                    f"{where}: thickness: the field of the mesh reaches {shape.margin:.3g} m beyond it, less than {collider.thickness}: "
-                    "make it with a larger margin"
+                    f"{where}: thickness: the field of the mesh reaches {shape.margin:.3g} m beyond it, less than "
+                    f"{collider.thickness}: make it with a larger margin"
                 )
             shapes[i, packing.ORIGIN : packing.ORIGIN + 3] = torch.as_tensor(shape.origin, dtype=torch.float64)
             shapes[i, packing.SPACING] = shape.spacing
@@ -123,7 +125,8 @@ def pack_colliders(colliders: Sequence[Collider], dtype: torch.dtype, device: to
             codes[i, packing.OFFSET] = offset
             fields.append(shape.values.double().cpu().reshape(-1))
             offset += shape.values.numel()
-    return PackedColliders(shapes.to(dtype=dtype, device=device), codes.to(device), torch.cat(fields).to(dtype=dtype, device=device))
+    values = torch.cat(fields)
+    return PackedColliders(shapes.to(dtype=dtype, device=device), codes.to(device), values.to(dtype=dtype, device=device))
 
 
 def _sizes(shape: Shape) -> tuple[float, ...]:

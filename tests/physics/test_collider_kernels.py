@@ -19,7 +19,8 @@ def uneven_field():
     """A smooth lattice of values that is no distance of anything: all its derivatives differ from 0."""
     axes = [0.06 * torch.arange(n).double() - 0.3 for n in (11, 12, 10)]
     x, y, z = torch.meshgrid(*axes, indexing="ij")
-    return SignedDistanceField(torch.sqrt((1.3 * x + 0.2 * y) ** 2 + y**2 + (z + 0.4 * x * y) ** 2 + 0.01) - 0.22, (-0.3,) * 3, 0.06, 0.1)
+    values = torch.sqrt((1.3 * x + 0.2 * y) ** 2 + y**2 + (z + 0.4 * x * y) ** 2 + 0.01) - 0.22
+    return SignedDistanceField(values, (-0.3,) * 3, 0.06, 0.1)
 
 
 SHAPES = {"half space": HalfSpace(), "sphere": Sphere(0.2), "capsule": Capsule(0.1, 0.2), "cylinder": Cylinder(0.15, 0.25),
@@ -48,7 +49,8 @@ def arguments(colliders, mass, poses):
     # poses are those of substep 2 of 3
     held = [torch.stack([torch.full_like(p, 7.0), torch.full_like(p, 7.0), p]).contiguous() for p in poses]
     return [
-        wp.from_torch(grid, dtype=VEC4), 0.0, wp.zeros(1, dtype=wp.vec3i, device="cpu"), wp.vec3i(*DIMS), DX, 1 / DT, len(colliders), 2,
+        wp.from_torch(grid, dtype=VEC4), 0.0, wp.zeros(1, dtype=wp.vec3i, device="cpu"), wp.vec3i(*DIMS), DX, 1 / DT,
+        len(colliders), 2,
         *(wp.from_torch(t, dtype=kind) for t, kind in zip(packed, (wp.float64, wp.int32, wp.float64))),
         *(wp.from_torch(p, dtype=kind) for p, kind in zip(held, kinds)),
     ]  # fmt: skip
@@ -85,7 +87,8 @@ CASES = [(name, mode, friction, thickness)
 @pytest.mark.parametrize("name, mode, friction, thickness", CASES)
 def test_kernel_and_adjoint_against_the_twin(name, mode, friction, thickness):
     """With a second collider after it, so that the order of contacts is differentiated through."""
-    colliders = [Collider(SHAPES[name], mode, friction, thickness=thickness), Collider(Sphere(0.15), "separate", 0.2, thickness=0.05)]
+    colliders = [Collider(SHAPES[name], mode, friction, thickness=thickness),
+                 Collider(Sphere(0.15), "separate", 0.2, thickness=0.05)]  # fmt: skip
     u, mass, position, turns, linear, angular, *seeds = drawn(colliders)
     inside = mass > 0
     leaves = [t.clone().requires_grad_() for t in (u, mass, position, exponential(turns), linear, angular)]
@@ -132,7 +135,7 @@ def test_adjoint_against_differences(name, mode, friction, thickness):
                 return loss([v + s * direction if j == i else v for j, v in enumerate(values)])
 
             fine, coarse = ((8 * (shifted(h) - shifted(-h)) - shifted(2 * h) + shifted(-2 * h)) / (12 * h) for h in (1e-5, 2e-5))
-            allowed = 1e-6 * abs(float(fine)) + 1e-15 * size / 1e-5
+            allowed = 1e-6 * abs(float(fine)) + 3e-15 * size / 1e-5
             if abs(float(fine - coarse)) < allowed:
                 break
         else:

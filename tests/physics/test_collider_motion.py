@@ -46,8 +46,8 @@ def test_displacement_is_the_integral_of_the_velocity():
     torch.testing.assert_close(R[1:], exponential(0.01 * angular[:-1]) @ R[:-1], **exact())
     # at rest before and after, at the waypoints in between
     assert torch.equal(linear[:10].abs().sum() + linear[40:].abs().sum(), torch.zeros(()).double())
-    torch.testing.assert_close(x[[0, 10, 20, 40, 49]], torch.tensor([[0, 0, 0], [0, 0, 0], [1, 0, 0], [1, -1, 0], [1, -1, 0]]).double(),
-                               **exact())  # fmt: skip
+    places = torch.tensor([[0, 0, 0], [0, 0, 0], [1, 0, 0], [1, -1, 0], [1, -1, 0]]).double()
+    torch.testing.assert_close(x[[0, 10, 20, 40, 49]], places, **exact())
     turns = Rotation.from_rotvec([[0, 0, 0], [0, 0, 1.5], [1.0, 0, 0]]).as_matrix()
     torch.testing.assert_close(R[[10, 20, 40]], torch.from_numpy(turns), **exact(atol=1e-12))
 
@@ -64,8 +64,8 @@ def test_rotation_vector_inverts_the_exponential(angle):
 
 def test_gradients():
     g = torch.Generator().manual_seed(2)
-    position, rotation, velocity, spin = (torch.randn(*s, 3, generator=g).double().requires_grad_() for s in ((), (), (4,), (4,)))
-    assert torch.autograd.gradcheck(lambda *a: Motion(*a).sample(4, 2, 0.1), (position, rotation, velocity, spin), rtol=1e-6, atol=1e-8)
+    twists = tuple(torch.randn(*s, 3, generator=g).double().requires_grad_() for s in ((), (), (4,), (4,)))
+    assert torch.autograd.gradcheck(lambda *a: Motion(*a).sample(4, 2, 0.1), twists, rtol=1e-6, atol=1e-8)
     points, turns = (torch.randn(3, 3, generator=g).double().requires_grad_() for _ in range(2))
     assert torch.autograd.gradcheck(
         lambda p, r: Motion.waypoints([0.0, 0.2, 0.5], p, r).sample(3, 2, 0.1), (points, turns), rtol=1e-6, atol=1e-8
@@ -89,7 +89,7 @@ def test_trajectory_and_shift():
     "make, match",
     [
         (lambda: Motion(velocity=torch.zeros(7, 3)).sample(3, 4, 0.1), r"expected 1, 3 \(per frame interval\) or 12"),
-        (lambda: Motion(velocity=torch.zeros(3, 3), angular_velocity=torch.zeros(2, 3)).sample(3, 4, 0.1), "angular_velocity: expected 1"),
+        (lambda: Motion((0, 0, 0), (0, 0, 0), torch.zeros(3, 3), torch.zeros(2, 3)).sample(3, 4, 0.1), "angular_velocity: expected 1"),
         (lambda: Motion(velocity=(1.0, 2.0)).sample(3, 4, 0.1), r"velocity: expected \(3,\)"),
         (lambda: Motion(position=(math.nan, 0, 0)).sample(3, 4, 0.1), "position"),
         (lambda: Motion(rotation=torch.ones(3, 3)).sample(3, 4, 0.1), "expected rotation matrices"),
