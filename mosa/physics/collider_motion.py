@@ -113,7 +113,7 @@ class Motion:
 
     def shifted(self, offset: Tensor) -> "Motion":
         """The same motion moved by offset (3,) [m]."""
-        return replace(self, position=torch.as_tensor(self.position, dtype=torch.float64) + offset.to(torch.float64))
+        return replace(self, position=torch.as_tensor(self.position, dtype=torch.float64).cpu() + offset.double().cpu())
 
     def sample(self, frames: int, substeps: int, dt: float, start: float = 0.0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """(position (S, 3), rotation (S, 3, 3), linear (S, 3), angular (S, 3)) float64 at S = frames * substeps substeps of dt [s]
@@ -174,7 +174,7 @@ class Trajectory:
     angular_velocity: Tensor
 
     def shifted(self, offset: Tensor) -> "Trajectory":
-        return replace(self, position=self.position + offset.to(self.position))
+        return replace(self, position=self.position.double().cpu() + offset.double().cpu())
 
     def sample(self, frames: int, substeps: int, dt: float, start: float = 0.0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """As `Motion.sample`; `start` must be a whole number of substeps into the trajectory."""

@@ -166,15 +166,17 @@ _FIELDS = {"plane": (HalfSpace, ()), "sphere": (Sphere, ("radius",)), "capsule":
 _COMMON = ("type", "name", "mode", "friction", "thickness", "position", "rotation", "motion")
 
 
-def colliders_from_config(items: Sequence[dict], field_name: str = "world.colliders") -> tuple[Collider, ...]:
-    """Colliders of plain containers, as a YAML file has them.
+def colliders_from_config(items: Sequence[dict | Collider], field_name: str = "world.colliders") -> tuple[Collider, ...]:
+    """Colliders of plain containers, as a YAML file has them; a `Collider` is passed on.
 
     Each: type: plane | sphere | capsule | cylinder | box | mesh, with radius, length [m], size (3 edges) [m], or path (OBJ or PLY,
     with spacing [m] of the lattice, and scale); plane takes `normal` instead of rotation; mode, friction, thickness, name;
     position (3,) [m]; rotation (ax, ay, az, degrees); motion: {velocity, angular_velocity [rad/s], times} or
     {waypoints: [{time, position, rotation}, ...]}. Errors: ConfigError naming the entry and the field.
     """
-    return tuple(_collider(dict(item), f"{field_name}[{i}]") for i, item in enumerate(items))
+    return tuple(
+        item if isinstance(item, Collider) else _collider(dict(item), f"{field_name}[{i}]") for i, item in enumerate(items)
+    )
 
 
 def _collider(item: dict, where: str) -> Collider:
