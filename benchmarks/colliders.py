@@ -22,7 +22,8 @@ FLOOR = Plane((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), "separate", 0.3)
 
 def colliders(kinds: list) -> list[Collider]:
     """One moving collider of each shape below the body."""
-    return [Collider(kind, "separate", 0.3, Motion((0.3, -0.08, 0.3), (0.1, 0.0, 0.0), (0.1, 0.2, 0.0), (0.0, 1.0, 0.0))) for kind in kinds]
+    motion = Motion((0.3, -0.08, 0.3), (0.1, 0.0, 0.0), (0.1, 0.2, 0.0), (0.0, 1.0, 0.0))
+    return [Collider(kind, "separate", 0.3, motion) for kind in kinds]
 
 
 VARIANTS = {
@@ -65,7 +66,8 @@ def main(edge: int = 21, repeats: int = 5) -> None:
     print(f"{len(x)} particles, dx {dx:.4f} m, float32, {torch.get_num_threads()} thread(s), ms per substep")
     base = best["planes only"]
     for name, (forward, backward) in best.items():
-        print(f"{name:26s} forward {1e3 * forward:6.2f} ({forward / base[0]:.3f})   backward {1e3 * backward:6.2f} ({backward / base[1]:.3f})")
+        ratios = forward / base[0], backward / base[1]
+        print(f"{name:26s} forward {1e3 * forward:6.2f} ({ratios[0]:.3f})   backward {1e3 * backward:6.2f} ({ratios[1]:.3f})")
 
 
 if __name__ == "__main__":

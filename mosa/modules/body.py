@@ -236,7 +236,8 @@ class Body(nn.Module):
             dtype = torch.float64 if self.settings.precision == 64 else torch.float32
             self._simulator = Simulator(
                 law, dx=self.settings.dx, substeps=substeps, frame_dt=frame_dt, gravity=world.gravity, up=world.up,
-                ground=world.ground, planes=world.planes, colliders=world.colliders, box=world.box, dtype=dtype, device=self.rest.device, **self.law_options,
+                ground=world.ground, planes=world.planes, colliders=world.colliders, box=world.box,
+                dtype=dtype, device=self.rest.device, **self.law_options,
             )
             self._simulator_key, self._simulator_world = key, world  # held, so that its id is not given to another world
         return self._simulator
