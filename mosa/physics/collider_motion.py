@@ -118,7 +118,10 @@ class Motion:
     def sample(self, frames: int, substeps: int, dt: float, start: float = 0.0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """(position (S, 3), rotation (S, 3, 3), linear (S, 3), angular (S, 3)) float64 at S = frames * substeps substeps of dt [s]
         from time `start`. Errors: ConfigError naming the field."""
-        position, R0 = _vectors("position", self.position)[0].cpu(), rotation_matrices(self.rotation).cpu()
+        start_position, R0 = _vectors("position", self.position).cpu(), rotation_matrices(self.rotation).cpu()
+        if len(start_position) != 1:
+            raise ConfigError(f"motion: position: expected (3,), found {len(start_position)} vectors: see Motion.waypoints")
+        position = start_position[0]
         linear, angular = _vectors("velocity", self.velocity).cpu(), _vectors("angular_velocity", self.angular_velocity).cpu()
         times, count = self._pieces(frames, substeps, dt, max(len(linear), len(angular)))
         for name, value in (("velocity", linear), ("angular_velocity", angular)):
@@ -196,6 +199,16 @@ def sample_poses(
     motions: Sequence[Motion | Trajectory], frames: int, substeps: int, dt: float, start: float, dtype: torch.dtype,
     device: torch.device,
 ) -> Poses:  # fmt: skip
-    """Poses of all colliders at every substep of `frames` frame intervals, in the simulator's type."""
+    """Poses of all colliders at every substep of `frames` frame intervals, in the simulator's type.
+
+    Errors: ConfigError naming a collider whose motion is not finite (a NaN would silently touch nothing).
+    """
     sampled = [motion.sample(frames, substeps, dt, start) for motion in motions]
+    for i, parts in enumerate(sampled):
+        for name, part in zip(Poses._fields, parts):
+            if not bool(torch.isfinite(part.detach()).all()):
+                bad = int((~torch.isfinite(part.detach())).reshape(len(part), -1).any(1).nonzero()[0])
+                raise ConfigError(
+                    f"motion of collider {i}: {name}: expected finite numbers, found {part[bad].tolist()} at substep {bad}"
+                )
     return Poses(*(torch.stack(parts, 1).to(dtype=dtype, device=device) for parts in zip(*sampled)))

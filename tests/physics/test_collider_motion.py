@@ -7,7 +7,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from mosa.errors import ConfigError
-from mosa.physics.collider_motion import Motion, Trajectory, exponential, rotation_vector
+from mosa.physics.collider_motion import Motion, Trajectory, exponential, rotation_vector, sample_poses
 
 
 def exact(**tolerance):
@@ -85,6 +85,10 @@ def test_trajectory_and_shift():
         Trajectory(*sampled).sample(3, 4, 0.1, start=0.4)
 
 
+STILL, NAN_TURN = torch.zeros(4, 3), torch.zeros(4, 3)
+NAN_TURN[2, 1] = math.nan
+
+
 @pytest.mark.parametrize(
     "make, match",
     [
@@ -92,6 +96,9 @@ def test_trajectory_and_shift():
         (lambda: Motion((0, 0, 0), (0, 0, 0), torch.zeros(3, 3), torch.zeros(2, 3)).sample(3, 4, 0.1), "angular_velocity: exp"),
         (lambda: Motion(velocity=(1.0, 2.0)).sample(3, 4, 0.1), r"velocity: expected \(3,\)"),
         (lambda: Motion(position=(math.nan, 0, 0)).sample(3, 4, 0.1), "position"),
+        (lambda: Motion(position=torch.zeros(4, 3)).sample(3, 4, 0.1), r"position: expected \(3,\), found 4"),
+        (lambda: sample_poses([Motion(), Trajectory(STILL, NAN_TURN, STILL, STILL)], 1, 4, 0.1, 0.0, torch.float64,
+                              torch.device("cpu")), "collider 1: rotation.*at substep 2"),
         (lambda: Motion(rotation=torch.ones(3, 3)).sample(3, 4, 0.1), "expected rotation matrices"),
         (lambda: Motion(times=[0.1, 0.0], velocity=torch.zeros(2, 3)).sample(3, 4, 0.1), "times: expected ascending"),
         (lambda: Motion.waypoints([0.0], [[0, 0, 0]]), "at least two"),

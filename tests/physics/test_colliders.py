@@ -73,19 +73,41 @@ def test_a_resting_half_space_or_box_is_the_plane(mode, friction, make_block):
 
 
 def test_galilean_invariance(make_block):
-    """Body and spinning collider seen from a frame that moves by one cell a frame: the same forces."""
+    """Body and spinning collider seen from a moving frame: the same force and the same change of velocity in a substep."""
     state = make_block()
-    w = DX / 0.01 * torch.tensor([1.0, 0.0, -1.0]).double()
+    w = torch.tensor([4.0, 0.0, -4.0]).double()
     results = []
     for boost in (0 * w, w):
         motion = Motion((0.15, -0.06, 0.11), (0.3, 0.0, 0.1), torch.tensor([0.1, 0.3, 0.0]).double() + boost, (2.0, -3.0, 1.0))
         collider = Collider(Capsule(0.05, 0.1), "separate", 0.3, motion, thickness=0.03)
         shifted = replace(state, v=state.v + boost)
-        # one substep a frame of 0.01/25 moves the grid by 1/25 cell, so only whole frames compare: ask one long rollout
         results.append(rollout(shifted, [collider], frames=2, substeps=1))
     assert float(results[0].reactions[0, 0, 0, :3].norm()) > 1
     torch.testing.assert_close(results[1].reactions, results[0].reactions, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(results[1].v[1], results[0].v[1] + w, rtol=0, atol=1e-10)
+
+
+def test_rotated_and_shifted_scene(make_block):
+    """Scene and collider turned by 90 degrees and moved by whole cells: the same motion over 200 substeps."""
+    state = make_block(velocity=(0.0, -1.0, 0.0))
+    Q = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]).double()
+    shift = DX * torch.tensor([3.0, -2.0, 5.0]).double()
+    eye = torch.eye(3).double().expand_as(state.F).contiguous()
+    state = replace(state, F=eye, F_tot=eye)
+    turned_F = Q.expand_as(eye).contiguous()
+    turned = ParticleState(state.x @ Q.T + shift, state.v @ Q.T, Q @ state.C_affine @ Q.T, turned_F, turned_F)
+    position, spin, velocity = (torch.tensor(a).double() for a in ((0.16, -0.05, 0.1), (0.0, 3.0, 5.0), (0.1, 0.2, 0.0)))
+    attitude = exponential(torch.tensor([0.3, 0.1, 0.0]).double())
+    motions = Motion(position, attitude, velocity, spin), Motion(Q @ position + shift, Q @ attitude, Q @ velocity, Q @ spin)
+    down = torch.tensor([0.0, -9.8, 0.0]).double()
+    first, second = (
+        rollout(start, [Collider(Capsule(0.08, 0.1), "separate", 0.4, motion)], substeps=100, gravity=gravity)
+        for start, motion, gravity in zip((state, turned), motions, (down, Q @ down))
+    )
+    assert first.reactions[..., :3].norm(dim=-1).max() > 10
+    assert (second.x[-1] - (first.x[-1] @ Q.T + shift)).abs().max() < 1e-10 * DX
+    force = first.reactions.unflatten(-1, (2, 3)) @ Q.T
+    torch.testing.assert_close(second.reactions.unflatten(-1, (2, 3)), force, rtol=0, atol=1e-8 * float(force.abs().max()))
 
 
 @pytest.mark.parametrize("mode, friction", [("sticky", 0.0), ("slip", 0.0), ("separate", 0.3)])
