@@ -16,6 +16,7 @@ from mosa.modules.body import Body, SimulationSettings, World
 from mosa.modules.heterogeneity import HeterogeneityField
 from mosa.modules.material import Material
 from mosa.modules.stages import Stage
+from mosa.physics.colliders import colliders_from_config, domain_walls
 from mosa.types import Ground, Scene
 
 
@@ -34,13 +35,17 @@ def world_config(scene: Scene) -> dict[str, Any]:
 
 
 def build_world(config: Mapping[str, Any]) -> World:
+    """walls: {mode, friction} of the box's six sides, or None; colliders: list, see `colliders_from_config`; both may be absent."""
     ground = Ground(**config["ground"]) if config["ground"] is not None else None
-    return World(ground, *(torch.tensor(config[k], dtype=torch.float32) for k in ("gravity", "up", "box")))
+    gravity, up, box = (torch.tensor(config[k], dtype=torch.float32) for k in ("gravity", "up", "box"))
+    walls = config.get("walls")
+    planes = domain_walls(box, **walls) if walls is not None else []
+    return World(ground, gravity, up, box, tuple(planes), colliders_from_config(config.get("colliders") or ()))
 
 
 def run_config(cfg: dict[str, Any], scene: Scene, dx: float) -> dict[str, Any]:
     """What a checkpoint keeps: the configuration, and what was measured from the data."""
-    return {"cfg": cfg, "world": world_config(scene), "density": scene.density, "dx": dx,
+    return {"cfg": cfg, "world": world_config(scene) | (cfg.get("world") or {}), "density": scene.density, "dx": dx,
             "frame_dt": float(scene.times[1] - scene.times[0])}
 
 

@@ -9,7 +9,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from mosa.analysis.figures import side_by_side, write_video
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body import Body, Start, World
 from mosa.modules.observer import deformed_covariances, observe
+from mosa.physics.colliders import Collider, colliders_from_config
 from mosa.rendering.cameras import look_at
 from mosa.types import Cameras, Rollout
 
@@ -59,12 +61,14 @@ class Twin:
         frames: int = 30,
         variant: str = "adapted",
         progress: bool = False,
+        colliders: Sequence[Collider | Mapping] | None = None,
     ) -> Rollout:
         """Roll the learned law out from a new start.
 
         rotation: (ax, ay, az, degrees) about the body's centre, or a (3, 3) matrix, relative to the rest shape; height [m] of the
         lowest point above the ground; velocity [m/s]; angular_velocity [rad/s]; what is left out is taken from the training
-        sequence. Errors: ConfigError (shapes), SimulationDiverged (the body leaves the box of the scene).
+        sequence. colliders: rigid solids instead of the world's, or entries as a configuration has them; `reactions` of the result
+        holds the forces on them. Errors: ConfigError (shapes), SimulationDiverged (the body leaves the box of the scene).
         """
         body, first = self.body, self.training_start
         Q = first.rotation if rotation is None else rotation_matrix(rotation)
@@ -78,8 +82,11 @@ class Twin:
             ground = self.world.ground.height if self.world.ground is not None else 0.0
             center = center + up * (ground + height - lowest - center @ up)
         start = Start(Q, center, velocity_.to(body.rest), spin.to(body.rest))
+        world = self.world
+        if colliders is not None:
+            world = replace(world, colliders=colliders_from_config(colliders, "colliders"))
         with tqdm(total=frames - 1, desc="simulate", unit="frame", disable=not progress) as bar:
-            return body.simulate(start, self.world, frames, self.frame_dt, variant=variant, progress=lambda _: bar.update())
+            return body.simulate(start, world, frames, self.frame_dt, variant=variant, progress=lambda _: bar.update())
 
     @torch.no_grad()
     def render(self, rollout: Rollout, size: int = 400) -> Tensor:

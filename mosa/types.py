@@ -157,7 +157,8 @@ class ParticleState:
 class Rollout:
     """Simulated frames, frame 0 first. x, v: (T, N, 3); F, F_tot: (T, N, 3, 3); times: (T,) [s]; final: state to go on from.
 
-    inverted: number of (particle, frame) pairs with det F <= 0.
+    inverted: number of (particle, frame) pairs with det F <= 0. reactions: (T - 1, substeps, K, 6) force [N] and torque about the
+    collider's origin [N m] that the body exerts on each of K colliders, None without colliders; a frame's mean is `.mean(1)`.
     """
 
     x: Tensor
@@ -167,3 +168,4 @@ class Rollout:
     times: Tensor
     final: ParticleState
     inverted: int = 0
+    reactions: Tensor | None = None

@@ -15,6 +15,8 @@ from torch import Tensor, nn
 from mosa.errors import ConfigError
 from mosa.modules.heterogeneity import HeterogeneityField
 from mosa.modules.material import Material
+from mosa.physics.boundary import Plane
+from mosa.physics.colliders import Collider, reach
 from mosa.physics.rollout import Simulator
 from mosa.physics.time_step import required_substeps
 from mosa.types import Ground, ParticleState, Rollout
@@ -36,12 +38,14 @@ class Start:
 
 @dataclass(frozen=True)
 class World:
-    """What a body falls in. gravity, up: (3,); box: (2, 3) [m]."""
+    """What a body falls in. gravity, up: (3,); box: (2, 3) [m]; planes: walls beside the ground; colliders: moving rigid solids."""
 
     ground: Ground | None
     gravity: Tensor
     up: Tensor
     box: Tensor
+    planes: tuple[Plane, ...] = ()
+    colliders: tuple[Collider, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -201,6 +205,7 @@ class Body(nn.Module):
         fall = float(gravity.norm()) * frames * frame_dt
         speed = float(start.velocity.detach().norm()) + fall
         speed += float(start.angular_velocity.detach().norm()) * self.size
+        speed += max((c.motion.max_speed(reach(c.shape)) for c in world.colliders), default=0.0)
         # one time step for all variants of a body: their difference is then the law's, not the integrator's
         substeps = self.substeps(float(material.max_modulus(factor.detach())), frame_dt, speed, self.adapter is not None)
         self.last_substeps = substeps
@@ -219,6 +224,7 @@ class Body(nn.Module):
         rollout = simulator.rollout(
             state, {k: p.to(dtype) for k, p in parameters.items()}, self.volume.to(dtype), self.density, frames,
             adapter=operator, stride=self.settings.stride, progress=progress,
+            motions=[c.motion.shifted(lift) for c in world.colliders],  # the offset is the ground's: they keep their place
         )
         fields = {name: getattr(rollout, name).to(self.rest.dtype) for name in ("x", "v", "F", "F_tot")}
         return replace(rollout, **{**fields, "x": fields["x"] - lift})
@@ -230,7 +236,8 @@ class Body(nn.Module):
             dtype = torch.float64 if self.settings.precision == 64 else torch.float32
             self._simulator = Simulator(
                 law, dx=self.settings.dx, substeps=substeps, frame_dt=frame_dt, gravity=world.gravity, up=world.up,
-                ground=world.ground, box=world.box, dtype=dtype, device=self.rest.device, **self.law_options,
+                ground=world.ground, planes=world.planes, colliders=world.colliders, box=world.box,
+                dtype=dtype, device=self.rest.device, **self.law_options,
             )
             self._simulator_key, self._simulator_world = key, world  # held, so that its id is not given to another world
         return self._simulator

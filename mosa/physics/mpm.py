@@ -63,15 +63,17 @@ class SegmentSolver:
             )  # fmt: skip
         return self._workspaces[key]
 
-    def prepare(self, state: tuple[Tensor, ...], held: dict, substeps: int, window, with_adjoint: bool) -> Workspace:
-        """A workspace loaded with the start of a segment."""
+    def prepare(self, state: tuple[Tensor, ...], held: dict, poses, substeps: int, window, with_adjoint: bool) -> Workspace:
+        """A workspace loaded with the start of a segment. poses: of the colliders at its substeps, None where there are none."""
         work = self.workspace(substeps, held["G"] is not None, held["plastic_G"] is not None, with_adjoint)
         work.set_window(*window)
-        work.load(state, held, self.volume, self.mass, self.cutoff)
+        work.load(state, held, self.volume, self.mass, self.cutoff, poses)
         return work
 
-    def advance(self, state: tuple[Tensor, ...], held: dict, substeps: int, first: int) -> tuple[tuple[Tensor, ...], tuple]:
-        """(state after `substeps`, grid window used). first: number of the first substep, for messages.
+    def advance(self, state: tuple[Tensor, ...], held: dict, poses, substeps: int, first: int) -> tuple[tuple, tuple, tuple]:
+        """(state after `substeps`, reactions (force, torque) of the colliders or (), grid window used).
+
+        first: number of the first substep, for messages.
 
         Errors: SimulationDiverged naming substep and particle.
         """
@@ -80,11 +82,12 @@ class SegmentSolver:
         for margin in (2, 3 + substeps // 2):
             origin, dims = grid_window(state[0], state[1], self.numerics.dx, 2 * substeps * self.numerics.dt, margin)
             self._dims = dims = tuple(max(a, b) for a, b in zip(dims, self._dims))
-            work = self.prepare(state, held, substeps, (origin, dims), with_adjoint=False)
+            work = self.prepare(state, held, poses, substeps, (origin, dims), with_adjoint=False)
             work.advance()
             flags = work.flags.tolist()
             if not self._left_window(flags, first):
-                return work.final(), (origin, dims)
+                reaction = () if work.colliders is None else tuple(t.clone() for t in work.colliders.reaction)
+                return work.final(), reaction, (origin, dims)
         raise self._error(WINDOW, flags[WINDOW], first)
 
     def _left_window(self, flags: list[int], first: int) -> bool:
@@ -115,35 +118,47 @@ class SegmentSolver:
 
 class _Segment(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, solver: SegmentSolver, substeps: int, first: int, x, v, C, F, F_tot, *held):
-        state = tuple(t.detach().contiguous() for t in (x, v, C, F, F_tot))
-        named = dict(zip(HELD, held, strict=True))
-        result, window = solver.advance(state, named, substeps, first)
+    def forward(ctx, solver: SegmentSolver, substeps: int, first: int, *inputs):
+        """inputs: state (5), held (5), and, where there are colliders, their poses at the segment's substeps (4)."""
+        state = tuple(t.detach().contiguous() for t in inputs[:5])
+        held, poses = dict(zip(HELD, inputs[5:10], strict=True)), inputs[10:] or None
+        result, reaction, window = solver.advance(state, held, poses, substeps, first)
         ctx.solver, ctx.substeps, ctx.window = solver, substeps, window
-        ctx.plastic = solver.numerics.law.plastic
-        ctx.save_for_backward(*state, *held)
-        return result if ctx.plastic else result[:4]
+        ctx.states = 5 if solver.numerics.law.plastic else 4
+        ctx.save_for_backward(*state, *inputs[5:])
+        return *result[: ctx.states], *reaction
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, *seeds):
-        state, held = ctx.saved_tensors[:5], dict(zip(HELD, ctx.saved_tensors[5:], strict=True))
-        work = ctx.solver.prepare(state, held, ctx.substeps, ctx.window, with_adjoint=True)
+        saved = ctx.saved_tensors
+        state, held, poses = saved[:5], dict(zip(HELD, saved[5:10], strict=True)), saved[10:] or None
+        work = ctx.solver.prepare(state, held, poses, ctx.substeps, ctx.window, with_adjoint=True)
         work.advance()
         slot = ctx.substeps % 2
-        targets = [work.adj_x, work.adj_v, work.adj_C, work.adj_F] + ([work.adj_A] if ctx.plastic else [])
-        for target, seed in zip(targets, seeds, strict=True):
-            target[slot].zero_() if seed is None else target[slot].copy_(seed)
+        targets = [work.adj_x, work.adj_v, work.adj_C, work.adj_F, work.adj_A][: ctx.states]
+        filled = [target[slot] for target in targets] + ([] if poses is None else work.colliders.adj_reaction)
+        for target, seed in zip(filled, seeds, strict=True):
+            target.zero_() if seed is None else target.copy_(seed)
         work.adjoint()
-        gradients = [target[0].clone() for target in targets] + ([] if ctx.plastic else [None])
+        gradients = [target[0].clone() for target in targets] + [None] * (5 - ctx.states)
         gradients += [None if held[name] is None else work.adj_held[name].clone() for name in HELD]
+        gradients += [] if poses is None else [t.clone() for t in work.colliders.adj_poses]
         return None, None, None, *gradients
 
 
-def advance_segment(solver: SegmentSolver, state: tuple[Tensor, ...], held: dict, substeps: int, first: int):
-    """(x, v, C_affine, F, F_tot) after `substeps`, differentiable in the state and in everything in `held`."""
-    result = _Segment.apply(solver, substeps, first, *state, *(held[name] for name in HELD))
-    return result if solver.numerics.law.plastic else (*result, result[3])
+def advance_segment(
+    solver: SegmentSolver, state: tuple[Tensor, ...], held: dict, substeps: int, first: int, poses: tuple[Tensor, ...] = ()
+) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+    """((x, v, C_affine, F, F_tot) after `substeps`, reactions), differentiable in state, everything in `held`, and poses.
+
+    poses: of K colliders at the segment's S substeps, as `collider_motion.Poses`, () where there are none; reactions: force [N]
+    and torque about each collider's origin [N m], (S, K, 3), or ().
+    """
+    result = _Segment.apply(solver, substeps, first, *state, *(held[name] for name in HELD), *poses)
+    count = 5 if solver.numerics.law.plastic else 4
+    final, reaction = result[:count], result[count:]
+    return (final if count == 5 else (*final, final[3])), reaction
 
 
 def _stream(device: torch.device):

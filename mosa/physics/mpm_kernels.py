@@ -370,5 +370,5 @@ def transfer_kernels(scalar) -> SimpleNamespace:
 
     return SimpleNamespace(
         p2g=p2g, grid_update=grid_update, g2p=g2p, adj_g2p=adj_g2p, adj_grid=adj_grid, adj_p2g=adj_p2g,
-        vec3=vec3, vec4=vec4, mat33=mat33,
+        node_position=node_position, vec3=vec3, vec4=vec4, mat33=mat33,
     )  # fmt: skip

@@ -16,6 +16,8 @@ from torch import Tensor
 
 from mosa.errors import ConfigError
 from mosa.physics.boundary import Plane, ground_plane, pack_planes
+from mosa.physics.collider_motion import Motion, Trajectory, sample_poses
+from mosa.physics.colliders import Collider, pack_colliders
 from mosa.physics.laws import SLOTS, law_named
 from mosa.physics.mpm import SegmentSolver, advance_segment, first_advance, material_state
 from mosa.physics.plasticity import yield_factor
@@ -54,7 +56,8 @@ class Simulator:
     """MLS-MPM of one law on one grid and time step. Rollouts are differentiable in state, parameters and adapter outputs.
 
     dx: grid spacing [m]; substeps per frame of frame_dt [s]; gravity (3,) [m/s^2]; ground: plane below `up` ((3,), against
-    gravity by default), then `planes` in order; box: (2, 3) [m] corners a particle may not leave, None for no limit.
+    gravity by default), then `planes` in order, then the moving `colliders`; box: (2, 3) [m] corners a particle may not leave,
+    None for no limit.
     mass_cutoff: node mass [kg] above which a node has a velocity (None: 0 in float64, 1e-12 of a particle's in float32).
     init_affine: `spin` takes the state's C_affine, `zero` replaces it by 0. norm_eps: under the root of yield norms.
     yield_convention: paper | sqrt23. rebuild: write U S V^T back also where nothing yielded (PAC-NeRF does).
@@ -73,6 +76,7 @@ class Simulator:
         ground: Ground | None = None,
         up: Sequence[float] | Tensor | None = None,
         planes: Sequence[Plane] = (),
+        colliders: Sequence[Collider] = (),
         box: Tensor | None = None,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
@@ -102,6 +106,8 @@ class Simulator:
             up = -gravity / gravity.norm() if gravity.norm() > 0 else torch.tensor([0.0, 1.0, 0.0])
         all_planes = ([ground_plane(ground, up)] if ground is not None else []) + list(planes)
         values, modes = pack_planes(all_planes, dtype, self.device)
+        self.colliders = tuple(colliders)
+        packed_colliders = pack_colliders(self.colliders, dtype, self.device) if self.colliders else None
         if box is None:
             low, high = (-_UNBOUNDED,) * 3, (_UNBOUNDED,) * 3
         else:
@@ -112,6 +118,7 @@ class Simulator:
             law=self.law, dtype=dtype, device=self.device, dx=float(dx), dt=self.dt, gravity=tuple(gravity.tolist()),
             planes=values, modes=modes, plane_count=len(all_planes), low=low, high=high, norm_eps=float(norm_eps),
             rebuild=rebuild, check_J=self.law.needs_positive_J or on_inversion == "error",
+            colliders=packed_colliders,
         )  # fmt: skip
         self._workspaces: dict = {}
 
@@ -155,12 +162,15 @@ class Simulator:
         stride: int = 1,
         progress: Callable[[int], None] | None = None,
         started: bool = False,
+        motions: Sequence[Motion | Trajectory] | None = None,
+        start_time: float = 0.0,
     ) -> Rollout:
         """`frames` frames, the start being frame 0 (so frames - 1 intervals are simulated).
 
         state: particles at frame 0, its F and F_tot not yet advanced by C_affine, unless `started` (the `final` of an earlier
         rollout). parameters: physical values the law names, per particle (N,) or scalar; volume: (N,) [m^3]; density [kg/m^3].
         adapter: asked every `stride` substeps from the start of each frame. progress: called with the number of each frame.
+        motions: of the colliders, instead of their own; start_time [s]: time of frame 0 in these motions.
         Frame 0 of the result holds the state as given. Errors: SimulationDiverged naming substep and particle; ConfigError.
         """
         if frames < 1 or stride < 1:
@@ -186,13 +196,17 @@ class Simulator:
             else:
                 F = F_tot = first_advance(self.numerics, F, C, packed)
         current = (state.x, state.v, C, F, F_tot)
+        poses = self._poses(motions, frames, start_time)
+        reactions = []
         lengths = _segments(self.substeps, stride if adapter is not None else None)
         for frame in range(1, frames):
             first = (frame - 1) * self.substeps
             for length in lengths:
                 if adapter is not None:
                     held.update(self._ask(adapter, current[3], current[2], packed))
-                current = advance_segment(solver, current, held, length, first)
+                along = tuple(part[first : first + length] for part in poses)
+                current, reaction = advance_segment(solver, current, held, length, first, along)
+                reactions += [torch.cat(reaction, -1)] if reaction else []
                 first += length
             for name, value in zip(recorded, (current[0], current[1], current[3], current[4])):
                 recorded[name].append(value)
@@ -204,7 +218,16 @@ class Simulator:
         inverted = int((torch.linalg.det(stacked["F"].detach()) <= 0).sum())
         if inverted and self.on_inversion == "warn":
             warnings.warn(f"{inverted} particle states with det F <= 0 in {frames} frames", stacklevel=2)
-        return Rollout(**stacked, times=times, final=ParticleState(*current), inverted=inverted)
+        per_frame = torch.cat(reactions).unflatten(0, (frames - 1, self.substeps)) if reactions else None
+        return Rollout(**stacked, times=times, final=ParticleState(*current), inverted=inverted, reactions=per_frame)
+
+    def _poses(self, motions: Sequence[Motion | Trajectory] | None, frames: int, start_time: float) -> tuple[Tensor, ...]:
+        motions = [collider.motion for collider in self.colliders] if motions is None else motions
+        if len(motions) != len(self.colliders):
+            raise ConfigError(f"motions: expected one for each of {len(self.colliders)} colliders, found {len(motions)}")
+        if not self.colliders:
+            return ()
+        return sample_poses(motions, frames - 1, self.substeps, self.dt, start_time, self.dtype, self.device)
 
     def material_state(self, F: Tensor, C_affine: Tensor, parameters: dict[str, Tensor]) -> MaterialState:
         """What an adapter would read at deformation gradients F (N, 3, 3); differentiable. For analysis and tests."""

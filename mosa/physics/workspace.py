@@ -10,6 +10,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from mosa.physics.collider_workspace import ColliderBuffers
+from mosa.physics.colliders import PackedColliders
 from mosa.physics.laws import SLOTS, Law
 from mosa.physics.material_kernels import kernels_of
 from mosa.physics.mpm_kernels import NO_EVENT, transfer_kernels
@@ -20,7 +22,8 @@ SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
 @dataclass(frozen=True)
 class Numerics:
     """What is constant over a rollout. dx [m], dt [s], gravity (3,) [m/s^2], planes (P, 5) and modes (P,) from `pack_planes`,
-    low and high (3,) [m] corners of the admissible domain, norm_eps under the root of yield norms."""
+    low and high (3,) [m] corners of the admissible domain, norm_eps under the root of yield norms, colliders None where there
+    are none."""
 
     law: Law
     dtype: torch.dtype
@@ -36,6 +39,7 @@ class Numerics:
     norm_eps: float
     rebuild: bool
     check_J: bool
+    colliders: PackedColliders | None = None
 
 
 class Workspace:
@@ -88,6 +92,11 @@ class Workspace:
         self.origin, self.origin_wp = self._array((1, 3), wp.vec3i, torch.int32)
         self.planes_wp = wp.from_torch(numerics.planes, dtype=self.scalar)
         self.modes_wp = wp.from_torch(numerics.modes, dtype=wp.int32)
+        self.colliders = None
+        if numerics.colliders is not None:
+            self.colliders = ColliderBuffers(
+                numerics.colliders, self.scalar, substeps, numerics.dt, self._array, self._run, with_adjoint
+            )
         self.cutoff = 0.0
         self.dims = (0, 0, 0)
         self._graphs: dict[str, object] = {}
@@ -109,15 +118,20 @@ class Workspace:
         grids = self.substeps if self.with_adjoint else 1
         self.grid, self.grid_wp = self._per_slot(grids, (nodes, 4), self.kernels.vec4)
         self.velocity, self.velocity_wp = self._per_slot(grids, (nodes, 3), self.kernels.vec3)
+        if self.colliders is not None:
+            self.colliders.set_nodes(nodes)
         if self.with_adjoint:
             self.adj_grid, self.adj_grid_wp = self._array((nodes, 4), self.kernels.vec4)
             self.adj_velocity, self.adj_velocity_wp = self._array((nodes, 3), self.kernels.vec3)
         self._graphs.clear()
 
     def load(
-        self, state: tuple[Tensor, ...], held: dict[str, Tensor | None], volume: Tensor, mass: Tensor, cutoff: float
-    ) -> None:
-        """Copy the start of a segment in: (x, v, C_affine, F, F_tot), the parameters and the adapter's operator."""
+        self, state: tuple[Tensor, ...], held: dict[str, Tensor | None], volume: Tensor, mass: Tensor, cutoff: float,
+        poses: tuple[Tensor, ...] | None = None,
+    ) -> None:  # fmt: skip
+        """Copy the start of a segment in: (x, v, C_affine, F, F_tot), the parameters, the adapter's operator, colliders' poses."""
+        if self.colliders is not None:
+            self.colliders.load(poses)
         for slots, value in zip((self.x, self.v, self.C, self.F), state[:4], strict=True):
             slots[0].copy_(value)
         if self.plastic:
@@ -184,6 +198,9 @@ class Workspace:
             self.modes_wp, numerics.plane_count,
         ]  # fmt: skip
 
+    def _collider_place(self, slot: int) -> list:
+        return [self.grid_wp[slot], self.cutoff, self.origin_wp, wp.vec3i(*self.dims), self.numerics.dx]
+
     def _stress_arguments(self, state: int, slot: int) -> list:
         held = self.held_wp
         return [self.F_wp[state], self.C_wp[state], held["parameters"], held["G"], held["h"], self.tau_wp[slot]]
@@ -200,6 +217,8 @@ class Workspace:
         states, grids = len(self.x), len(self.grid)
         geometry = self._geometry()
         low, high = kernels.vec3(*numerics.low), kernels.vec3(*numerics.high)
+        if self.colliders is not None:
+            self.colliders.reset()
         for step in range(self.substeps):
             a, b, g = step % states, (step + 1) % states, step % grids
             self.grid_wp[g].zero_()
@@ -209,6 +228,8 @@ class Workspace:
                 *geometry, int(numerics.check_J), step, self.flags_wp, self.grid_wp[g],
             ])  # fmt: skip
             self._run(kernels.grid_update, len(self.grid[g]), [*self._grid_arguments(g), self.velocity_wp[g]])
+            if self.colliders is not None:
+                self.colliders.apply(step, self._collider_place(g), self.velocity_wp[g])
             self._run(kernels.g2p, n, [
                 self.x_wp[a], self.A_wp[a], self.velocity_wp[g], *geometry, low, high, step, self.flags_wp,
                 self.x_wp[b], self.v_wp[b], self.C_wp[b], self.A_wp[b],
@@ -221,6 +242,8 @@ class Workspace:
         geometry = self._geometry()
         for array in held.values():
             array.zero_()
+        if self.colliders is not None:
+            self.colliders.reset_adjoint()
         for step in reversed(range(self.substeps)):
             a, b = step % 2, (step + 1) % 2  # adjoint slots; the states of all substeps are stored
             if self.plastic:
@@ -235,8 +258,14 @@ class Workspace:
                 self.adj_x_wp[b], self.adj_v_wp[b], self.adj_C_wp[b], self.adj_A_wp[b],
                 self.adj_x_wp[a], self.adj_A_wp[a], self.adj_velocity_wp,
             ])  # fmt: skip
+            if self.colliders is not None:
+                # the velocities that the colliders found are cheaper to compute again than to keep
+                self._run(kernels.grid_update, len(self.grid[step]), [*self._grid_arguments(step), self.colliders.before_wp])
+                self.colliders.adjoint(step, self._collider_place(step), self.adj_velocity_wp)
             self._run(kernels.adj_grid, len(self.grid[step]),
                       [*self._grid_arguments(step), self.adj_velocity_wp, self.adj_grid_wp])  # fmt: skip
+            if self.colliders is not None:
+                self.colliders.add_mass(self.adj_grid_wp)
             self._run(kernels.adj_p2g, n, [
                 self.x_wp[step], self.v_wp[step], self.C_wp[step], self.tau_wp[step], self.mass_wp, self.volume_wp, *geometry,
                 self.adj_grid_wp, self.adj_x_wp[a], self.adj_v_wp[a], self.adj_C_wp[a], self.adj_tau_wp,

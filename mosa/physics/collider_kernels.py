@@ -1,0 +1,161 @@
+"""Moving rigid colliders on the velocities of grid nodes, their reaction, and the exact adjoint of both.
+
+A node at y, r = y - position, in the collider's axes at q = R^T r, of distance phi(q) and outward normal n = R grad phi/|grad phi|,
+moves relative to the solid's velocity there, V = linear + angular x r:
+    u' = u + w(phi) (V + collide(u - V, n) - u),    force on the collider f = -m (u' - u)/dt,    torque r x f
+with `collide` of `boundary` and w = 1 inside (tolerance 1e-6 m as for planes), falling to 0 over the collider's `thickness`.
+Colliders act in the order given, after the planes. The pose is the one at the start of the substep.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from mosa.physics.boundary import make_normal_adjoint, make_plane_functions
+from mosa.physics.collider_shapes import shape_functions
+from mosa.physics.mpm_kernels import transfer_kernels
+
+
+@cache
+def collider_kernels(scalar) -> SimpleNamespace:
+    """Kernels collide_nodes, adj_collide_nodes, add_mass for wp.float32 or wp.float64 fields."""
+    vec3 = wp.types.vector(length=3, dtype=scalar)
+    vec4 = wp.types.vector(length=4, dtype=scalar)
+    mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
+    collide, adj_collide = make_plane_functions(scalar)
+    adj_collide_normal = make_normal_adjoint(scalar)
+    shape = shape_functions(scalar)
+    signed_distance, curvature = shape.signed_distance, shape.curvature
+    node_position = transfer_kernels(scalar).node_position
+    module = f"mosa.physics.colliders_{scalar.__name__}"
+
+    @wp.func
+    def weight(phi: scalar, thickness: scalar):
+        """(w, dw/dphi): 1 inside, a smooth step to 0 at `thickness` above the surface."""
+        w = scalar(0.0)
+        slope = scalar(0.0)
+        if phi <= scalar(1.0e-6):
+            w = scalar(1.0)
+        elif phi < thickness:
+            s = phi / thickness
+            w = (scalar(1.0) - s) * (scalar(1.0) - s) * (scalar(1.0) + scalar(2.0) * s)
+            slope = scalar(-6.0) * s * (scalar(1.0) - s) / thickness
+        return w, slope
+
+    @wp.func
+    def respond(
+        u: vec3, y: vec3, k: int, substep: int, shapes: wp.array2d(dtype=scalar), codes: wp.array2d(dtype=int),
+        fields: wp.array(dtype=scalar), position: wp.array2d(dtype=vec3), rotation: wp.array2d(dtype=mat33),
+        linear: wp.array2d(dtype=vec3), angular: wp.array2d(dtype=vec3),
+    ):  # fmt: skip
+        """Velocity u of a node at y after collider k."""
+        out = u
+        r = y - position[substep, k]
+        Q = rotation[substep, k]
+        phi, g = signed_distance(wp.transpose(Q) * r, k, shapes, codes, fields)
+        w, _slope = weight(phi, shapes[k, 3])
+        if w > scalar(0.0):
+            V = linear[substep, k] + wp.cross(angular[substep, k], r)
+            hit = V + collide(u - V, Q * wp.normalize(g), codes[k, 1], shapes[k, 4])
+            if w < scalar(1.0):
+                out = u + w * (hit - u)
+            else:
+                out = hit
+        return out
+
+    @wp.kernel(module=module, enable_backward=False)
+    def collide_nodes(
+        grid: wp.array(dtype=vec4), cutoff: scalar, origin: wp.array(dtype=wp.vec3i), dims: wp.vec3i, dx: scalar,
+        inv_dt: scalar, count: int, substep: int, shapes: wp.array2d(dtype=scalar), codes: wp.array2d(dtype=int),
+        fields: wp.array(dtype=scalar), position: wp.array2d(dtype=vec3), rotation: wp.array2d(dtype=mat33),
+        linear: wp.array2d(dtype=vec3), angular: wp.array2d(dtype=vec3), velocity: wp.array(dtype=vec3),
+        force: wp.array2d(dtype=vec3), torque: wp.array2d(dtype=vec3),
+    ):  # fmt: skip
+        """Changes velocity in place, adds to force and torque of the substep."""
+        node = wp.tid()
+        m = grid[node][3]
+        if m > cutoff:
+            u = velocity[node]
+            y = node_position(node, origin[0], dims, dx)
+            for k in range(count):
+                after = respond(u, y, k, substep, shapes, codes, fields, position, rotation, linear, angular)
+                f = (m * inv_dt) * (u - after)
+                if wp.dot(f, f) > scalar(0.0):
+                    wp.atomic_add(force, substep, k, f)
+                    wp.atomic_add(torque, substep, k, wp.cross(y - position[substep, k], f))
+                u = after
+            velocity[node] = u
+
+    @wp.kernel(module=module, enable_backward=False)
+    def adj_collide_nodes(
+        grid: wp.array(dtype=vec4), cutoff: scalar, origin: wp.array(dtype=wp.vec3i), dims: wp.vec3i, dx: scalar,
+        inv_dt: scalar, count: int, substep: int, shapes: wp.array2d(dtype=scalar), codes: wp.array2d(dtype=int),
+        fields: wp.array(dtype=scalar), position: wp.array2d(dtype=vec3), rotation: wp.array2d(dtype=mat33),
+        linear: wp.array2d(dtype=vec3), angular: wp.array2d(dtype=vec3), before: wp.array(dtype=vec3),
+        adj_force: wp.array2d(dtype=vec3), adj_torque: wp.array2d(dtype=vec3), adj_velocity: wp.array(dtype=vec3),
+        adj_mass: wp.array(dtype=scalar), adj_position: wp.array2d(dtype=vec3), adj_rotation: wp.array2d(dtype=mat33),
+        adj_linear: wp.array2d(dtype=vec3), adj_angular: wp.array2d(dtype=vec3),
+    ):  # fmt: skip
+        """before: node velocities as the first collider finds them. Turns adj_velocity into theirs, writes adj_mass, adds to the
+        adjoints of the pose and of the velocities."""
+        node = wp.tid()
+        m = grid[node][3]
+        am = scalar(0.0)
+        if m > cutoff:
+            a = adj_velocity[node]
+            y = node_position(node, origin[0], dims, dx)
+            for reverse in range(count):
+                k = count - 1 - reverse
+                r = y - position[substep, k]
+                Q = rotation[substep, k]
+                q = wp.transpose(Q) * r
+                phi, g = signed_distance(q, k, shapes, codes, fields)
+                w, slope = weight(phi, shapes[k, 3])
+                if w > scalar(0.0):
+                    u = before[node]
+                    for j in range(k):
+                        u = respond(u, y, j, substep, shapes, codes, fields, position, rotation, linear, angular)
+                    omega = angular[substep, k]
+                    local = wp.normalize(g)
+                    n = Q * local
+                    V = linear[substep, k] + wp.cross(omega, r)
+                    D = V + collide(u - V, n, codes[k, 1], shapes[k, 4]) - u
+                    # u' = u + w D,  f = -(m w/dt) D,  torque = r x f
+                    at = adj_torque[substep, k]
+                    af = adj_force[substep, k] + wp.cross(at, r)
+                    f = (-m * w * inv_dt) * D
+                    am = am - (w * inv_dt) * wp.dot(D, af)
+                    aD = w * a - (m * w * inv_dt) * af
+                    aw = wp.dot(D, a) - (m * inv_dt) * wp.dot(D, af)
+                    ar = wp.cross(f, at)
+                    # D = V + collide(u - V, n) - u
+                    relative = adj_collide(u - V, n, codes[k, 1], shapes[k, 4], aD)
+                    an = adj_collide_normal(u - V, n, codes[k, 1], shapes[k, 4], aD)
+                    a = a - aD + relative
+                    aV = aD - relative
+                    # V = linear + angular x r
+                    ar = ar + wp.cross(aV, omega)
+                    # n = Q local, local = g/|g|, g = grad phi(q), w(phi)
+                    al = wp.transpose(Q) * an
+                    ag = (al - wp.dot(local, al) * local) / wp.length(g)
+                    aq = curvature(q, k, shapes, codes, fields, ag) + (slope * aw) * g
+                    # q = Q^T r, r = y - position
+                    ar = ar + Q * aq
+                    wp.atomic_add(adj_linear, substep, k, aV)
+                    wp.atomic_add(adj_angular, substep, k, wp.cross(r, aV))
+                    wp.atomic_add(adj_rotation, substep, k, wp.outer(an, local) + wp.outer(r, aq))
+                    wp.atomic_add(adj_position, substep, k, -ar)
+            adj_velocity[node] = a
+        adj_mass[node] = am
+
+    @wp.kernel(module=module, enable_backward=False)
+    def add_mass(adj_mass: wp.array(dtype=scalar), adj_grid: wp.array(dtype=vec4)):
+        """What the reaction adds to the adjoint of node masses."""
+        node = wp.tid()
+        z = scalar(0.0)
+        adj_grid[node] = adj_grid[node] + vec4(z, z, z, adj_mass[node])
+
+    return SimpleNamespace(
+        collide_nodes=collide_nodes, adj_collide_nodes=adj_collide_nodes, add_mass=add_mass, vec3=vec3, mat33=mat33
+    )

@@ -1,0 +1,214 @@
+"""Prescribed rigid motions of colliders: pose and twist at every substep, differentiable in what describes them.
+
+The pose of substep s is the one at its start, t = s dt; the twist is the one in its middle. A motion is described by pieces of
+constant twist (`Motion`, `Motion.waypoints`), or given substep by substep (`Trajectory`). Everything is torch: gradients reach
+positions, rotations and velocities through autograd.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from mosa.errors import ConfigError
+
+
+class Poses(NamedTuple):
+    """K colliders at S substeps. position: (S, K, 3) [m]; rotation: (S, K, 3, 3), body to world; linear: (S, K, 3) [m/s],
+    velocity of the collider's origin; angular: (S, K, 3) [rad/s], both in world axes."""
+
+    position: Tensor
+    rotation: Tensor
+    linear: Tensor
+    angular: Tensor
+
+
+def exponential(vectors: Tensor) -> Tensor:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad], differentiable."""
+    zero = torch.zeros_like(vectors[..., 0])
+    x, y, z = vectors.unbind(-1)
+    return torch.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3)))
+
+
+def rotation_matrices(value: Tensor | Sequence, leading: int = 0) -> Tensor:
+    """(..., 3, 3) float64 of rotation vectors (..., 3) [rad] or matrices, with `leading` dimensions before. Differentiable.
+
+    Errors: ConfigError for another shape, or matrices that are not rotations (1e-4).
+    """
+    value = torch.as_tensor(value, dtype=torch.float64)
+    if value.ndim == leading + 1 and value.shape[-1] == 3:
+        return exponential(value)
+    if value.ndim != leading + 2 or value.shape[-2:] != (3, 3):
+        expected = "(K, 3) or (K, 3, 3)" if leading else "(3,) or (3, 3)"
+        raise ConfigError(f"rotation: expected rotation vectors or matrices {expected}, found shape {tuple(value.shape)}")
+    defect = (value.detach() @ value.detach().mT - torch.eye(3, dtype=torch.float64, device=value.device)).abs().max()
+    if not (float(defect) < 1e-4 and bool((torch.linalg.det(value.detach()) > 0).all())):
+        raise ConfigError(f"rotation: expected rotation matrices (R R^T = I, det R = 1), found a defect of {float(defect):.3g}")
+    return value
+
+
+def rotation_vector(R: Tensor) -> Tensor:
+    """Rotation vectors (..., 3) [rad] of rotation matrices (..., 3, 3) by less than pi, differentiable."""
+    sine = 0.5 * torch.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1)
+    cosine = 0.5 * (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)
+    square = (sine**2).sum(-1)
+    small = square < 1e-8
+    # angle/sin(angle), by its series where the angle (below 1e-4) leaves 1e-17 of it
+    size = torch.where(small, torch.ones_like(square), square).sqrt()
+    factor = torch.where(small & (cosine > 0), 1 + square / 6, torch.atan2(size, cosine) / size)
+    return factor[..., None] * sine
+
+
+def _vectors(name: str, value: Tensor | Sequence) -> Tensor:
+    value = torch.as_tensor(value, dtype=torch.float64)
+    if value.shape[-1:] != (3,) or value.ndim > 2 or not bool(torch.isfinite(value.detach()).all()):
+        raise ConfigError(f"motion: {name}: expected (3,) or (K, 3) finite numbers, found shape {tuple(value.shape)}")
+    return value.reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Pieces of constant twist from a pose at t = 0.
+
+    position: (3,) [m]; rotation: (3,) rotation vector [rad] or (3, 3); velocity, angular_velocity: (3,) for always or (K, 3),
+    [m/s], [rad/s], world axes. times: (K,) [s] start of each piece, ascending; at rest before the first, and the last one never
+    ends. Without times K is 1, the number of frame intervals, or the number of substeps of the rollout. Numbers or tensors;
+    differentiable in all but times.
+    """
+
+    position: Tensor | Sequence[float] = (0.0, 0.0, 0.0)
+    rotation: Tensor | Sequence = (0.0, 0.0, 0.0)
+    velocity: Tensor | Sequence = (0.0, 0.0, 0.0)
+    angular_velocity: Tensor | Sequence = (0.0, 0.0, 0.0)
+    times: Sequence[float] | Tensor | None = None
+
+    @classmethod
+    def waypoints(cls, times: Sequence[float] | Tensor, positions: Tensor | Sequence, rotations: Tensor | Sequence | None = None):
+        """Through poses at `times` (K,) [s], K >= 2, at constant twist between; at rest before the first and after the last.
+
+        positions: (K, 3) [m]; rotations: (K, 3) or (K, 3, 3), turned by less than half a turn from one to the next.
+        Errors: ConfigError naming the field.
+        """
+        times = torch.as_tensor(times, dtype=torch.float64)
+        positions = _vectors("waypoints: positions", positions)
+        count = len(times)
+        if times.ndim != 1 or count < 2 or not bool((times.diff() > 0).all()):
+            raise ConfigError(f"motion: waypoints: times: expected at least two ascending numbers, found {times.tolist()}")
+        R = rotation_matrices(torch.zeros(count, 3) if rotations is None else rotations, 1)
+        if len(positions) != count or len(R) != count:
+            raise ConfigError(
+                f"motion: waypoints: expected one position and rotation for each of {count} times, found {len(positions)} and "
+                f"{len(R)}"
+            )
+        steps = R[1:] @ R[:-1].mT
+        if bool((steps.detach().diagonal(dim1=-2, dim2=-1).sum(-1) < -0.99).any()):
+            raise ConfigError("motion: waypoints: rotations: expected less than half a turn between two, put one in between")
+        interval, rest = times.diff()[:, None], torch.zeros(1, 3, dtype=torch.float64)
+        velocity = torch.cat([(positions[1:] - positions[:-1]) / interval, rest])
+        angular = torch.cat([rotation_vector(steps) / interval, rest])
+        return cls(positions[0], R[0], velocity, angular, times)
+
+    def shifted(self, offset: Tensor) -> "Motion":
+        """The same motion moved by offset (3,) [m]."""
+        return replace(self, position=torch.as_tensor(self.position, dtype=torch.float64).cpu() + offset.double().cpu())
+
+    def sample(self, frames: int, substeps: int, dt: float, start: float = 0.0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """(position (S, 3), rotation (S, 3, 3), linear (S, 3), angular (S, 3)) float64 at S = frames * substeps substeps of dt [s]
+        from time `start`. Errors: ConfigError naming the field."""
+        start_position, R0 = _vectors("position", self.position).cpu(), rotation_matrices(self.rotation).cpu()
+        if len(start_position) != 1:
+            raise ConfigError(f"motion: position: expected (3,), found {len(start_position)} vectors: see Motion.waypoints")
+        position = start_position[0]
+        linear, angular = _vectors("velocity", self.velocity).cpu(), _vectors("angular_velocity", self.angular_velocity).cpu()
+        times, count = self._pieces(frames, substeps, dt, max(len(linear), len(angular)))
+        for name, value in (("velocity", linear), ("angular_velocity", angular)):
+            if len(value) not in (1, count):
+                raise ConfigError(f"motion: {name}: expected 1 or {count} vectors, found {len(value)}")
+        linear, angular = linear.expand(count, 3), angular.expand(count, 3)
+        interval = times.diff()[:, None]
+        knots = torch.cat([position[None], position + ((linear[:-1] * interval).cumsum(0))])
+        turns = exponential(angular[:-1] * interval)
+        attitudes = [R0]
+        for turn in turns:
+            attitudes.append(turn @ attitudes[-1])
+        attitudes = torch.stack(attitudes)
+        t = start + dt * torch.arange(frames * substeps, dtype=torch.float64)
+        # a substep belongs to the piece that its middle is in
+        piece = torch.searchsorted(times, t + 0.5 * dt, right=True) - 1
+        resting = (piece < 0)[:, None]
+        piece = piece.clamp_min(0)
+        since = torch.where(resting, torch.zeros(()), (t - times[piece])[:, None])
+        x = knots[piece] + since * linear[piece]
+        R = exponential(since * angular[piece]) @ attitudes[piece]
+        return x, R, linear[piece] * ~resting, angular[piece] * ~resting
+
+    def _pieces(self, frames: int, substeps: int, dt: float, count: int) -> tuple[Tensor, int]:
+        """(start times (K,), K)."""
+        if self.times is not None:
+            times = torch.as_tensor(self.times, dtype=torch.float64).cpu()
+            if times.ndim != 1 or not len(times) or not bool((times.diff() > 0).all()) or not bool(torch.isfinite(times).all()):
+                raise ConfigError(f"motion: times: expected ascending numbers, found {times.tolist()}")
+            return times, len(times)
+        length = {1: 0.0, frames: substeps * dt, frames * substeps: dt}
+        if count not in length:
+            raise ConfigError(
+                f"motion: velocity and angular_velocity: expected 1, {frames} (per frame interval) or {frames * substeps} (per "
+                f"substep) vectors where no times are given, found {count}"
+            )
+        return length[count] * torch.arange(count, dtype=torch.float64), count
+
+    def max_speed(self, reach: float) -> float:
+        """Bound of the speed [m/s] of a point within `reach` [m] of the origin."""
+        linear, angular = (_vectors("", v).detach().norm(dim=1).max() for v in (self.velocity, self.angular_velocity))
+        return float(linear + reach * angular)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A motion substep by substep, nothing derived. position: (S, 3) [m]; rotation: (S, 3, 3) or (S, 3); velocity and
+    angular_velocity: (S, 3) of the S substeps of a rollout. For optimal control and gradient checks."""
+
+    position: Tensor
+    rotation: Tensor
+    velocity: Tensor
+    angular_velocity: Tensor
+
+    def shifted(self, offset: Tensor) -> "Trajectory":
+        return replace(self, position=self.position.double().cpu() + offset.double().cpu())
+
+    def sample(self, frames: int, substeps: int, dt: float, start: float = 0.0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """As `Motion.sample`; `start` must be a whole number of substeps into the trajectory."""
+        first, count = round(start / dt), frames * substeps
+        values = (self.position, rotation_matrices(self.rotation, 1), self.velocity, self.angular_velocity)
+        if any(len(v) < first + count for v in values) or not math.isclose(first * dt, start, abs_tol=1e-6 * dt):
+            raise ConfigError(
+                f"trajectory: expected poses and velocities of substeps {first} to {first + count}, found "
+                f"{[len(v) for v in values]}"
+            )
+        return tuple(v[first : first + count].double().cpu() for v in values)
+
+    def max_speed(self, reach: float) -> float:
+        linear, angular = (v.detach().norm(dim=1).max() for v in (self.velocity, self.angular_velocity))
+        return float(linear + reach * angular)
+
+
+def sample_poses(
+    motions: Sequence[Motion | Trajectory], frames: int, substeps: int, dt: float, start: float, dtype: torch.dtype,
+    device: torch.device,
+) -> Poses:  # fmt: skip
+    """Poses of all colliders at every substep of `frames` frame intervals, in the simulator's type.
+
+    Errors: ConfigError naming a collider whose motion is not finite (a NaN would silently touch nothing).
+    """
+    sampled = [motion.sample(frames, substeps, dt, start) for motion in motions]
+    for i, parts in enumerate(sampled):
+        for name, part in zip(Poses._fields, parts):
+            if not bool(torch.isfinite(part.detach()).all()):
+                bad = int((~torch.isfinite(part.detach())).reshape(len(part), -1).any(1).nonzero()[0])
+                raise ConfigError(
+                    f"motion of collider {i}: {name}: expected finite numbers, found {part[bad].tolist()} at substep {bad}"
+                )
+    return Poses(*(torch.stack(parts, 1).to(dtype=dtype, device=device) for parts in zip(*sampled)))

@@ -1,0 +1,85 @@
+"""Colliders from plain containers, and what is wrong with them."""
+
+import math
+
+import pytest
+import torch
+
+from mosa.errors import ConfigError
+from mosa.physics.collider_motion import Motion
+from mosa.physics.collider_reference import signed_distance
+from mosa.physics.colliders import Collider, Sphere, colliders_from_config, pack_colliders, reach
+from mosa.physics.rollout import Simulator
+
+
+def test_every_type(tmp_path):
+    corners = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+    faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    text = [f"v {x} {y} {z}" for x, y, z in corners] + ["f " + " ".join(str(i + 1) for i in f) for f in faces]
+    (tmp_path / "cube.obj").write_text("\n".join(text))
+    made = colliders_from_config([
+        {"type": "plane", "normal": [0, 2, 0], "position": [0, 1, 0], "mode": "separate", "friction": 0.3},
+        {"type": "sphere", "radius": 0.1, "motion": {"velocity": [1, 0, 0], "angular_velocity": [0, 0, 1]}},
+        {"type": "capsule", "radius": 0.1, "length": 0.4, "rotation": [0, 0, 1, 90]},
+        {"type": "cylinder", "radius": 0.3, "length": 0.4, "thickness": 0.02, "name": "roll"},
+        {"type": "box", "size": [1, 2, 2], "motion": {"waypoints": [
+            {"time": 0.0, "position": [0, 0, 0]}, {"time": 1.0, "position": [0, 0, 1], "rotation": [1, 0, 0, 90]}]}},
+        {"type": "mesh", "path": str(tmp_path / "cube.obj"), "spacing": 0.1, "scale": 2.0, "thickness": 0.3},
+    ])  # fmt: skip
+    pack_colliders(made, torch.float32, torch.device("cpu"))
+    plane, sphere, capsule, roll, box, mesh = made
+    assert plane.mode == "separate" and plane.friction == 0.3
+    up = plane.motion.sample(1, 1, 0.1)[1][0] @ torch.tensor([0.0, 0.0, 1.0]).double()
+    torch.testing.assert_close(up, torch.tensor([0.0, 1.0, 0.0]).double(), rtol=0, atol=1e-15)
+    assert sphere.shape == Sphere(0.1) and sphere.motion.max_speed(2.0) == pytest.approx(3.0)
+    turned = capsule.motion.sample(1, 1, 0.1)[1][0]
+    torch.testing.assert_close(turned[:, 0], torch.tensor([0.0, 1.0, 0.0]).double(), rtol=0, atol=1e-15)
+    assert (roll.name, roll.thickness) == ("roll", 0.02) and reach(roll.shape) == pytest.approx(math.hypot(0.3, 0.2))
+    assert reach(box.shape) == pytest.approx(1.5) and reach(capsule.shape) == pytest.approx(0.3) and reach(plane.shape) == 0
+    x, R, *_ = box.motion.sample(3, 1, 0.5)
+    torch.testing.assert_close(x[1], torch.tensor([0.0, 0.0, 0.5]).double())
+    torch.testing.assert_close(R[2] @ R[2], torch.diag(torch.tensor([1.0, -1.0, -1.0])).double(), rtol=0, atol=1e-12)
+    centre = torch.ones(1, 3).double()
+    assert float(signed_distance(mesh.shape, centre)) == pytest.approx(-1.0, abs=0.06)
+
+
+@pytest.mark.parametrize(
+    "item, match",
+    [
+        ({"type": "torus"}, r"world\.colliders\[0\]\.type: expected one of plane, sphere.*'torus'"),
+        ({"type": "sphere"}, "a sphere needs radius"),
+        ({"type": "sphere", "radius": 1, "length": 2}, "unknown: length"),
+        ({"type": "sphere", "radius": "wide"}, "wrong form"),
+        ({"type": "box", "size": 3.0}, "wrong form"),
+        ({"type": "plane", "normal": [0, 0, 0]}, "normal: expected a non-zero"),
+        ({"type": "plane", "normal": [0, 0, 1], "rotation": [0, 0, 1, 3]}, "one of them"),
+        ({"type": "sphere", "radius": 1, "rotation": [0, 0, 0, 90]}, "rotation: expected"),
+        ({"type": "sphere", "radius": 1, "motion": {"speed": 1}}, "unknown: speed"),
+        ({"type": "sphere", "radius": 1, "motion": {"waypoints": [], "velocity": [0, 0, 0]}}, "stand alone"),
+        ({"type": "mesh", "path": "absent.obj"}, r"colliders\[0\]: mesh: no file"),
+    ],
+)  # fmt: skip
+def test_errors_of_a_configuration(item, match):
+    with pytest.raises(ConfigError, match=match):
+        colliders_from_config([item])
+
+
+@pytest.mark.parametrize(
+    "collider, match",
+    [
+        (Collider(Sphere(0.0)), "collider 0: Sphere: expected positive"),
+        (Collider(Sphere(1.0), "bouncy", name="ball"), "collider ball: mode.*'bouncy'"),
+        (Collider(Sphere(1.0), "slip", 0.2), "separate only"),
+        (Collider(Sphere(1.0), thickness=-1.0), "thickness"),
+        (Collider("sphere"), "shape: expected one of HalfSpace"),
+    ],
+)
+def test_packing_errors(collider, match):
+    with pytest.raises(ConfigError, match=match):
+        pack_colliders([collider], torch.float64, torch.device("cpu"))
+
+
+def test_motions_of_another_number(make_block):
+    simulator = Simulator("corotated", dx=0.04, substeps=5, frame_dt=0.01, colliders=[Collider(Sphere(0.1))], dtype=torch.float64)
+    with pytest.raises(ConfigError, match="one for each of 1 colliders, found 2"):
+        simulator.rollout(make_block(), {"mu": 4e4, "lam": 5e4}, torch.full((64,), 8e-6).double(), 1e3, 2, motions=[Motion()] * 2)

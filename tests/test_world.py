@@ -1,0 +1,50 @@
+"""A body among moving colliders: from plain configuration to reactions, through the twin's interface."""
+
+import pytest
+import torch
+
+from mosa.config import build_world
+from mosa.errors import ConfigError
+from mosa.modules.body import Body, SimulationSettings, Start
+from mosa.modules.material import Material
+from mosa.twin import Twin
+
+WORLD = {"ground": {"height": 0.0, "mode": "separate", "friction": 0.2}, "gravity": [0, -9.8, 0], "up": [0, 1, 0],
+         "box": [[-0.5, -0.5, -0.5], [0.5, 1.0, 0.5]]}  # fmt: skip
+PLATE = {"type": "box", "size": [0.6, 0.1, 0.6], "position": [0, 0.36, 0], "mode": "separate", "friction": 0.1,
+         "motion": {"waypoints": [{"time": 0.0, "position": [0, 0.36, 0]}, {"time": 0.1, "position": [0, 0.21, 0]}]}}  # fmt: skip
+PLATE.pop("position")
+
+
+def twin(world=WORLD):
+    axis = (torch.arange(6) + 0.5) * 0.03 - 0.09
+    rest = torch.cartesian_prod(axis, axis, axis)
+    n = len(rest)
+    body = Body(rest=rest, volume=torch.full((n,), 0.03**3), colors=torch.ones(n, 3), opacities=torch.ones(n),
+                covariances=1e-4 * torch.eye(3).expand(n, 3, 3), density=1000.0,
+                material=Material("corotated", {"E": 5e4, "nu": 0.3}), heterogeneity=None, adapter=None,
+                settings=SimulationSettings(dx=0.06))  # fmt: skip
+    start = Start(torch.eye(3), torch.tensor([0.0, 0.11, 0.0]), torch.zeros(3), torch.zeros(3))
+    return Twin(body, build_world(world), 0.02, {}, start)
+
+
+def test_a_plate_presses_the_body_down():
+    free = twin().simulate(frames=8)
+    assert free.reactions is None
+    for rollout in (twin().simulate(frames=8, colliders=[PLATE]), twin(WORLD | {"colliders": [PLATE]}).simulate(frames=8)):
+        top = rollout.x[-1, :, 1].max()
+        assert top < 0.16 + 0.06 < free.x[-1, :, 1].max() + 0.06
+        assert top < free.x[-1, :, 1].max() - 0.01
+        up = rollout.reactions[..., 0, 1].mean(1)
+        assert up[0] == 0 and up[-1] > 5.0
+
+
+def test_walls_and_errors():
+    narrow = WORLD | {"box": [[-0.12, -0.5, -0.5], [0.12, 1.0, 0.5]]}
+    walled = twin(narrow | {"walls": {"mode": "separate", "friction": 0.1}})
+    assert len(walled.world.planes) == 6
+    assert walled.simulate(frames=8, velocity=(1.0, 0.0, 0.0)).x[..., 0].max() < 0.12
+    with pytest.raises(ConfigError, match=r"world\.colliders\[0\]: a sphere needs radius"):
+        build_world(WORLD | {"colliders": [{"type": "sphere"}]})
+    with pytest.raises(ConfigError, match=r"colliders\[0\].type"):
+        twin().simulate(colliders=[{"type": "cone"}])
