@@ -51,7 +51,7 @@ def _matrix(rows: int, columns: int, scalar: type) -> type:
 
 @functools.cache
 def start_warp() -> None:
-    wp.config.quiet = True
+    wp.config.log_level = wp.LOG_WARNING
     wp.init()
 
 

@@ -15,8 +15,8 @@ from mosa.errors import DataError
 def test_against_colorsys(angle, length):
     vector = length * torch.tensor([math.cos(math.radians(angle)), math.sin(math.radians(angle))])
     found = flow_colors(vector.expand(2, 3, 4, 2), largest=4.0)
-    wanted = colorsys.hsv_to_rgb(angle / 360, min(length / 4, 1), 1)
-    torch.testing.assert_close(found, torch.tensor(wanted).expand(2, 3, 4, 3), rtol=0, atol=2e-6)
+    wanted = torch.tensor(colorsys.hsv_to_rgb(angle / 360, min(length / 4, 1), 1.0), dtype=torch.float32)
+    torch.testing.assert_close(found, wanted.expand(2, 3, 4, 3), rtol=0, atol=2e-6)
 
 
 def test_longest_flow_has_full_colour_and_rest_is_white():

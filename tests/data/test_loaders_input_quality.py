@@ -204,7 +204,7 @@ def test_raw_footage_is_matted_from_its_plates(blocks, pacnerf_folder, capsys):
 
 
 def test_plates_of_the_real_bird(reference_data):
-    """Camera 0 of PAC-NeRF's bird with the plate that is kept: against the mattes of the data set, which are binary and about half a
+    """Camera 0 of PAC-NeRF's bird with the plate that is kept: against the mattes of the data set, binary and about half a
     pixel smaller."""
     folder = reference_data / "pacnerf" / "bird" / "data"
     if not (folder / "r_0_-1.png").is_file():
