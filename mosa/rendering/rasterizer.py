@@ -53,10 +53,11 @@ def _check(means: Tensor, covariances: Tensor, opacities: Tensor, features: Tens
             raise ConfigError(f"rasterize: {name} is on {value.device}, means on {means.device}; move all to one device")
         if name != "state_index" and (value.dtype != means.dtype or value.dtype not in SCALARS):
             raise ConfigError(f"rasterize: {name} is {value.dtype}, means {means.dtype}; use one of float32, float64 for all")
-    for name, value in (("means", means), ("covariances", covariances), ("opacities", opacities), ("features", features)):
-        if not bool(value.detach().isfinite().all()):
-            where = (~value.detach().isfinite()).nonzero()[0].tolist()
-            raise DataError(f"rasterize: {name}{where} is not finite; it would silently vanish from the image")
+    numbers = {"means": means, "covariances": covariances, "opacities": opacities, "features": features}
+    if not bool(torch.stack([value.detach().isfinite().all() for value in numbers.values()]).all()):  # one wait for the GPU
+        name = next(name for name, value in numbers.items() if not bool(value.detach().isfinite().all()))
+        where = (~numbers[name].detach().isfinite()).nonzero()[0].tolist()
+        raise DataError(f"rasterize: {name}{where} is not finite; it would silently vanish from the image")
     for name, value, size in (("K", cameras.K, 3), ("w2c", cameras.w2c, 4)):
         if tuple(value.shape) != (images, size, size):
             raise ConfigError(f"rasterize: cameras.{name} has shape {tuple(value.shape)}, expected {(images, size, size)}")

@@ -17,7 +17,7 @@ from torch.autograd.function import once_differentiable
 from mosa.rendering.covariance import CLAMP_MARGIN
 from mosa.rendering.projection_kernels import projection_kernels
 from mosa.rendering.raster_kernels import raster_kernels
-from mosa.rendering.tile_kernels import tile_kernels, tile_lists
+from mosa.rendering.tile_kernels import tile_kernels, tile_lists, tile_threads
 
 CAMERA_CHUNKS = 1024
 """Threads per image that sum the gradient of its camera."""
@@ -149,7 +149,7 @@ class Splat(torch.autograd.Function):
             kernel, _ = tile_kernels(arrays.scalar, channels)
             wp.launch(
                 kernel,
-                dim=(images, g.height, g.width),
+                dim=tile_threads(images, g.width, g.height),
                 inputs=[*map(_integers, lists), *shared, rects_wp, *tail],
                 outputs=outputs,
                 device=device,
@@ -204,7 +204,7 @@ class Splat(torch.autograd.Function):
             _, kernel = tile_kernels(arrays.scalar, channels)
             wp.launch(
                 kernel,
-                dim=(images, g.height, g.width),
+                dim=tile_threads(images, g.width, g.height),
                 inputs=[*map(_integers, lists), *shared],
                 outputs=outputs,
                 device=device,

@@ -136,3 +136,18 @@ def test_depth(expected):
         return objective(depth[..., None], torch.zeros_like(depth))
 
     agree(picture, leaves | {"top": w2c[:, :3].clone()})
+
+
+@pytest.mark.gpu
+def test_camera_gradients_on_cuda_match_cpu():
+    """1500 Gaussians of float64, nine channels, more than one block of threads to a camera and ragged tiles at the border."""
+    scene = draw(1500, states=2, images=4, channels=9, size=0.04)
+    scene.cameras = replace(scene.cameras, width=100, height=90, K=4 * scene.cameras.K * torch.tensor([[1.0], [1.0], [0.25]]))
+    found = []
+    for device in ("cpu", "cuda"):
+        K, w2c = (x.clone().to(device).requires_grad_() for x in (scene.cameras.K, scene.cameras.w2c))
+        values = [getattr(scene, name).to(device).requires_grad_() for name in NAMES]
+        output = rasterize(*values, replace(scene.cameras, K=K, w2c=w2c), scene.state_index.to(device))
+        found.append([g.cpu() for g in torch.autograd.grad(objective(*output), [K, w2c, *values])])
+    for ours, wanted in zip(*found):
+        torch.testing.assert_close(ours, wanted, rtol=1e-9, atol=1e-10 * float(wanted.abs().max()))
