@@ -28,6 +28,7 @@ from mosa.modules.lit_mosa import LitMosa
 from mosa.reconstruction.starts import first_contact, sequence_start, splats_of
 from mosa.rendering.cameras import crop_boxes, crop_images
 from mosa.rendering.covariance import covariance_from
+from mosa.rendering.rasterizer import use_backend
 from mosa.twin import Twin, save_rollout
 from mosa.types import MotionCues, Reconstruction, Scene
 
@@ -95,6 +96,7 @@ def train(cfg: DictConfig) -> float | None:
     L.seed_everything(cfg.seed, verbose=False)
     clock, folder = Clock(), run_folder()
     device = "cuda" if cfg.trainer.accelerator in ("gpu", "cuda") else "cpu"
+    use_backend(cfg.rendering.backend)
     with clock.measure("data"):
         scene, held_out = scenes(cfg)
     if scene.synthetic:

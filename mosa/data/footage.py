@@ -17,6 +17,9 @@ WHITE = np.ones(3, np.float32)
 # columns 1 and 2 of a pose with OpenGL axes (y up, looks along -z) point against those of OpenCV (y down, z forward)
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
+# relative jitter of frame times that still counts as a constant frame rate
+TIME_JITTER = 1e-3
+
 
 @dataclass(frozen=True)
 class Footage:
@@ -50,9 +53,7 @@ def matrix(value, shape: tuple[int, int], where: str) -> np.ndarray:
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise DataError(
-            f"{where}: expected a {shape[0]}x{shape[1]} matrix of numbers, found {str(value)[:80]}"
-        ) from error
+        raise DataError(f"{where}: expected a {shape[0]}x{shape[1]} matrix of numbers, found {str(value)[:80]}") from error
     if array.shape == (4, 4) and shape == (3, 4):
         array = array[:3]
     if array.shape != shape:
@@ -104,9 +105,7 @@ def frame_range(present: list[int], wanted, where: str) -> list[int]:
         present = [f for f in present if wanted[0] <= f <= wanted[1]]
     missing = sorted(set(range(present[0], present[-1] + 1)) - set(present)) if present else []
     if missing:
-        raise DataError(
-            f"{where}: frames {missing} are missing between {present[0]} and {present[-1]}; restrict scene.frames"
-        )
+        raise DataError(f"{where}: frames {missing} are missing between {present[0]} and {present[-1]}; restrict scene.frames")
     if len(present) < 2:
         raise DataError(f"{where}: expected at least two frames, found {len(present)}")
     return present
@@ -119,6 +118,21 @@ def merge_time(times: dict[int, tuple[float, str]], frame: int, time: float, whe
         raise DataError(
             f"{where}: frame {frame} has time {time:.6f} s, but {known:.6f} s in {first}; "
             "the cameras of a scene must be synchronous"
+        )
+
+
+def even_times(times: list[float], frames: list[int], where: str, remedy: str) -> None:
+    """The times [s] of the chosen frames increase at one rate. Errors: DataError with the times, beginning with `where`."""
+    steps = np.diff(np.asarray(times, dtype=np.float64))
+    listed = ", ".join(f"{t:.6g}" for t in times[:8]) + (" ..." if len(times) > 8 else "")
+    if not (steps > 0).all():
+        raise DataError(f"{where}: expected increasing frame times, found {listed} s; {remedy}")
+    middle = float(np.median(steps))
+    worst = int(np.abs(steps - middle).argmax())
+    if abs(steps[worst] - middle) > TIME_JITTER * middle:
+        raise DataError(
+            f"{where}: expected one frame rate, found the times {listed} s: {steps[worst]:.6f} s between frames "
+            f"{frames[worst]} and {frames[worst + 1]}, {middle:.6f} s elsewhere; {remedy}"
         )
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import cv2
-import imageio.v3 as iio
 import numpy as np
+from PIL import Image
 
 from mosa.errors import ConfigError, DataError
 
@@ -14,16 +14,18 @@ from mosa.errors import ConfigError, DataError
 def read_image(path: Path) -> np.ndarray:
     """Pixels of an image file, (H, W, C) float32 in [0, 1], C = 1, 3 or 4.
 
-    Errors: DataError where the file is missing, truncated, no image, or holds values that are not finite.
+    Palettes become colours, with an alpha channel where an entry is transparent, grey with alpha becomes RGBA, and 16-bit
+    PNGs keep their 16 bits. Errors: DataError where the file is missing, truncated, no image, or holds values that are not finite.
     """
     if not path.is_file():
         raise DataError(f"{path}: image not found")
     try:
-        pixels = np.asarray(iio.imread(path, plugin="pillow"))
-    except (OSError, SyntaxError, ValueError, RuntimeError) as error:
-        raise DataError(
-            f"{path}: expected a readable image, found a damaged one ({error}); copy or export it again"
-        ) from error
+        pixels = deep_png(path)
+        if pixels is None:
+            with Image.open(path) as picture:
+                pixels = np.asarray(picture.convert(plain_mode(picture)))
+    except (OSError, SyntaxError, ValueError, RuntimeError, Image.DecompressionBombError) as error:
+        raise DataError(f"{path}: expected a readable image, found a damaged one ({error}); copy or export it again") from error
     if pixels.dtype == np.uint8:
         pixels = pixels.astype(np.float32) / 255
     elif pixels.dtype == np.uint16:
@@ -37,10 +39,45 @@ def read_image(path: Path) -> np.ndarray:
     if pixels.ndim != 3 or pixels.shape[2] not in (1, 3, 4):
         raise DataError(f"{path}: expected a picture with 1, 3 or 4 channels, found an array of shape {pixels.shape}")
     if not np.isfinite(pixels).all():
-        raise DataError(
-            f"{path}: expected finite pixels, found {int((~np.isfinite(pixels)).sum())} that are NaN or infinite"
-        )
+        raise DataError(f"{path}: expected finite pixels, found {int((~np.isfinite(pixels)).sum())} that are NaN or infinite")
     return np.clip(pixels, 0, 1)
+
+
+def plain_mode(picture: Image.Image) -> str:
+    """The mode without palette, with straight alpha where there is transparency, that holds a picture."""
+    if picture.mode in ("PA", "LA", "La", "RGBa") or "transparency" in picture.info:
+        return "RGBA"
+    return "RGB" if picture.mode in ("P", "CMYK", "YCbCr", "LAB", "HSV") else picture.mode
+
+
+def deep_png(path: Path) -> np.ndarray | None:
+    """Pixels of a colour PNG with 16 bits per channel, which Pillow would cut to 8; None for any other file."""
+    with path.open("rb") as file:
+        header = file.read(26)
+    if header[:8] != b"\x89PNG\r\n\x1a\n" or len(header) < 26 or header[24] != 16 or header[25] not in (2, 6):
+        return None
+    with Image.open(path) as picture:
+        picture.load()  # OpenCV fills the rest of a truncated file with black, Pillow says so
+    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise OSError("OpenCV cannot decode it")
+    return cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGBA if pixels.shape[2] == 4 else cv2.COLOR_BGR2RGB)
+
+
+def fill_holes(matte: np.ndarray, largest: int) -> np.ndarray:
+    """A matte (H, W) whose enclosed holes of at most `largest` pixels are covered; 0 leaves it as it is.
+
+    Errors: ConfigError for a size that is none.
+    """
+    if isinstance(largest, bool) or not isinstance(largest, int) or largest < 0:
+        raise ConfigError(f"scene.fill_holes: expected a number of pixels, 0 or more, found {largest!r}")
+    if largest == 0:
+        return matte
+    _, labels, stats, _ = cv2.connectedComponentsWithStats((matte < 0.5).astype(np.uint8), connectivity=4)
+    small = stats[:, cv2.CC_STAT_AREA] <= largest
+    small[0] = False  # what is covered
+    small[np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))] = False
+    return np.where(small[labels], np.float32(1), matte)
 
 
 def expect_size(path: Path, pixels: np.ndarray, width: int, height: int, reason: str) -> None:
@@ -63,9 +100,7 @@ def scaled_size(width: int, height: int, scale: float) -> tuple[int, int]:
         raise ConfigError(f"scene.scale: expected a number in (0, 1], found {scale}")
     size = round(width * scale), round(height * scale)
     if min(size) < 16:
-        raise ConfigError(
-            f"scene.scale: {scale} leaves {size[0]}x{size[1]} px of {width}x{height}; at least 16 px are needed"
-        )
+        raise ConfigError(f"scene.scale: {scale} leaves {size[0]}x{size[1]} px of {width}x{height}; at least 16 px are needed")
     return size
 
 

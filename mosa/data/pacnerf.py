@@ -11,6 +11,7 @@ import torch
 from mosa.data.footage import (
     WHITE,
     Footage,
+    even_times,
     frame_range,
     matrix,
     merge_time,
@@ -20,7 +21,8 @@ from mosa.data.footage import (
     stack_cameras,
     world_to_camera,
 )  # fmt: skip
-from mosa.data.images import composite, expect_size, read_image, resize, scaled_size
+from mosa.data.images import composite, expect_size, fill_holes, read_image, resize, scaled_size
+from mosa.data.matting import matte_from_plate
 from mosa.data.scene import assemble
 from mosa.errors import DataError
 from mosa.rendering.cameras import scale_cameras
@@ -43,24 +45,30 @@ PUBLISHED = {
 """Published parameters by folder name (SI, degrees): compared with at the end, never read by learning, in no config."""
 
 
-def read_pacnerf(path: str | Path, *, frames=None, scale: float = 1.0) -> Footage:
+def read_pacnerf(path: str | Path, *, frames=None, fps: float | None = None, scale: float = 1.0, fill: int = 0) -> Footage:
     """Footage of a folder in PAC-NeRF's layout; only all_data.json and data/ are opened.
 
-    frames: (first, last) or None for all that have a matte; scale: image scale in (0, 1].
+    Raw images without mattes are matted from the empty plates of their cameras. frames: (first, last) or None for all there
+    are; fps: given where the file's times are not to be used; scale: image scale in (0, 1]; fill: holes of mattes up to this
+    many pixels of the file are covered.
     Errors: DataError naming the file (missing, damaged, of another size, without a matte, with another time), ConfigError.
     """
     folder = Path(path)
     if not folder.is_dir():
-        raise DataError(
-            f"{folder}: folder not found; set scene.path to a scene in PAC-NeRF's layout (all_data.json, data/)"
-        )
+        raise DataError(f"{folder}: folder not found; set scene.path to a scene in PAC-NeRF's layout (all_data.json, data/)")
     listing = folder / "all_data.json"
     calibration, times = read_listing(listing)
     prefix, present = usable_frames(folder, calibration)
     numbers = frame_range([f for f in present if f in times], frames, str(folder / "data"))
+    if fps is None:
+        remedy = "correct them, restrict scene.frames, or set scene.fps"
+        even_times([times[f][0] for f in numbers], numbers, str(listing), remedy)
+    if prefix == "r":
+        print(f"{folder}: raw images without mattes; matted from the background plates r_<camera>_-1.png")
     images, mattes, full = [], [], None
     for camera in calibration:
         rows = []
+        plate = read_plate(folder / "data" / f"r_{camera}_-1.png") if prefix == "r" else None
         for frame in numbers:
             file = folder / "data" / f"{prefix}_{camera}_{frame}.png"
             if not file.is_file():
@@ -73,7 +81,8 @@ def read_pacnerf(path: str | Path, *, frames=None, scale: float = 1.0) -> Footag
                 full, first = pixels.shape[1::-1], file.name
                 size = scaled_size(*full, scale)
             expect_size(file, pixels, *full, reason=f"as {first}")
-            color, matte = split(file, pixels)
+            color, matte = split(file, pixels, plate)
+            matte = fill_holes(matte, fill)
             rows.append((resize(composite(color, matte, WHITE), *size), resize(matte, *size)))
         images.append(np.stack([r[0] for r in rows]))
         mattes.append(np.stack([r[1] for r in rows]))
@@ -98,25 +107,21 @@ def read_listing(path: Path) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], 
                 raise DataError(f"{where}: expected the keys file_path, time, c2w and intrinsic, found no {key}")
         found = NAME.search(str(entry["file_path"]))
         if found is None:
-            raise DataError(
-                f"{where}: expected a file_path like ./data/r_<camera>_<frame>.png, found {entry['file_path']!r}"
-            )
+            raise DataError(f"{where}: expected a file_path like ./data/r_<camera>_<frame>.png, found {entry['file_path']!r}")
         camera, frame = found[2], int(found[3])
         K = matrix(entry["intrinsic"], (3, 3), f"{where}, intrinsic")
         w2c = world_to_camera(matrix(entry["c2w"], (3, 4), f"{where}, c2w"), f"{where}, c2w")
         if not same_camera(calibration.setdefault(camera, (K, w2c)), K, w2c):
-            raise DataError(
-                f"{where}: camera {camera} has another pose or intrinsics than before; cameras must not move"
-            )
+            raise DataError(f"{where}: camera {camera} has another pose or intrinsics than before; cameras must not move")
         if frame >= 0:
             merge_time(times, frame, number(entry["time"], f"{where}, time"), where)
     return dict(sorted(calibration.items(), key=lambda item: int(item[0]))), times
 
 
 def usable_frames(folder: Path, calibration: dict) -> tuple[str, list[int]]:
-    """The kind of file to read (a, else m) and the frame numbers any camera has it for.
+    """The kind of file to read (a, else m, else r) and the frame numbers any camera has it for.
 
-    Errors: DataError where there is nothing, or only raw images without mattes.
+    Errors: DataError where there is nothing, or only raw images and a camera without its background plate.
     """
     present: dict[str, set[int]] = {"a": set(), "m": set(), "r": set()}
     if (folder / "data").is_dir():
@@ -128,26 +133,41 @@ def usable_frames(folder: Path, calibration: dict) -> tuple[str, list[int]]:
         if present[kind]:
             return kind, sorted(present[kind])
     if present["r"]:
-        raise DataError(
-            f"{folder / 'data'}: no mattes: expected a_<camera>_<frame>.png (RGBA) or m_<camera>_<frame>.png "
-            "(background painted white), found raw r_ images only; matte them first, "
-            "with the background plate r_<camera>_-1.png"
-        )
+        bare = [camera for camera in calibration if not (folder / "data" / f"r_{camera}_-1.png").is_file()]
+        if bare:
+            raise DataError(
+                f"{folder / 'data'}: no mattes: expected a_<camera>_<frame>.png (RGBA) or m_<camera>_<frame>.png "
+                f"(background painted white), found raw r_ images only, and no background plate r_{bare[0]}_-1.png to matte them "
+                f"with; add the plates of camera {', '.join(bare)}, or matte the images first"
+            )
+        return "r", sorted(present["r"])
     raise DataError(f"{folder / 'data'}: expected images a_<camera>_<frame>.png, found none")
 
 
-def split(file: Path, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colour (H, W, 3) and matte (H, W): the alpha channel of an a_ file, or what is not white in an m_ file."""
+def read_plate(file: Path) -> np.ndarray:
+    """Colour (H, W, 3) of an image without the object."""
+    pixels = read_image(file)
+    return np.ascontiguousarray(np.broadcast_to(pixels[..., :3], (*pixels.shape[:2], 3)))
+
+
+def split(file: Path, pixels: np.ndarray, plate: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """Colour (H, W, 3) and matte (H, W): the alpha channel of an a_ file, what is not white in an m_ file, what differs from the
+    plate in an r_ file."""
     if file.name.startswith("a_"):
         if pixels.shape[2] != 4:
             raise DataError(f"{file}: expected RGBA with the matte as alpha, found {pixels.shape[2]} channels")
         return pixels[..., :3], pixels[..., 3]
-    color = np.broadcast_to(pixels[..., :3], (*pixels.shape[:2], 3))
+    color = np.ascontiguousarray(np.broadcast_to(pixels[..., :3], (*pixels.shape[:2], 3)))
+    if plate is not None:
+        expect_size(file, pixels, *plate.shape[1::-1], reason="as the background plate of its camera")
+        return matte_from_plate(color, plate)
     return color, (color.min(-1) < WHITE_LEVEL).astype(np.float32)
 
 
-def load_pacnerf(path: str | Path, *, frames=None, scale: float = 1.0, name: str | None = None, **world) -> Scene:
+def load_pacnerf(
+    path: str | Path, *, frames=None, scale: float = 1.0, fill_holes: int = 0, name: str | None = None, **world
+) -> Scene:
     """Scene of a folder in PAC-NeRF's layout. `world`: the keyword arguments of `mosa.data.scene.assemble`."""
-    footage = read_pacnerf(path, frames=frames, scale=scale)
+    footage = read_pacnerf(path, frames=frames, fps=world.get("fps"), scale=scale, fill=fill_holes)
     folder = Path(path).resolve().name
     return assemble(footage, name=name or folder, known_parameters=PUBLISHED.get(folder, {}), **world)

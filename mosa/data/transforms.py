@@ -13,6 +13,7 @@ import torch
 from mosa.data.footage import (
     WHITE,
     Footage,
+    even_times,
     frame_range,
     matrix,
     number,
@@ -21,7 +22,7 @@ from mosa.data.footage import (
     stack_cameras,
     world_to_camera,
 )  # fmt: skip
-from mosa.data.images import composite, expect_size, read_image, resize, scaled_size
+from mosa.data.images import composite, expect_size, fill_holes, read_image, resize, scaled_size
 from mosa.data.scene import assemble
 from mosa.errors import DataError
 from mosa.rendering.cameras import scale_cameras
@@ -44,13 +45,14 @@ class Shot:
     camera: str | None
 
 
-def read_transforms(path: str | Path, *, frames=None, fps: float | None = None, scale: float = 1.0) -> Footage:
+def read_transforms(path: str | Path, *, frames=None, fps: float | None = None, scale: float = 1.0, fill: int = 0) -> Footage:
     """Footage of a transforms.json (path: the file, or its folder).
 
     Top level or per entry: fl_x, fl_y, cx, cy [px] or camera_angle_x [rad], w, h. Per entry: file_path (extension may be left
     out), transform_matrix (camera to world, OpenGL axes), time [s] (left out: the last number in the file name counts
-    frames at fps), mask_path (grey, white = object; left out: the image's alpha), camera (left out: entries with one
-    pose and intrinsics are one camera). Errors: DataError naming file and entry, ConfigError.
+    frames at fps; where all entries have one and fps is given, evenly spaced times take their place), mask_path (grey, white =
+    object; left out: the image's alpha), camera (left out: entries with one pose and intrinsics are one camera). fill: holes
+    of mattes up to this many pixels of the file are covered. Errors: DataError naming file and entry, ConfigError.
     """
     file = Path(path)
     file = file / "transforms.json" if file.is_dir() or not file.suffix else file
@@ -59,11 +61,16 @@ def read_transforms(path: str | Path, *, frames=None, fps: float | None = None, 
     cameras, by_camera = group(shots, file)
     times, table = synchronise(by_camera, fps)
     wanted = frame_range(list(range(len(times))), frames, str(file))
+    if fps is not None and all(entry.get("time") is not None for entry in document["frames"]):
+        times = [i / fps for i in range(len(times))]
+    remedy = "correct them, restrict scene.frames, or set scene.fps where every entry has a time"
+    even_times([times[f] for f in wanted], wanted, str(file), remedy)
     full, first, images, mattes = None, "", [], []
     for row in table:
         pictures = []
         for frame in wanted:
             color, matte = read_shot(row[frame])
+            matte = fill_holes(matte, fill)
             if full is None:
                 full, first = color.shape[1::-1], row[frame].image.name
                 size = scaled_size(*full, scale)
@@ -122,9 +129,7 @@ def counted_time(image: Path, fps: float | None, where: str) -> float:
     """Time [s] from the last number in a file name."""
     counter = re.findall(r"\d+", image.stem)
     if fps is None or not counter:
-        raise DataError(
-            f"{where}: expected a time in seconds, found none; add `time`, or number the files and set scene.fps"
-        )
+        raise DataError(f"{where}: expected a time in seconds, found none; add `time`, or number the files and set scene.fps")
     return int(counter[-1]) / fps
 
 
@@ -141,9 +146,7 @@ def group(shots: list[Shot], file: Path) -> tuple[dict[str, Shot], dict[str, lis
             same = (
                 n
                 for n, s in first.items()
-                if s.camera is None
-                and shot.intrinsics == s.intrinsics
-                and same_camera((np.eye(3), s.w2c), np.eye(3), shot.w2c)
+                if s.camera is None and shot.intrinsics == s.intrinsics and same_camera((np.eye(3), s.w2c), np.eye(3), shot.w2c)
             )
             name = next(same, str(len(first)))
         known = first.setdefault(name, shot)
@@ -173,9 +176,7 @@ def synchronise(by_camera: dict[str, list[Shot]], fps: float | None) -> tuple[li
         for shot in shots:
             index = int(np.abs(np.array(times) - shot.time).argmin())
             if row[index] is not None:
-                raise DataError(
-                    f"{shot.where}: camera {name} has two images at {shot.time:.6f} s, the other in {row[index].where}"
-                )
+                raise DataError(f"{shot.where}: camera {name} has two images at {shot.time:.6f} s, the other in {row[index].where}")
             row[index] = shot
         missing = [round(t, 6) for t, s in zip(times, row) if s is None]
         if missing:
@@ -197,8 +198,7 @@ def read_shot(shot: Shot) -> tuple[np.ndarray, np.ndarray]:
         return color, np.ascontiguousarray(mask[..., 0])
     if pixels.shape[2] != 4:
         raise DataError(
-            f"{shot.image}: no matte: expected an alpha channel, or a mask_path in {shot.where}, "
-            f"found {pixels.shape[2]} channels"
+            f"{shot.image}: no matte: expected an alpha channel, or a mask_path in {shot.where}, found {pixels.shape[2]} channels"
         )
     return color, np.ascontiguousarray(pixels[..., 3])
 
@@ -221,9 +221,16 @@ def camera_matrix(shot: Shot, width: int, height: int) -> np.ndarray:
 
 
 def load_transforms(
-    path: str | Path, *, frames=None, fps: float | None = None, scale: float = 1.0, name: str | None = None, **world
+    path: str | Path,
+    *,
+    frames=None,
+    fps: float | None = None,
+    scale: float = 1.0,
+    fill_holes: int = 0,
+    name: str | None = None,
+    **world,
 ) -> Scene:
     """Scene of a transforms.json. `world`: the keyword arguments of `mosa.data.scene.assemble`."""
-    footage = read_transforms(path, frames=frames, fps=fps, scale=scale)
+    footage = read_transforms(path, frames=frames, fps=fps, scale=scale, fill=fill_holes)
     folder = Path(path).resolve()
     return assemble(footage, name=name or (folder.parent.name if folder.suffix else folder.name), **world)

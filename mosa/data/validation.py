@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import hashlib
+import warnings
 
 import torch
 
+from mosa.data.agreement import check_agreement, holes_report
+from mosa.data.footage import TIME_JITTER
 from mosa.errors import DataError
 from mosa.types import Scene
 
-# relative jitter of frame times that still counts as a constant frame rate
-TIME_JITTER = 1e-3
-
 
 def validate(scene: Scene) -> Scene:
-    """The scene itself. Errors: DataError naming camera and frame, what was expected and what was found."""
+    """The scene itself. Errors: DataError naming camera and frame, what was expected and what was found.
+
+    Suspicious holes in the mattes of real footage are a warning: only who took it knows whether they are openings.
+    """
     V, T = len(scene.cameras), scene.frames
     H, W = scene.cameras.height, scene.cameras.width
     label = f"scene {scene.name} ({scene.sequence})"
@@ -29,12 +32,14 @@ def validate(scene: Scene) -> Scene:
         for v in range(V):
             for t in range(T):
                 if not bool(torch.isfinite(value[v, t]).all()):
-                    raise DataError(
-                        f"{label}: {name}: NaN or infinite pixels in camera {scene.cameras.names[v]}, frame {t}"
-                    )
+                    raise DataError(f"{label}: {name}: NaN or infinite pixels in camera {scene.cameras.names[v]}, frame {t}")
     check_cameras(scene, label)
     check_times(scene, label)
     check_mattes(scene, label)
+    check_agreement(scene, label)
+    holes = None if scene.synthetic else holes_report(scene)
+    if holes:
+        warnings.warn(f"{label}: {holes}", stacklevel=2)
     return scene
 
 
@@ -63,9 +68,7 @@ def check_times(scene: Scene, label: str) -> None:
     """Increasing times at one frame rate."""
     steps = scene.times.double().diff()
     if not bool(torch.isfinite(scene.times).all()) or not bool((steps > 0).all()):
-        raise DataError(
-            f"{label}: expected increasing frame times, found {[round(t, 5) for t in scene.times.tolist()]}"
-        )
+        raise DataError(f"{label}: expected increasing frame times, found {[round(t, 5) for t in scene.times.tolist()]}")
     # float32 keeps 7 digits of the time itself, which is more than the jitter only for steps far smaller than the time
     allowed = TIME_JITTER * float(steps.median()) + 2e-7 * float(scene.times.abs().max())
     worst = int((steps - steps.median()).abs().argmax())

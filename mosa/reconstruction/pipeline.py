@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from mosa.data.splats import load_ply
 from mosa.errors import ConfigError, DataError
 from mosa.reconstruction.cues import gaussian_cues, neighbourhood, neighbourhood_cues
 from mosa.reconstruction.dynamic import DynamicSettings, Scaffold, fit_motion
@@ -22,7 +23,8 @@ from mosa.reconstruction.filling import Particles, body_volume, carve, fill
 from mosa.reconstruction.hull import Volume, hull_bounds, hull_centroid, shave_ridges, visual_hull
 from mosa.reconstruction.modes import deformation_modes
 from mosa.reconstruction.observed import Windows, object_windows
-from mosa.reconstruction.static import FitSettings, fit_splats, inherited_colors, initial_splats, isotropic_covariances
+from mosa.reconstruction.static import FitSettings, fit_splats, inherited_colors, initial_splats
+from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import expected_depth, rasterize
 from mosa.types import Reconstruction, Scene, Splats
 
@@ -35,7 +37,8 @@ class ReconstructionSettings:
     """resolution: voxels along the object's longest side in the hull; ridge_passes: hull.shave_ridges; carve: empty what
     lies in front of the static Gaussians' depth by more than carve_tolerance [spacings]; points: static Gaussians;
     neighbours: of the least-squares deformation; cue: neighbourhood | gaussian (method.md, section 7); margin: px of the
-    windows around mattes."""
+    windows around mattes; splats: 3DGS PLY file of the object at frame 0, in the scene's world, that replaces the static
+    stage (None: fit it)."""
 
     resolution: int = 80
     ridge_passes: int = 24
@@ -45,6 +48,7 @@ class ReconstructionSettings:
     neighbours: int = 20
     cue: str = "neighbourhood"
     margin: int = 6
+    splats: str | None = None
     static: FitSettings = field(default_factory=FitSettings)
     appearance: FitSettings = field(default_factory=FitSettings)
     dynamic: DynamicSettings = field(default_factory=DynamicSettings)
@@ -146,12 +150,28 @@ def _tensors(splats: Splats) -> dict[str, Tensor]:
     return {f.name: getattr(splats, f.name).cpu() for f in fields(Splats)}
 
 
+def imported_splats(path: str, scene: Scene) -> Splats:
+    """Gaussians of a 3DGS PLY inside the scene's box, in the colours they have on average over directions.
+
+    Errors: DataError where the file is not one, or fewer than eight of its Gaussians lie in the box.
+    """
+    splats, _ = load_ply(path)
+    inside = ((splats.means > scene.box[0]) & (splats.means < scene.box[1])).all(1)
+    if int(inside.sum()) < 8:
+        low, high = (x.tolist() for x in (splats.means.amin(0), splats.means.amax(0)))
+        raise DataError(
+            f"{path}: expected Gaussians in the scene's box {scene.box.tolist()} m, found {int(inside.sum())} of {len(inside)}: "
+            f"the file spans {low} to {high}; bring it into the scene's world and metres first"
+        )
+    return Splats(*(getattr(splats, f.name)[inside] for f in fields(Splats)))
+
+
 def _render_still(splats: Splats, windows: Windows, background: Tensor) -> Tensor:
     state = torch.zeros(len(windows), dtype=torch.long, device=background.device)
     with torch.no_grad():
         return rasterize(
             splats.means[None],
-            isotropic_covariances(splats.scales.mean(1))[None],
+            covariance_from(splats.scales, splats.rotations)[None],
             splats.opacities,
             splats.colors[None],
             windows.cameras,
@@ -165,7 +185,7 @@ def fill_body(hull: Volume, static: Splats, windows: Windows, settings: Reconstr
     if settings.carve:
         state = torch.zeros(len(windows), dtype=torch.long, device=static.means.device)
         depth, alpha = expected_depth(
-            static.means[None], isotropic_covariances(static.scales.mean(1))[None], static.opacities, windows.cameras, state
+            static.means[None], covariance_from(static.scales, static.rotations)[None], static.opacities, windows.cameras, state
         )
         hull = carve(hull, depth, alpha, windows.cameras, tolerance=settings.carve_tolerance * spacing)
     return fill(hull, spacing=spacing)
@@ -202,6 +222,9 @@ def reconstruct(
         "settings": asdict(settings),
         "box": scene.box.tolist(),
     }
+    if settings.splats is not None:
+        imported = imported_splats(settings.splats, scene)
+        key["splats"] = hashlib.sha256(Path(settings.splats).read_bytes()).hexdigest()[:16]
     cache = _Cache(Path(cache_dir) if cache_dir is not None else None, key)
     hull = Volume(**cache.stage("hull", lambda: _volume_tensors(object_hull(scene, settings))))
     windows = object_windows(scene, views, frames, margin=settings.margin).to(device)
@@ -211,6 +234,9 @@ def reconstruct(
         return tqdm(total=total, desc=f"reconstruction: {name}", disable=not progress, leave=False)
 
     def static_stage() -> dict[str, Tensor]:
+        if settings.splats is not None:
+            cache.strip("static", still, _render_still(_on(imported, device), still, background))
+            return _tensors(imported)
         start = initial_splats(hull, still, count=settings.points, seed=seed)
         with bar("static Gaussians", settings.static.iterations) as steps:
             fitted = fit_splats(start, still, background, settings.static, move=True, seed=seed, progress=steps.update)

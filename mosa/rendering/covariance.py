@@ -89,3 +89,46 @@ def square_root(M: Tensor) -> Tensor:
     s = (xx * yy - xy * xy).sqrt()
     t = (xx + yy + 2 * s).sqrt()
     return torch.stack(((xx + s) / t, xy / t, (yy + s) / t), -1)
+
+
+def matrix_to_quaternion(R: Tensor) -> Tensor:
+    """Unit quaternions (..., 4), order w x y z with w >= 0, of rotation matrices (..., 3, 3).
+
+    The largest of the four components is computed from the trace or a diagonal entry, the others by division with it, so
+    that no rotation is near a singularity (Shepperd 1978). Not meant to be differentiated.
+    """
+    m = [[R[..., i, j] for j in range(3)] for i in range(3)]
+    squares = torch.stack(
+        (
+            1 + m[0][0] + m[1][1] + m[2][2],
+            1 + m[0][0] - m[1][1] - m[2][2],
+            1 - m[0][0] + m[1][1] - m[2][2],
+            1 - m[0][0] - m[1][1] + m[2][2],
+        ),
+        -1,
+    )  # 4 w^2, 4 x^2, 4 y^2, 4 z^2
+    wx, wy, wz = m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]
+    xy, xz, yz = m[0][1] + m[1][0], m[0][2] + m[2][0], m[1][2] + m[2][1]
+    rows = (
+        (squares[..., 0], wx, wy, wz),
+        (wx, squares[..., 1], xy, xz),
+        (wy, xy, squares[..., 2], yz),
+        (wz, xz, yz, squares[..., 3]),
+    )
+    products = torch.stack([torch.stack(row, -1) for row in rows], -2)  # 4 q q^T
+    largest = squares.argmax(-1)[..., None, None].expand(*squares.shape[:-1], 1, 4)
+    q = products.gather(-2, largest)[..., 0, :]
+    q = q / q.norm(dim=-1, keepdim=True)
+    return torch.where(q[..., :1] < 0, -q, q)
+
+
+def scales_and_rotations(covariances: Tensor) -> tuple[Tensor, Tensor]:
+    """Standard deviations (..., 3) [m], ascending, and quaternions (..., 4) wxyz of covariances (..., 3, 3) [m^2].
+
+    The inverse of `covariance_from` up to the order and sign of the axes; of the symmetric part, eigenvalues below 0
+    (rounding) taken as 0. Not meant to be differentiated.
+    """
+    values, vectors = torch.linalg.eigh(0.5 * (covariances + covariances.transpose(-1, -2)))
+    turn = torch.linalg.det(vectors).sign()
+    vectors = torch.cat((vectors[..., :2], vectors[..., 2:] * turn[..., None, None]), -1)
+    return values.clamp(min=0).sqrt(), matrix_to_quaternion(vectors)

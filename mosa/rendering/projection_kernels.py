@@ -21,10 +21,12 @@ ALPHA_MIN = 1.0 / 255.0
 
 @functools.cache
 def projection_kernels(dtype: type):
-    """(project, project_backward) for one Warp scalar type.
+    """(project, project_backward, camera_backward) for one Warp scalar type.
 
     Arrays are flat: `means`, `covariances` over S * N, everything per image over B * N. `settings` holds near
     plane, clamp margin (0.3), largest extent in standard deviations and 1 for the square INRIA extent.
+    camera_backward is launched only where cameras are learned: it repeats the work of project_backward instead of
+    storing it per image and Gaussian.
     """
     vec2 = wp.types.vector(length=2, dtype=dtype)
     vec3 = wp.types.vector(length=3, dtype=dtype)
@@ -32,6 +34,7 @@ def projection_kernels(dtype: type):
     mat22 = wp.types.matrix(shape=(2, 2), dtype=dtype)
     mat23 = wp.types.matrix(shape=(2, 3), dtype=dtype)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=dtype)
+    mat34 = wp.types.matrix(shape=(3, 4), dtype=dtype)
     mat44 = wp.types.matrix(shape=(4, 4), dtype=dtype)
 
     @wp.func
@@ -74,6 +77,68 @@ def projection_kernels(dtype: type):
     @wp.func
     def symmetric(A: mat33):
         return dtype(0.5) * (A + wp.transpose(A))
+
+    @wp.func
+    def covariance_gradient(c: vec3, g: vec3):
+        """dL/dSigma_2D = -P (dL/dP) P of a conic P = (xx, xy, yy), whose off-diagonal entry stands for two."""
+        half = dtype(0.5)
+        P = mat22(c[0], c[1], c[1], c[2])
+        return -P * mat22(g[0], half * g[1], half * g[1], g[2]) * P
+
+    @wp.func
+    def point_gradient(K: mat33, p: vec3, limits: vec4, gc: vec2, gJ: mat23):
+        """dL/dp of a point in camera axes, from those of its pixel and of J there."""
+        two = dtype(2.0)
+        fx = K[0, 0]
+        sk = K[0, 1]
+        fy = K[1, 1]
+        z = p[2]
+        z2 = z * z
+        sx = wp.clamp(p[0] / z, limits[0], limits[1])
+        sy = wp.clamp(p[1] / z, limits[2], limits[3])
+        gx = fx / z * gc[0]
+        gy = sk / z * gc[0] + fy / z * gc[1]
+        gz = -(fx * p[0] + sk * p[1]) / z2 * gc[0] - fy * p[1] / z2 * gc[1]
+        gz -= fx / z2 * gJ[0, 0] + sk / z2 * gJ[0, 1] + fy / z2 * gJ[1, 1]
+        gz += two * (fx * sx + sk * sy) / z2 * gJ[0, 2] + two * fy * sy / z2 * gJ[1, 2]
+        gtx = -fx / z2 * gJ[0, 2]
+        gty = -sk / z2 * gJ[0, 2] - fy / z2 * gJ[1, 2]
+        if p[0] / z == sx:
+            gx += gtx
+        else:
+            gz += sx * gtx
+        if p[1] / z == sy:
+            gy += gty
+        else:
+            gz += sy * gty
+        return vec3(gx, gy, gz)
+
+    @wp.func
+    def intrinsics_gradient(K: mat33, p: vec3, limits: vec4, gc: vec2, gJ: mat23):
+        """dL/dK of a pixel and of J, the limits of the clamp included: d limit/d cx = -1/fx, d limit/d fx = -limit/fx."""
+        zero = dtype(0.0)
+        fx = K[0, 0]
+        sk = K[0, 1]
+        fy = K[1, 1]
+        z = p[2]
+        u = p[0] / z
+        v = p[1] / z
+        sx = wp.clamp(u, limits[0], limits[1])
+        sy = wp.clamp(v, limits[2], limits[3])
+        gfx = u * gc[0] + (gJ[0, 0] - sx * gJ[0, 2]) / z
+        gsk = v * gc[0] + (gJ[0, 1] - sy * gJ[0, 2]) / z
+        gfy = v * gc[1] + (gJ[1, 1] - sy * gJ[1, 2]) / z
+        gcx = gc[0]
+        gcy = gc[1]
+        if u != sx:
+            gs = -fx / z * gJ[0, 2]
+            gcx -= gs / fx
+            gfx -= gs * sx / fx
+        if v != sy:
+            gs = -sk / z * gJ[0, 2] - fy / z * gJ[1, 2]
+            gcy -= gs / fy
+            gfy -= gs * sy / fy
+        return mat33(gfx, gsk, gcx, zero, gfy, gcy, zero, zero, zero)
 
     @wp.kernel(enable_backward=False, module="unique")
     def project(
@@ -177,41 +242,59 @@ def projection_kernels(dtype: type):
                 limits = slope_limits(K[b], width, height, settings[1])
                 T = jacobian(K[b], p, limits) * R
                 A = symmetric(covariances[s])
-                c = conics[i]
-                g = grad_conics[i]
-                half = dtype(0.5)
-                two = dtype(2.0)
-                P = mat22(c[0], c[1], c[1], c[2])
-                # dL/dSigma_2D = -P (dL/dP) P; the conic's off-diagonal entry stands for two
-                G = -P * mat22(g[0], half * g[1], half * g[1], g[2]) * P
+                G = covariance_gradient(conics[i], grad_conics[i])
                 grad_covariances[s] = grad_covariances[s] + wp.transpose(T) * G * T
-                gJ = two * G * T * A * wp.transpose(R)
-                gu = grad_centers[i][0]
-                gv = grad_centers[i][1]
-                fx = K[b][0, 0]
-                sk = K[b][0, 1]
-                fy = K[b][1, 1]
-                z = p[2]
-                z2 = z * z
-                sx = wp.clamp(p[0] / z, limits[0], limits[1])
-                sy = wp.clamp(p[1] / z, limits[2], limits[3])
-                gx = fx / z * gu
-                gy = sk / z * gu + fy / z * gv
-                gz = -(fx * p[0] + sk * p[1]) / z2 * gu - fy * p[1] / z2 * gv
-                gz -= fx / z2 * gJ[0, 0] + sk / z2 * gJ[0, 1] + fy / z2 * gJ[1, 1]
-                gz += two * (fx * sx + sk * sy) / z2 * gJ[0, 2] + two * fy * sy / z2 * gJ[1, 2]
-                gtx = -fx / z2 * gJ[0, 2]
-                gty = -sk / z2 * gJ[0, 2] - fy / z2 * gJ[1, 2]
-                if p[0] / z == sx:
-                    gx += gtx
-                else:
-                    gz += sx * gtx
-                if p[1] / z == sy:
-                    gy += gty
-                else:
-                    gz += sy * gty
-                grad_means[s] = grad_means[s] + wp.transpose(R) * vec3(gx, gy, gz)
+                gJ = dtype(2.0) * G * T * A * wp.transpose(R)
+                gp = point_gradient(K[b], p, limits, grad_centers[i], gJ)
+                grad_means[s] = grad_means[s] + wp.transpose(R) * gp
                 k = state_index[b] * opacity_stride + n
                 grad_opacities[k] = grad_opacities[k] + grad_weights[i]
 
-    return project, project_backward
+    @wp.kernel(enable_backward=False, module="unique")
+    def camera_backward(
+        means: wp.array(dtype=vec3),
+        covariances: wp.array(dtype=mat33),
+        K: wp.array(dtype=mat33),
+        w2c: wp.array(dtype=mat44),
+        state_index: wp.array(dtype=wp.int32),
+        settings: vec4,
+        count: int,
+        width: int,
+        height: int,
+        chunks: int,
+        conics: wp.array(dtype=vec3),
+        rects: wp.array(dtype=wp.vec4i),
+        grad_centers: wp.array(dtype=vec2),
+        grad_conics: wp.array(dtype=vec3),
+        # out: partial sums over every `chunks`-th Gaussian, (B * chunks)
+        grad_w2c: wp.array(dtype=mat34),
+        grad_K: wp.array(dtype=mat33),
+    ):
+        b, first = wp.tid()
+        R = rotation(w2c[b])
+        limits = slope_limits(K[b], width, height, settings[1])
+        gw = mat34()
+        gk = mat33()
+        for n in range(first, count, chunks):
+            i = b * count + n
+            rect = rects[i]
+            if rect[1] > rect[0] and rect[3] > rect[2]:
+                s = state_index[b] * count + n
+                m = means[s]
+                p = to_camera(w2c[b], m)
+                J = jacobian(K[b], p, limits)
+                # Sigma_2D = T A T^T with T = J R
+                gT = dtype(2.0) * covariance_gradient(conics[i], grad_conics[i]) * (J * R) * symmetric(covariances[s])
+                gJ = gT * wp.transpose(R)
+                gp = point_gradient(K[b], p, limits, grad_centers[i], gJ)
+                gR = wp.transpose(J) * gT + wp.outer(gp, m)
+                gw += mat34(
+                    gR[0, 0], gR[0, 1], gR[0, 2], gp[0],
+                    gR[1, 0], gR[1, 1], gR[1, 2], gp[1],
+                    gR[2, 0], gR[2, 1], gR[2, 2], gp[2],
+                )  # fmt: skip
+                gk += intrinsics_gradient(K[b], p, limits, grad_centers[i], gJ)
+        grad_w2c[b * chunks + first] = gw
+        grad_K[b * chunks + first] = gk
+
+    return project, project_backward, camera_backward

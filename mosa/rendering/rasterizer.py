@@ -1,237 +1,41 @@
-"""Differentiable rasterisation of 3D Gaussians on CPU and CUDA: Warp kernels behind one torch autograd function.
+"""Differentiable rasterisation of 3D Gaussians: one call for both backends, and depth.
 
-Conventions of rendering.md (gsplat by default, INRIA by `preset`); gradients to means, covariances, opacities and
-features by hand-written adjoints, none to cameras. Nothing but the projected Gaussians, final transmittance and the
-rank at which a pixel ended is kept for the backward pass.
+`warp` (mosa/rendering/splatting.py) runs everywhere in float32 and float64; `gsplat` (gsplat_backend.py) is a
+CUDA package that one may choose instead. Conventions of rendering.md (gsplat's by default, INRIA's by `preset`).
 """
 
-import functools
-from dataclasses import dataclass
+from __future__ import annotations
 
 import torch
-import warp as wp
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from mosa.errors import ConfigError, DataError
-from mosa.rendering.covariance import CLAMP_MARGIN
-from mosa.rendering.projection_kernels import projection_kernels
-from mosa.rendering.raster_kernels import raster_kernels
-from mosa.rendering.tile_kernels import tile_kernels, tile_lists
+from mosa.rendering import gsplat_backend
+from mosa.rendering.splatting import PRESETS, SCALARS, Geometry, Splat, start_warp
 from mosa.types import Cameras
 
+BACKENDS = ("warp", "gsplat")
 
-@dataclass(frozen=True)
-class Preset:
-    """near: nearest depth [m]; extent: standard deviations; square: INRIA's square extent, whole tiles; alpha_max:
-    cap of alpha."""
-
-    near: float
-    extent: float
-    square: bool
-    alpha_max: float
+_backend = "warp"
 
 
-PRESETS = {"gsplat": Preset(0.01, 3.33, False, 0.999), "inria": Preset(0.2, 3.0, True, 0.99)}
+def use_backend(name: str) -> None:
+    """Choose the backend of all later calls of `rasterize` in this process that do not name one.
 
-_SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
-
-
-@functools.cache
-def _vector(length: int, scalar: type) -> type:
-    return wp.types.vector(length=length, dtype=scalar)
-
-
-@functools.cache
-def _matrix(rows: int, scalar: type) -> type:
-    return wp.types.matrix(shape=(rows, rows), dtype=scalar)
-
-
-@functools.cache
-def _start_warp() -> None:
-    wp.config.quiet = True
-    wp.init()
+    gsplat then serves the calls it has kernels for (CUDA, float32, preset gsplat, no gradient to K), warp the others.
+    Errors: ConfigError for an unknown name, and for gsplat where it cannot run, with the reason.
+    """
+    global _backend
+    if name not in BACKENDS:
+        raise ConfigError(f"rendering.backend: expected one of {', '.join(BACKENDS)}, found {name!r}")
+    if name == "gsplat":
+        reason = gsplat_backend.why_unavailable()
+        if reason:
+            raise ConfigError(f"rendering.backend: gsplat cannot be used here: {reason}; choose rendering=warp")
+    _backend = name
 
 
-@dataclass(frozen=True)
-class _Geometry:
-    """What a call fixes besides its differentiable inputs."""
-
-    K: Tensor
-    w2c: Tensor
-    state_index: Tensor
-    width: int
-    height: int
-    preset: Preset
-    scan: str
-
-
-class _Arrays:
-    """Flat Warp views of torch tensors of one scalar type."""
-
-    def __init__(self, dtype: torch.dtype):
-        self.scalar = _SCALARS[dtype]
-
-    def scalars(self, x: Tensor) -> wp.array:
-        return wp.from_torch(x.view(-1), dtype=self.scalar)
-
-    def vectors(self, x: Tensor) -> wp.array:
-        return wp.from_torch(x.view(-1, x.shape[-1]), dtype=_vector(x.shape[-1], self.scalar))
-
-    def matrices(self, x: Tensor) -> wp.array:
-        return wp.from_torch(x.view(-1, *x.shape[-2:]), dtype=_matrix(x.shape[-1], self.scalar))
-
-
-def _integers(x: Tensor) -> wp.array:
-    return wp.from_torch(x.view(-1), dtype=wp.int32)
-
-
-class _Rasterize(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, means: Tensor, covariances: Tensor, opacities: Tensor, features: Tensor, geometry: _Geometry):
-        g, preset = geometry, geometry.preset
-        means, covariances, opacities, features = (x.detach().contiguous() for x in (means, covariances, opacities, features))
-        images, count, channels = len(g.state_index), means.shape[1], features.shape[-1]
-        arrays, device = _Arrays(means.dtype), wp.device_from_torch(means.device)
-        centers, conics = means.new_zeros(images, count, 2), means.new_zeros(images, count, 3)
-        weights, depths = means.new_empty(images, count), means.new_empty(images, count)
-        rects = torch.empty(images, count, 4, dtype=torch.int32, device=means.device)
-        rects_wp = wp.from_torch(rects.view(-1, 4), dtype=wp.vec4i)
-        settings = _vector(4, arrays.scalar)(preset.near, CLAMP_MARGIN, preset.extent, float(preset.square))
-        opacity_stride = count if opacities.dim() == 2 else 0
-        project, _ = projection_kernels(arrays.scalar)
-        wp.launch(
-            project,
-            dim=(images, count),
-            inputs=[
-                arrays.vectors(means),
-                arrays.matrices(covariances),
-                arrays.scalars(opacities),
-                opacity_stride,
-                arrays.matrices(g.K),
-                arrays.matrices(g.w2c),
-                _integers(g.state_index),
-                settings,
-                count,
-                g.width,
-                g.height,
-            ],
-            outputs=[
-                arrays.vectors(centers),
-                arrays.vectors(conics),
-                arrays.scalars(weights),
-                arrays.scalars(depths),
-                rects_wp,
-            ],
-            device=device,
-        )
-        order = depths.argsort(dim=1, stable=True).to(torch.int32)
-        transmittance = means.new_ones(images, g.height, g.width)
-        image = means.new_zeros(images, g.height, g.width, channels)
-        ends = torch.full((images, g.height, g.width), count, dtype=torch.int32, device=means.device)
-        feature_stride = count if features.shape[0] > 1 else 0
-        shared = [arrays.vectors(centers), arrays.vectors(conics), arrays.scalars(weights)]
-        tail = [arrays.vectors(features), feature_stride, arrays.scalar(preset.alpha_max), count, g.width, g.height]
-        outputs = [arrays.scalars(transmittance), arrays.vectors(image), _integers(ends)]
-        if g.scan == "gaussian":
-            lists = ()
-            kernel, _ = raster_kernels(arrays.scalar, channels)
-            wp.launch(kernel, dim=images, inputs=[_integers(order), *shared, rects_wp, *tail], outputs=outputs, device=device)
-        else:
-            lists = tile_lists(order, rects, g.width, g.height)
-            kernel, _ = tile_kernels(arrays.scalar, channels)
-            wp.launch(
-                kernel,
-                dim=(images, g.height, g.width),
-                inputs=[*map(_integers, lists), *shared, rects_wp, *tail],
-                outputs=outputs,
-                device=device,
-            )
-        ctx.save_for_backward(
-            means, covariances, opacities, features, centers, conics, weights, rects, order, transmittance, ends, *lists
-        )
-        ctx.geometry = geometry
-        return image, 1 - transmittance
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, grad_image: Tensor, grad_alpha: Tensor):
-        means, covariances, opacities, features, centers, conics, weights, rects, order, final, ends, *lists = ctx.saved_tensors
-        g, preset = ctx.geometry, ctx.geometry.preset
-        images, count, channels = len(g.state_index), means.shape[1], features.shape[-1]
-        arrays, device = _Arrays(means.dtype), wp.device_from_torch(means.device)
-        rects_wp = wp.from_torch(rects.view(-1, 4), dtype=wp.vec4i)
-        transmittance, behind = final.clone(), -grad_alpha * final
-        grad_image = grad_image.contiguous()
-        grad_centers, grad_conics = torch.zeros_like(centers), torch.zeros_like(conics)
-        grad_weights, grad_features = torch.zeros_like(weights), torch.zeros_like(features)
-        feature_stride = count if features.shape[0] > 1 else 0
-        shared = [
-            arrays.vectors(centers),
-            arrays.vectors(conics),
-            arrays.scalars(weights),
-            rects_wp,
-            arrays.vectors(features),
-            feature_stride,
-            arrays.scalar(preset.alpha_max),
-            count,
-            g.width,
-            g.height,
-            _integers(ends),
-            arrays.vectors(grad_image),
-            arrays.scalars(transmittance),
-            arrays.scalars(behind),
-        ]
-        outputs = [
-            arrays.vectors(grad_centers),
-            arrays.vectors(grad_conics),
-            arrays.scalars(grad_weights),
-            arrays.vectors(grad_features),
-        ]
-        if g.scan == "gaussian":
-            _, kernel = raster_kernels(arrays.scalar, channels)
-            wp.launch(kernel, dim=images, inputs=[_integers(order), *shared], outputs=outputs, device=device)
-        else:
-            _, kernel = tile_kernels(arrays.scalar, channels)
-            wp.launch(
-                kernel,
-                dim=(images, g.height, g.width),
-                inputs=[*map(_integers, lists), *shared],
-                outputs=outputs,
-                device=device,
-            )
-        grad_means, grad_covariances = torch.zeros_like(means), torch.zeros_like(covariances)
-        grad_opacities = torch.zeros_like(opacities)
-        settings = _vector(4, arrays.scalar)(preset.near, CLAMP_MARGIN, preset.extent, float(preset.square))
-        _, kernel = projection_kernels(arrays.scalar)
-        wp.launch(
-            kernel,
-            dim=count,
-            inputs=[
-                arrays.vectors(means),
-                arrays.matrices(covariances),
-                count if opacities.dim() == 2 else 0,
-                arrays.matrices(g.K),
-                arrays.matrices(g.w2c),
-                _integers(g.state_index),
-                settings,
-                count,
-                g.width,
-                g.height,
-                images,
-                arrays.vectors(conics),
-                rects_wp,
-                *outputs[:3],
-            ],
-            outputs=[arrays.vectors(grad_means), arrays.matrices(grad_covariances), arrays.scalars(grad_opacities)],
-            device=device,
-        )
-        return grad_means, grad_covariances, grad_opacities, grad_features, None
-
-
-def _check(
-    means: Tensor, covariances: Tensor, opacities: Tensor, features: Tensor, cameras: Cameras, state_index: Tensor
-) -> None:
+def _check(means: Tensor, covariances: Tensor, opacities: Tensor, features: Tensor, cameras: Cameras, state_index: Tensor) -> None:
     """Shapes, types and devices of `rasterize`; ConfigError names the first that is off."""
     states, count = (means.shape[0], means.shape[1]) if means.dim() == 3 else (-1, -1)
     images = len(cameras)
@@ -247,12 +51,16 @@ def _check(
             raise ConfigError(f"rasterize: {name} has shape {tuple(value.shape)}, expected one of {shapes}, none empty")
         if value.device != means.device:
             raise ConfigError(f"rasterize: {name} is on {value.device}, means on {means.device}; move all to one device")
-        if name != "state_index" and (value.dtype != means.dtype or value.dtype not in _SCALARS):
+        if name != "state_index" and (value.dtype != means.dtype or value.dtype not in SCALARS):
             raise ConfigError(f"rasterize: {name} is {value.dtype}, means {means.dtype}; use one of float32, float64 for all")
-    for name, value in (("means", means), ("covariances", covariances), ("opacities", opacities), ("features", features)):
-        if not bool(value.detach().isfinite().all()):
-            where = (~value.detach().isfinite()).nonzero()[0].tolist()
-            raise DataError(f"rasterize: {name}{where} is not finite; it would silently vanish from the image")
+    numbers = {"means": means, "covariances": covariances, "opacities": opacities, "features": features}
+    if not bool(torch.stack([value.detach().isfinite().all() for value in numbers.values()]).all()):  # one wait for the GPU
+        name = next(name for name, value in numbers.items() if not bool(value.detach().isfinite().all()))
+        where = (~numbers[name].detach().isfinite()).nonzero()[0].tolist()
+        raise DataError(f"rasterize: {name}{where} is not finite; it would silently vanish from the image")
+    for name, value, size in (("K", cameras.K, 3), ("w2c", cameras.w2c, 4)):
+        if tuple(value.shape) != (images, size, size):
+            raise ConfigError(f"rasterize: cameras.{name} has shape {tuple(value.shape)}, expected {(images, size, size)}")
     if not means.is_cuda and (int(state_index.min()) < 0 or int(state_index.max()) >= states):
         raise ConfigError(f"rasterize: state_index reaches outside the {states} states")
 
@@ -268,48 +76,89 @@ def rasterize(
     preset: str = "gsplat",
     *,
     scan: str | None = None,
+    backend: str | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Composite N Gaussians in S states into B images of any number C of channels.
 
-    means: (S, N, 3) [m]; covariances: (S, N, 3, 3) [m^2], only the symmetric part counts; opacities: (N,) or (S, N)
-    in [0, 1]; features: (B, N, C) or (1, N, C) shared by all images; cameras: B of them; state_index: (B,) state
+    means: (S, N, 3) [m]; covariances: (S, N, 3, 3) [m^2], only the symmetric part counts (`covariance_from` makes
+    them of scales and rotations); opacities: (N,) or (S, N) in [0, 1]; features: (B, N, C) or (1, N, C) shared by
+    all images (`view_colors` makes colours of spherical harmonics); cameras: B of them; state_index: (B,) state
     that image b shows; background: (C,) or None for zeros; preset: gsplat | inria (rendering.md); scan: gaussian
-    (default on CPU) | tile (default on CUDA, and what a CPU test compares with). The dtype of the inputs, float32
-    or float64, is that of the computation.
+    (default on CPU) | tile (default on CUDA, and what a CPU test compares with); backend: warp | gsplat, None for
+    that of `use_backend`. The dtype of the inputs, float32 or float64, is that of the computation.
 
     Returns image (B, H, W, C) = sum_i w_i c_i + (1 - alpha) background and alpha (B, H, W), with gradients to the
-    first four. Errors: ConfigError naming the argument of wrong shape, dtype, device, and for an unknown preset.
-    Source: Kerbl et al. 2023; conventions of gsplat (Ye et al. 2024).
+    first four and to the cameras' w2c (its upper 3 x 4 entries, each for itself) and K.
+    Errors: ConfigError naming the argument of wrong shape, dtype, device, for an unknown preset, and for a backend
+    that cannot do what is asked. Source: Kerbl et al. 2023; conventions of gsplat (Ye et al. 2024).
     """
     if preset not in PRESETS:
         raise ConfigError(f"rasterize: unknown preset '{preset}', expected one of {sorted(PRESETS)}")
-    scan = scan or ("tile" if means.is_cuda else "gaussian")
-    if scan not in ("gaussian", "tile"):
+    if scan not in (None, "gaussian", "tile"):
         raise ConfigError(f"rasterize: unknown scan '{scan}', expected gaussian or tile")
+    if backend not in (None, *BACKENDS):
+        raise ConfigError(f"rasterize: unknown backend '{backend}', expected one of {', '.join(BACKENDS)}")
     _check(means, covariances, opacities, features, cameras, state_index)
-    _start_warp()
-    geometry = _Geometry(
-        cameras.K.detach().to(means).contiguous(),
-        cameras.w2c.detach().to(means).contiguous(),
+    if (backend or _backend) == "gsplat":
+        obstacle = gsplat_backend.obstacle(means, cameras, preset, scan)
+        if obstacle is None:
+            image, alpha = gsplat_backend.splat(means, covariances, opacities, features, cameras, state_index)
+            return _over(image, alpha, background), alpha
+        if backend is not None:
+            raise ConfigError(f"rasterize: the gsplat backend cannot be used for this call: {obstacle}; use backend='warp'")
+    start_warp()
+    geometry = Geometry(
         state_index.to(torch.int32).contiguous(),
         cameras.width,
         cameras.height,
         PRESETS[preset],
-        scan,
+        scan or ("tile" if means.is_cuda else "gaussian"),
     )
-    image, alpha = _Rasterize.apply(means, covariances, opacities, features, geometry)
-    if background is not None:
-        image = image + (1 - alpha)[..., None] * background.to(image)
-    return image, alpha
+    image, alpha = Splat.apply(means, covariances, opacities, features, cameras.K.to(means), cameras.w2c.to(means), geometry)
+    return _over(image, alpha, background), alpha
 
 
-@torch.no_grad()
+def _over(image: Tensor, alpha: Tensor, background: Tensor | None) -> Tensor:
+    return image if background is None else image + (1 - alpha)[..., None] * background.to(image)
+
+
+def depth_channel(means: Tensor, cameras: Cameras, state_index: Tensor) -> Tensor:
+    """Depth of every Gaussian's centre along the line of sight of every image as a feature (B, N, 1) [m]."""
+    w2c = cameras.w2c.to(means)
+    return (means[state_index] * w2c[:, None, 2, :3]).sum(-1, keepdim=True) + w2c[:, None, 2, 3:]
+
+
+def rasterize_with_depth(
+    means: Tensor,
+    covariances: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    cameras: Cameras,
+    state_index: Tensor,
+    background: Tensor | None = None,
+    preset: str = "gsplat",
+    *,
+    backend: str | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`rasterize` with depth in the same pass: image (B, H, W, C), alpha (B, H, W), depth sum_i w_i z_i (B, H, W) [m].
+
+    Depth over alpha is the expected depth. Gradients and errors as of `rasterize`; depth has gradients to means,
+    covariances, opacities and cameras.
+    """
+    depths = depth_channel(means, cameras, state_index)
+    stacked = torch.cat((features.expand(len(cameras), -1, -1), depths), -1)
+    image, alpha = rasterize(means, covariances, opacities, stacked, cameras, state_index, preset=preset, backend=backend)
+    return _over(image[..., :-1], alpha, background), alpha, image[..., -1]
+
+
 def expected_depth(
     means: Tensor, covariances: Tensor, opacities: Tensor, cameras: Cameras, state_index: Tensor, preset: str = "gsplat"
 ) -> tuple[Tensor, Tensor]:
-    """Mean depth sum_i w_i z_i / alpha [m] per pixel, infinite where nothing is seen, and alpha; both (B, H, W). No
-    gradient."""
-    w2c = cameras.w2c.to(means)
-    depth = (means[state_index] * w2c[:, None, 2, :3]).sum(-1, keepdim=True) + w2c[:, None, 2, 3:]
-    image, alpha = rasterize(means, covariances, opacities, depth.contiguous(), cameras, state_index, preset=preset)
-    return torch.where(alpha > 0, image[..., 0] / alpha.clamp(min=1e-12), torch.inf), alpha
+    """Mean depth sum_i w_i z_i / alpha [m] per pixel, infinite where nothing is seen, and alpha; both (B, H, W).
+
+    Gradients to means, covariances, opacities and cameras where something is seen.
+    """
+    depths = depth_channel(means, cameras, state_index)
+    image, alpha = rasterize(means, covariances, opacities, depths, cameras, state_index, preset=preset)
+    seen = alpha > 0
+    return torch.where(seen, image[..., 0] / torch.where(seen, alpha, torch.ones_like(alpha)), torch.inf), alpha

@@ -17,15 +17,16 @@ def visible_covariance(mean: Tensor, covariance: Tensor, K: Tensor, w2c: Tensor,
     camera."""
     p = mean @ w2c[:3, :3].T + w2c[:3, 3]
     z = p[:, 2]
-    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    fx, skew, fy, cx, cy = K[0, 0], K[0, 1], K[1, 1], K[0, 2], K[1, 2]
     tan_x, tan_y = 0.5 * width / fx, 0.5 * height / fy
     tx = z * torch.clamp(p[:, 0] / z, -cx / fx - 0.3 * tan_x, (width - cx) / fx + 0.3 * tan_x)
     ty = z * torch.clamp(p[:, 1] / z, -cy / fy - 0.3 * tan_y, (height - cy) / fy + 0.3 * tan_y)
     zero = torch.zeros_like(z)
-    J = torch.stack((torch.stack((fx / z, zero, -fx * tx / z**2), -1), torch.stack((zero, fy / z, -fy * ty / z**2), -1)), -2)
+    first = torch.stack((fx / z, skew / z, -(fx * tx + skew * ty) / z**2), -1)
+    J = torch.stack((first, torch.stack((zero, fy / z, -fy * ty / z**2), -1)), -2)
     T = J @ w2c[:3, :3]
     symmetric = 0.5 * (covariance + covariance.transpose(-1, -2))
-    center = torch.stack((fx * p[:, 0] / z + cx, fy * p[:, 1] / z + cy), -1)
+    center = torch.stack(((fx * p[:, 0] + skew * p[:, 1]) / z + cx, fy * p[:, 1] / z + cy), -1)
     return center, T @ symmetric @ T.transpose(-1, -2) + 0.3 * torch.eye(2).to(T), z
 
 

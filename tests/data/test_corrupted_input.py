@@ -80,10 +80,13 @@ CORRUPTIONS = {
     "time NaN": (listing(lambda d: d[1].update(time=float("nan"))), "entry 1, time: expected a finite number"),
     "time mismatch": (listing(lambda d: first_with(d, "r_1_3.png").update(time=0.2)), "frame 3 has time 0.200000 s, but 0.125"),
     "time uneven": (
-        listing(lambda d: [e.update(time=0.5) for e in d if e["file_path"].endswith("_4.png")]), "expected one frame rate",
+        listing(lambda d: [e.update(time=0.5) for e in d if e["file_path"].endswith("_4.png")]),
+        r"all_data.json: expected one frame rate, found the times 0, 0.0416667, 0.0833333, 0.125, 0.5 s: 0.375000 s between "
+        "frames 3 and 4, 0.041667 s elsewhere; .*scene.fps",
     ),
     "time backwards": (
-        listing(lambda d: [e.update(time=0.01) for e in d if e["file_path"].endswith("_4.png")]), "increasing frame times",
+        listing(lambda d: [e.update(time=0.01) for e in d if e["file_path"].endswith("_4.png")]),
+        "all_data.json: expected increasing frame times, found 0, 0.0416667, 0.0833333, 0.125, 0.01 s",
     ),
     "view missing": (delete("data/a_1_2.png"), "a_1_2.png: image not found"),
     "frame missing": (delete("data/a_0_2.png", "data/a_1_2.png", "data/a_2_2.png"), r"frames \[2\] are missing"),
@@ -92,7 +95,11 @@ CORRUPTIONS = {
     "PNG empty": (lambda f: (f / "data" / "a_1_2.png").write_bytes(b""), "a_1_2.png: expected a readable image"),
     "image size": (image("a_2_1.png", lambda p: p[:30]), "a_2_1.png: expected 32x32 px .*found 32x30"),
     "no alpha": (image("a_2_1.png", lambda p: p[..., :3]), "a_2_1.png: expected RGBA"),
-    "no mattes": (raw_only, "matting|no mattes.*background plate"),
+    "no mattes": (raw_only, "no mattes.*no background plate r_0_-1.png .*plates of camera 0, 1, 2"),
+    "plate of another size": (
+        lambda f: (raw_only(f), [iio.imwrite(f / "data" / f"r_{v}_-1.png", np.zeros((30, 32, 3), np.uint8)) for v in range(3)]),
+        "r_0_0.png: expected 32x30 px .as the background plate of its camera., found 32x32",
+    ),
     "no images": (lambda f: shutil.rmtree(f / "data"), "found none"),
     "matte empty": (image("a_1_0.png", lambda p: p * np.array([1, 1, 1, 0], np.uint8)), "camera 1: the matte .* is empty"),
     "resolution": (
@@ -126,6 +133,10 @@ TRANSFORMS = {
     "no time": (entries(lambda d: d["frames"][3].pop("time")), r"frames\[3\]: expected a time"),
     "file missing": (delete("images/1_002.png"), "1_002.*image not found"),
     "view missing": (entries(lambda d: d["frames"].pop(7)), "camera 1 has no image at"),
+    "times uneven": (
+        entries(lambda d: [e.update(time=e["time"] + 0.01) for e in d["frames"] if e["file_path"].endswith("_003.png")]),
+        "transforms.json: expected one frame rate, found the times 0, 0.0416667, 0.0833333, 0.135, 0.166667 s",
+    ),
     "time off": (entries(lambda d: d["frames"][7].update(time=0.1)), "has no image at"),
     "frame twice": (entries(lambda d: d["frames"].append(d["frames"][0])), "camera 0 has two images at 0.000000 s"),
     "camera moves": (entries(lambda d: d["frames"][3]["transform_matrix"][0].__setitem__(3, 5.0)), "camera 0 has another pose"),
@@ -250,3 +261,19 @@ def test_mistaken_keys(pacnerf_folder, keys, message):
 def test_validation_of_scenes_from_anywhere(blocks, change, message):
     with pytest.raises(DataError, match=message):
         validate(change(blocks))
+
+
+def test_uneven_times_can_be_overridden(pacnerf_folder, transforms_folder):
+    """The way out that the message names."""
+    listing(lambda d: [e.update(time=0.5) for e in d if e["file_path"].endswith("_4.png")])(pacnerf_folder)
+    scene = load_scene(format="pacnerf", path=str(pacnerf_folder), fps=24.0, **WORLD)
+    assert torch.allclose(scene.times, torch.arange(5) / 24)
+    entries(lambda d: [e.update(time=0.2) for e in d["frames"] if e["file_path"].endswith("_004.png")])(transforms_folder)
+    scene = load_scene(format="transforms", path=str(transforms_folder), fps=24.0, **WORLD)
+    assert torch.allclose(scene.times, torch.arange(5) / 24)
+
+
+@pytest.mark.parametrize("value", [-1, 2.5, True])
+def test_fill_holes_is_a_number_of_pixels(pacnerf_folder, value):
+    with pytest.raises(ConfigError, match=r"scene.fill_holes: expected a number of pixels"):
+        load_scene(format="pacnerf", path=str(pacnerf_folder), fill_holes=value, **WORLD)

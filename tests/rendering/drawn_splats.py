@@ -55,3 +55,41 @@ def gradients(scene, function, **options):
     """Gradients of `objective` with respect to the four differentiable inputs."""
     leaves = {name: getattr(scene, name).detach().clone().requires_grad_() for name in NAMES}
     return torch.autograd.grad(objective(*render(scene, function, **leaves, **options)), list(leaves.values()))
+
+
+def dense():
+    """Large, nearly opaque Gaussians: alpha reaches its cap and pixels stop early."""
+    scene = draw(12, states=2, images=2, size=0.25, seed=11)
+    scene.opacities = 0.9 + 0.1 * (scene.opacities - 0.15) / 0.8
+    scene.opacities[::3] = 1.0
+    return scene
+
+
+def edge():
+    """Some Gaussians behind or beside a camera, where J is evaluated at the clamped direction, yet reaching into
+    the image."""
+    scene = draw(12, states=1, images=2, size=0.3, seed=2)
+    scene.means = 1.6 * scene.means
+    eye = -scene.cameras.w2c[0, :3, :3].T @ scene.cameras.w2c[0, :3, 3]
+    scene.means[0, 0] = 1.2 * eye
+    return scene
+
+
+CASES = {"sparse": lambda: draw(12, images=2, seed=1), "dense": dense, "edge": edge}
+
+
+def slopes(function, value):
+    """Derivatives of a scalar function of no arguments by the entries of `value`, which it reads: fourth-order differences in
+    float64. Zero where an entry does not matter."""
+    step = 1e-6 * float(value.abs().mean())
+    result = torch.zeros_like(value)
+    flat, out = value.view(-1), result.view(-1)
+    for i in range(len(flat)):
+        start = flat[i].clone()
+        sides = []
+        for k in (-2, -1, 1, 2):
+            flat[i] = start + k * step
+            sides.append(function())
+        flat[i] = start
+        out[i] = (sides[0] - 8 * sides[1] + 8 * sides[2] - sides[3]) / (12 * step)
+    return result

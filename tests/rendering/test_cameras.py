@@ -9,9 +9,11 @@ from mosa.errors import ConfigError, DataError
 from mosa.rendering.cameras import crop_boxes, crop_cameras, crop_images, look_at, project, rays, scale_cameras
 from mosa.rendering.covariance import (
     covariance_from,
+    matrix_to_quaternion,
     project_gaussians,
     quaternion_multiply,
     quaternion_to_matrix,
+    scales_and_rotations,
     square_root,
 )
 from mosa.rendering.rasterizer import rasterize
@@ -128,3 +130,16 @@ def test_square_root_and_its_gradient_at_equal_eigenvalues():
     gradient = torch.autograd.functional.jacobian(square_root, round_one)
     torch.testing.assert_close(gradient, torch.eye(3).double() / 4)
     assert torch.autograd.gradcheck(square_root, (M.flatten(1)[:5, [0, 1, 3]].requires_grad_(),), rtol=1e-6)
+
+
+def test_scales_and_rotations_rebuild_the_covariance():
+    """Round, flat and needle-like ones, half turns about every axis included."""
+    g = torch.Generator().manual_seed(2)
+    q = torch.cat((torch.randn(40, 4, generator=g, dtype=torch.float64), torch.eye(4).double()))
+    torch.testing.assert_close(quaternion_to_matrix(matrix_to_quaternion(quaternion_to_matrix(q))), quaternion_to_matrix(q))
+    scales = torch.rand(44, 3, generator=g, dtype=torch.float64)
+    scales[:5], scales[5:10, 1:] = 0.3, 0.01
+    covariances = covariance_from(scales, q)
+    found, rotations = scales_and_rotations(covariances)
+    torch.testing.assert_close(covariance_from(found, rotations), covariances, rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(found, scales.sort(1).values, rtol=1e-10, atol=1e-10)

@@ -4,32 +4,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from drawn_splats import NAMES, draw, gradients, objective, render
+from drawn_splats import CASES, NAMES, dense, draw, edge, gradients, objective, render, ring, slopes
 
 from mosa.errors import ConfigError, DataError
 from mosa.rendering.rasterizer import expected_depth, rasterize
 from mosa.rendering.reference import alphas, rasterize_reference, visible_covariance
-
-
-def dense():
-    """Large, nearly opaque Gaussians: alpha reaches its cap and pixels stop early."""
-    scene = draw(12, states=2, images=2, size=0.25, seed=11)
-    scene.opacities = 0.9 + 0.1 * (scene.opacities - 0.15) / 0.8
-    scene.opacities[::3] = 1.0
-    return scene
-
-
-def edge():
-    """Some Gaussians behind or beside a camera, where J is evaluated at the clamped direction, yet reaching into
-    the image."""
-    scene = draw(12, states=1, images=2, size=0.3, seed=2)
-    scene.means = 1.6 * scene.means
-    eye = -scene.cameras.w2c[0, :3, :3].T @ scene.cameras.w2c[0, :3, 3]
-    scene.means[0, 0] = 1.2 * eye
-    return scene
-
-
-CASES = {"sparse": lambda: draw(12, images=2, seed=1), "dense": dense, "edge": edge}
 
 
 def thresholds(scene):
@@ -80,21 +59,10 @@ def test_gradients_against_central_differences(case):
     ours = dict(zip(NAMES, gradients(scene, rasterize)))
     tiled = dict(zip(NAMES, gradients(scene, rasterize, scan="tile")))
     for name in NAMES:
-        value = getattr(scene, name)
-        step = 1e-6 * float(value.abs().mean())
-        flat = value.view(-1)
-        slopes = torch.empty_like(flat)
-        for i in range(len(flat)):
-            start = flat[i].clone()
-            sides = []
-            for k in (-2, -1, 1, 2):
-                flat[i] = start + k * step
-                sides.append(objective(*render(scene, rasterize)))
-            flat[i] = start
-            slopes[i] = (sides[0] - 8 * sides[1] + 8 * sides[2] - sides[3]) / (12 * step)
-        scale = float(slopes.abs().max())
+        wanted = slopes(lambda: objective(*render(scene, rasterize)), getattr(scene, name))
+        scale = float(wanted.abs().max())
         for gradient in (ours[name], tiled[name]):
-            torch.testing.assert_close(gradient.view(-1), slopes, rtol=1e-6, atol=1e-6 * scale)
+            torch.testing.assert_close(gradient, wanted, rtol=1e-6, atol=1e-6 * scale)
 
 
 def test_the_cases_reach_what_they_are_for():
@@ -146,6 +114,28 @@ def test_expected_depth_of_an_opaque_gaussian():
         seen = depth[b][alpha[b] > 0]
         torch.testing.assert_close(seen, distance[b].expand_as(seen))
     assert torch.isinf(depth[alpha == 0]).all() and (alpha == 0).any()
+
+
+@pytest.mark.parametrize("scan", ["gaussian", "tile"])
+def test_memory_follows_visible_pairs_not_gaussians_times_pixels(scan):
+    """Bytes kept for the backward pass, float64: 288 per Gaussian of two images, 12 per pixel, and with tiles 4 per tile and per
+    entry. Every Gaussian with every pixel would be 16 MB already in the smallest case."""
+
+    def kept(count, width, aside=0.0):
+        scene = draw(count, states=1, images=2, size=0.02)
+        scene.cameras = ring(2, width, width)
+        scene.means = scene.means + torch.tensor([0.0, aside, 0.0])
+        leaves = {name: getattr(scene, name).clone().requires_grad_() for name in NAMES}
+        total = []
+        with torch.autograd.graph.saved_tensors_hooks(lambda x: total.append(x.numel() * x.element_size()) or x, lambda x: x):
+            render(scene, rasterize, scan=scan, **leaves)
+        return sum(total)
+
+    small, more, wide = kept(500, 64), kept(1000, 64), kept(500, 256)
+    assert (more - small) / 500 < 400
+    assert (wide - small) / (2 * (256**2 - 64**2)) < 16
+    hidden = kept(500, 256, aside=50.0)
+    assert (wide > hidden + 4 * 500) if scan == "tile" else (wide == hidden)  # who is out of view has no entry
 
 
 @pytest.mark.parametrize(

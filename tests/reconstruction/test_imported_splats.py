@@ -1,0 +1,52 @@
+"""One's own splats as the object: a 3DGS PLY in place of the static stage."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mosa.data.splats import save_ply
+from mosa.errors import DataError
+from mosa.reconstruction import pipeline
+from mosa.reconstruction.observed import object_windows
+from mosa.reconstruction.pipeline import build_settings, object_hull, reconstruct
+from mosa.reconstruction.static import initial_splats
+
+QUICK = {
+    "resolution": 32, "ridge_passes": 4, "static": {"iterations": 3}, "appearance": {"iterations": 3},
+    "dynamic": {"modes": 8, "track_iterations": 2, "iterations": 2},
+}  # fmt: skip
+
+
+def test_a_ply_replaces_the_static_stage(squashed, tmp_path, monkeypatch):
+    """The particles get the file's colours, no static fit is run, and another file is another cache entry."""
+    settings = build_settings(splats=str(tmp_path / "own.ply"), **QUICK)
+    still = object_windows(squashed, squashed.training_cameras, [0], margin=6)
+    splats = initial_splats(object_hull(squashed, settings), still, count=150, seed=0)
+    green = replace(splats, colors=torch.tensor([0.1, 0.9, 0.2]).expand(150, 3))
+    far = replace(green, means=green.means + 100)  # the room around the object, outside of the scene's box
+    save_ply(tmp_path / "own.ply", type(green)(*(torch.cat([getattr(s, n) for s in (green, far)]) for n in vars(green))))
+    fitted, fit = [], pipeline.fit_splats
+
+    def noted(start, *arguments, **options):
+        fitted.append((options["move"], start.colors))
+        return fit(start, *arguments, **options)
+
+    monkeypatch.setattr(pipeline, "fit_splats", noted)
+    run = lambda: reconstruct(squashed, settings=settings, spacing=0.03, cache_dir=tmp_path, progress=False)  # noqa: E731
+    result = run()
+    assert [move for move, _ in fitted] == [False]
+    torch.testing.assert_close(fitted[0][1], torch.tensor([0.1, 0.9, 0.2]).expand_as(fitted[0][1]), atol=1e-5, rtol=0)
+    assert torch.isfinite(result.cues.positions).all()
+    save_ply(tmp_path / "own.ply", replace(splats, colors=0.5 * splats.colors))
+    run()
+    assert len(fitted) == 2 and len(list((tmp_path / "reconstruction").iterdir())) == 2
+
+
+def test_splats_of_another_world_are_refused(squashed, tmp_path):
+    means = 100 + torch.rand(20, 3)
+    rotations = torch.tensor([1.0, 0, 0, 0]).expand(20, 4)
+    splats = pipeline.Splats(means, torch.full((20, 3), 0.1), rotations, torch.full((20,), 0.5), torch.rand(20, 3))
+    settings = build_settings(splats=str(save_ply(tmp_path / "far.ply", splats)), **QUICK)
+    with pytest.raises(DataError, match=r"far.ply: expected Gaussians in the scene's box .*found 0 of 20"):
+        reconstruct(squashed, settings=settings, spacing=0.03, cache_dir=None, progress=False)
