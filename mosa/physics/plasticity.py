@@ -2,7 +2,8 @@
 
 A mapping gets the trial F = (I + dt C_affine) F_before with its factors, F_before and C_affine themselves (for flows that follow a
 rate), the material Hencky strain H = log W, and n2 = |E'|^2, the squared norm that enters the yield function: E' = dev(H) for a
-plain law, its corrected form when the adapter has a plastic part. It returns the mapped F and whether the particle yielded. The flow is coaxial: the deviator is scaled by max(0, 1 - dgamma/|E'|).
+plain law, its corrected form when the adapter has a plastic part. It returns the mapped F and whether the particle yielded. The
+flow is coaxial: the deviator is scaled by max(0, 1 - dgamma/|E'|).
 Where |E'| can vanish the argument is replaced *before* the root: 0 x NaN is NaN in a backward pass.
 """
 

@@ -29,6 +29,12 @@ _SQRT23 = wp.constant(wp.float64((2.0 / 3.0) ** 0.5))
 
 
 @wp.func
+def root(x: wp.float64):
+    """sqrt(x), with gradient 0 at x = 0."""
+    return wp.where(x > _ZERO, wp.sqrt(wp.where(x > _ZERO, x, _ONE)), _ZERO)
+
+
+@wp.func
 def flow_fraction(n: wp.float64, yield_stress: wp.float64, viscosity: wp.float64, modulus: wp.float64, dt: wp.float64):
     """|s|/|s_trial| after a step of flow: |s| = n - y/(1 + viscosity/(2 modulus dt)), y = n - sqrt(2/3) yield_stress > 0."""
     y = n - _SQRT23 * yield_stress
@@ -53,8 +59,8 @@ def herschel_bulkley_return(F: wp.mat33d, before: wp.mat33d, C_affine: wp.mat33d
     """s_trial = mu dev(b_bar); where |s_trial| > sqrt(2/3) yield_stress the deviator is scaled by `flow_fraction` with modulus
     mu, and b_bar gets the trace with which its determinant stays 1.
 
-    p: mu, kappa, yield_stress, viscosity. |s_trial| scales with |E'|/|E| when the adapter corrects the strain. norm_eps is
-    under the root of |s_trial| [Pa^2].
+    p: mu, kappa, yield_stress, viscosity. An adapter that corrects the strain adds 2 mu (|E'| - |E|) to |s_trial|: dev(b_bar) is
+    2 E at small strain, and a factor |E'|/|E| would have no derivative where E vanishes. norm_eps is under the root [Pa^2].
     """
     A = F
     yielded = int(0)
@@ -62,10 +68,8 @@ def herschel_bulkley_return(F: wp.mat33d, before: wp.mat33d, C_affine: wp.mat33d
     if J > _ZERO:
         D = deviator(wp.pow(J, -_TWO * _THIRD) * (F * wp.transpose(F)))
         E = deviator(H)
-        e2 = wp.ddot(E, E)
-        q = norm_eps
-        if e2 > _ZERO:
-            q = p[0] * p[0] * wp.ddot(D, D) * (n2 / e2) + norm_eps
+        measure = p[0] * wp.max(root(wp.ddot(D, D)) + _TWO * (root(n2) - root(wp.ddot(E, E))), _ZERO)
+        q = measure * measure + norm_eps
         n = wp.sqrt(wp.where(q > _ZERO, q, _ONE))
         if q > _ZERO and n > _SQRT23 * p[2]:
             A = isochoric_contract(F, U, S, V, flow_fraction(n, p[2], p[3], p[0], dt))
