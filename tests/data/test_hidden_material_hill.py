@@ -8,6 +8,9 @@ import torch
 from mosa.data.builtin.hill import COEFFICIENTS, HILL, HillMaterial
 from mosa.errors import ConfigError
 from mosa.physics.reference import deviator, hencky_material, polar
+from mosa.physics.rollout import Simulator
+from mosa.types import Ground, ParticleState
+
 from .anisotropic_states import check_gradients, drawn_rotations, drawn_states, mapped, stress
 
 AXES = drawn_rotations(1, 31)[0]
@@ -109,6 +112,19 @@ def test_gradient():
         return (weights * mapped(HILL, F, {**parameters, "lam": lam})).sum((1, 2))
 
     check_gradients(loss, leaves, seed=2)
+
+
+def test_a_body_of_it_stays_admissible_in_the_simulator():
+    """A cube driven into the ground: no particle is outside the criterion, and the plastic strain shows in F_tot."""
+    material = HillMaterial(E=8e4, nu=0.3, yield_stress=1e3, coefficients=CLAY.coefficients, axes=AXES)
+    index = torch.stack(torch.meshgrid(*(torch.arange(5),) * 3, indexing="ij"), -1).reshape(-1, 3).double()
+    n, eye = len(index), torch.eye(3).double().expand(len(index), 3, 3).contiguous()
+    v = torch.tensor([0.3, -2.0, 0.1]).double().expand(n, 3).contiguous()
+    state = ParticleState(0.02 * index + 0.03, v, torch.zeros_like(eye), eye, eye)
+    sim = Simulator(HILL, dx=0.04, substeps=100, frame_dt=0.04, ground=Ground(0.0), dtype=torch.float64)
+    final = sim.rollout(state, material.parameters(), torch.full((n,), 8e-6).double(), 1000.0, 2).final
+    assert equivalent(in_axes(final.F), material).max() < material.yield_stress * (1 + 1e-12)
+    assert (final.F_tot - final.F).abs().max() > 0.05
 
 
 def test_mistakes():

@@ -8,6 +8,7 @@ from mosa.data.builtin.orthotropic import MODULI, ORTHOTROPIC, OrthotropicMateri
 from mosa.errors import ConfigError
 from mosa.physics.laws import law_named
 from mosa.physics.reference import polar
+
 from .anisotropic_states import check_gradients, drawn_rotations, drawn_states, stress
 
 AXES = drawn_rotations(1, 21)[0]

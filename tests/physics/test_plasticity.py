@@ -95,7 +95,9 @@ def test_zero_operator_is_the_plain_map_and_gradients(law, adapted, drawn):
     # away from the switches: the map has kinks at first yield, at the tip and at the clamp
     kept = ("generic", "large", "inverted", "inverted, equal", "two equal", "dilated")
     keep = [i for i, name in enumerate(names) if name in kept]
-    F, names = torch.cat([F[keep], 0.7 * trial(40)]), [names[i] for i in keep] + ["trial"] * 40
+    sheared = torch.eye(3).double().repeat(3, 1, 1)
+    sheared[0, 0, 1], sheared[1, 1, 2], sheared[2, 2, 0] = 0.5, 0.5, 0.5
+    F, names = torch.cat([F[keep], sheared, 0.7 * trial(40)]), [names[i] for i in keep] + ["sheared"] * 3 + ["trial"] * 40
     n = len(F)
     generator = torch.Generator().manual_seed(7)
     G = 0.1 * torch.randn(n, 6, 6, generator=generator, dtype=torch.float64)
@@ -131,6 +133,16 @@ def test_zero_operator_is_the_plain_map_and_gradients(law, adapted, drawn):
         assert error.max() < 1e-6, (name, names[int(error.argmax())])
         if name not in UNUSED[law]:
             assert found.abs().max() > 0
+
+
+@pytest.mark.parametrize("law", PARAMETERS)
+def test_frame_indifference(law, rotations):
+    """map(Q F) = Q map(F), and a rotation of the rest state is carried along: map(F Q) = map(F) Q."""
+    F = torch.cat([trial(100), 0.8 * trial(100, seed=8)])
+    Q, A = rotations[: len(F)], mapped(law, F)
+    assert len(Q) == len(F) and (A - F).abs().max() > 1e-2
+    assert (mapped(law, Q @ F) - Q @ A).abs().max() < 1e-12
+    assert (mapped(law, F @ Q) - A @ Q).abs().max() < 1e-12
 
 
 @pytest.mark.parametrize("law", PARAMETERS)
