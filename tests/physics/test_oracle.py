@@ -36,11 +36,11 @@ def parameters_of(law, data):
     return {name: known[name] for name in TAKEN[law]}
 
 
-def simulator(law, data, frame_dt=1 / 24, substeps=100, **options):
+def simulator(law, data, frame_dt=1 / 24, substeps=100, dtype=torch.float64, **options):
     dx = float(data["dx"])
     return Simulator(
         law, dx=dx, frame_dt=frame_dt, substeps=substeps, gravity=data.get("gravity", torch.tensor([0.0, -9.8, 0.0])),
-        up=(0.0, 1.0, 0.0), dtype=torch.float64, mass_cutoff=1e-8 * dx**3, init_affine="zero",
+        up=(0.0, 1.0, 0.0), dtype=dtype, mass_cutoff=1e-8 * dx**3, init_affine="zero",
         norm_eps=0.0 if law in ("neo_hookean", "newtonian") else 1e-8, **options,
     )  # fmt: skip
 
@@ -80,6 +80,21 @@ def test_trajectory(name, oracle):
     if law != "herschel_bulkley_hencky":
         assert (F.mT @ F - expected.mT @ expected).abs().max() < max(1e-7, tolerance_F * 1e-2)
     assert float((x[last] - x[0]).norm(dim=1).mean()) > 1e-2
+
+
+@pytest.mark.parametrize("name", TRAJECTORIES)
+def test_trajectory_in_single_precision(name, oracle):
+    """Within ten times the error of the peer's own float32 run, at every frame (the README's tolerance)."""
+    law, options, _, _ = TRAJECTORIES[name]
+    data, _ = oracle(name)
+    state = start(data["x0"], data["v0"])
+    state = ParticleState(*(getattr(state, key).float() for key in ("x", "v", "C_affine", "F", "F_tot")))
+    volume = torch.full((len(state.x),), float(data["p_vol"]))
+    with torch.no_grad():
+        sim = simulator(law, data, dtype=torch.float32, **options)
+        x = sim.rollout(state, parameters_of(law, data), volume, 1000.0, 9).x.double()
+    error = (x - data["x"][:9]).abs().amax((1, 2))
+    assert bool((error <= 10 * data["x_f32_error"][:9]).all()), (error / data["x_f32_error"][:9]).tolist()
 
 
 # file -> law, options, tolerance on tau relative to its largest entry
