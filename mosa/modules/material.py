@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError
-from mosa.physics.elasticity import lame
+from mosa.physics.elasticity import lame, wave_modulus
 from mosa.physics.laws import law_named
 from mosa.physics.plasticity import friction_alpha
 from mosa.physics.rollout import MaterialState, Simulator
@@ -122,10 +122,9 @@ class Material(nn.Module):
         return result
 
     def max_modulus(self, factor: Tensor | float = 1.0) -> Tensor:
-        """Largest P wave modulus over the particles [Pa], (): lam + 2 mu, or kappa + 4 mu/3. For the time step; no gradient."""
+        """Largest P wave modulus over the particles [Pa], (), as the law says. For the time step; no gradient."""
         factor = factor.detach() if isinstance(factor, Tensor) else factor
-        p = {n: v.detach() for n, v in self.per_particle(factor).items()}
-        return (p["lam"] + 2 * p["mu"] if "lam" in p else p["kappa"] + 4 * p["mu"] / 3).max()
+        return wave_modulus(self.law, {n: v.detach() for n, v in self.per_particle(factor).items()})
 
     def reference_modulus(self) -> Tensor:
         """E, or kappa where the law has no E [Pa], (), without gradient: the unit the adapter measures stress in."""

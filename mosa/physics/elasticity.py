@@ -1,16 +1,15 @@
-"""Hyperelastic laws: Kirchhoff stress tau(F) [Pa] with energy per rest volume [J/m^3] (method.md, section 2).
+"""Hyperelastic laws: Kirchhoff stress tau(F) [Pa] (method.md, section 2); their energies are in `energies`.
 
 Every law is a Warp function of F built on `kinematics`, so that its adjoint is exact; R is the polar rotation where it is used.
 tau = (dPsi/dF) F^T and tau(I) = 0. Parameters: mu, lam, the Lamé parameters [Pa].
 """
 
-import torch
 import warp as wp
 from torch import Tensor
 
-from mosa.errors import ConfigError
+from mosa.physics.energies import corotated_energy, linear_energy, neo_hookean_energy, stvk_energy
 from mosa.physics.kinematics import hencky_spatial, svd
-from mosa.physics.laws import LawParameters, register_law
+from mosa.physics.laws import LawParameters, law_named, register_law
 
 _TWO = wp.constant(wp.float64(2.0))
 _HALF = wp.constant(wp.float64(0.5))
@@ -78,47 +77,10 @@ def stvk_paper(F: wp.mat33d, R: wp.mat33d, C_affine: wp.mat33d, p: LawParameters
     return _HALF * (T + wp.transpose(T))
 
 
-# --- energies, torch: F (..., 3, 3), parameters broadcastable to (...) -------------------------------------------------
-
-
-def neo_hookean_energy(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
-    """mu/2 (|F|^2 - 3) - mu log J + lam/2 (log J)^2 [J/m^3]."""
-    log_J = torch.log(torch.linalg.det(F))
-    return 0.5 * mu * ((F * F).sum((-2, -1)) - 3) - mu * log_J + 0.5 * lam * log_J**2
-
-
-def corotated_energy(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
-    """mu sum (S_i - 1)^2 + lam/2 (J - 1)^2 [J/m^3], S signed singular values."""
-    S, J = signed_singular_values(F)
-    return mu * ((S - 1) ** 2).sum(-1) + 0.5 * lam * (J - 1) ** 2
-
-
-def stvk_energy(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
-    """mu |eps|^2 + lam/2 tr(eps)^2 [J/m^3], eps = log max(S, 0.05)."""
-    S, _ = signed_singular_values(F)
-    eps = torch.log(S.clamp_min(0.05))
-    return mu * (eps**2).sum(-1) + 0.5 * lam * eps.sum(-1) ** 2
-
-
-def linear_energy(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
-    """mu |sym(F) - I|^2 + lam/2 tr(F - I)^2 [J/m^3], F relative to the start."""
-    strain = 0.5 * (F + F.mT) - torch.eye(3, dtype=F.dtype, device=F.device)
-    trace = strain.diagonal(dim1=-2, dim2=-1).sum(-1)
-    return mu * (strain**2).sum((-2, -1)) + 0.5 * lam * trace**2
-
-
-def signed_singular_values(F: Tensor) -> tuple[Tensor, Tensor]:
-    """(S (..., 3) descending with the sign of det F on the last, J (...))."""
-    S, J = torch.linalg.svdvals(F), torch.linalg.det(F)
-    sign = torch.where(J < 0, -torch.ones_like(J), torch.ones_like(J))
-    return torch.cat([S[..., :2], S[..., 2:] * sign[..., None]], -1), J
-
-
 def wave_modulus(law: str, parameters: dict[str, Tensor]) -> Tensor:
-    """Largest small-strain modulus M [Pa] of the P wave: lam + 2 mu. Errors: ConfigError if the law has other moduli."""
-    if "mu" not in parameters or "lam" not in parameters:
-        raise ConfigError(f"law {law!r}: expected parameters mu and lam, found {', '.join(parameters)}")
-    return (parameters["lam"] + 2 * parameters["mu"]).max()
+    """Largest small-strain modulus M [Pa] of the P wave over particles, (). Errors: ConfigError if it does not follow from the
+    parameters."""
+    return law_named(law).wave_modulus(parameters).max()
 
 
 _LAME = {"mu": 1, "lam": 1}

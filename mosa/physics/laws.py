@@ -1,12 +1,14 @@
 """Registry of constitutive laws: a law is one Warp function for the stress and, where it yields, one for the return mapping.
 
-Elastic laws are in `elasticity`, return mappings in `plasticity`; another module adds its own with `register_law`.
+Elastic laws are in `elasticity`, yielding ones in `plasticity`, those that flow at a rate in `viscosity`; another module adds its
+own with `register_law`. Bodies of different laws in one grid: `mixture`.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import warp as wp
+from torch import Tensor
 
 from mosa.errors import ConfigError
 
@@ -23,10 +25,13 @@ class Law:
     stress: `wp.func (F: mat33d, R: mat33d, C_affine: mat33d, p: LawParameters) -> mat33d`, the Kirchhoff stress [Pa]. R is the
     polar rotation of F with its differential if `uses_rotation`, else unspecified; everything is float64.
     parameters: name -> how many numbers (1 for a scalar, 3 for a vector, ...); p holds them in this order.
-    return_map: `wp.func (F, R, U, S, V, H, n2, norm_eps, p, dt) -> (F, yielded: int)` or None, see `plasticity`.
+    return_map: `wp.func (F, before, C_affine, R, U, S, V, H, n2, norm_eps, p, dt) -> (F, yielded: int)` or None, see
+    `plasticity`.
     reference: name of a 9-number parameter that the simulator fills with the rotation of the start's F, or None.
     needs_positive_J: the law has no value at det F <= 0, which is then an error.
-    energy: torch function (F (..., 3, 3), **parameters) -> energy per rest volume [J/m^3], or None.
+    energy: torch function (F (..., 3, 3), **parameters) -> energy per rest volume [J/m^3], or None; see `energies`.
+    modulus: torch function (**parameters) -> P wave modulus M at rest [Pa] for the time step, elementwise; None: lam + 2 mu or
+    kappa + 4 mu/3, whichever the parameters give.
     """
 
     name: str
@@ -37,6 +42,7 @@ class Law:
     reference: str | None = None
     needs_positive_J: bool = False
     energy: Callable | None = None
+    modulus: Callable | None = None
     offsets: dict[str, int] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -52,6 +58,19 @@ class Law:
     def plastic(self) -> bool:
         """Whether the law has a return mapping, so that F and F_tot differ."""
         return self.return_map is not None
+
+    def wave_modulus(self, parameters: dict[str, Tensor]) -> Tensor:
+        """P wave modulus M at rest [Pa], of the parameters' shape. Errors: ConfigError if it does not follow from them."""
+        if self.modulus is not None:
+            return self.modulus(**parameters)
+        if "mu" in parameters and "lam" in parameters:
+            return parameters["lam"] + 2 * parameters["mu"]
+        if "mu" in parameters and "kappa" in parameters:
+            return parameters["kappa"] + 4 * parameters["mu"] / 3
+        raise ConfigError(
+            f"law {self.name!r}: expected parameters mu and lam, or mu and kappa, found {', '.join(parameters)}; register the "
+            "law with `modulus`"
+        )
 
 
 _LAWS: dict[str, Law] = {}
@@ -75,16 +94,21 @@ def register_law(name: str, stress: Callable, parameters: dict[str, int] | tuple
 
 
 def law_named(name: str) -> Law:
-    """The law of that name. Errors: ConfigError naming the known ones."""
+    """The law of that name; `a+b` is the mixture of the laws a and b (see `mixture`). Errors: ConfigError naming the known ones.
+    """
     # the built-in laws register themselves on import
-    from mosa.physics import elasticity, plasticity  # noqa: F401
+    from mosa.physics import elasticity, plasticity, viscosity  # noqa: F401
 
+    if "+" in name and name not in _LAWS:
+        from mosa.physics.mixture import register_mixture
+
+        register_mixture(name, [law_named(part) for part in name.split("+")])
     if name not in _LAWS:
-        raise ConfigError(f"law: expected one of {', '.join(sorted(_LAWS))}, found {name!r}")
+        raise ConfigError(f"law: expected one of {', '.join(law_names())}, found {name!r}")
     return _LAWS[name]
 
 
 def law_names() -> list[str]:
-    """Names of all registered laws."""
+    """Names of all registered laws, without the mixtures of them."""
     law_named("neo_hookean")
-    return sorted(_LAWS)
+    return sorted(name for name in _LAWS if "+" not in name)

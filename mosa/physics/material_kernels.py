@@ -83,7 +83,8 @@ def return_kernel(return_map, scalar, adapted: bool):
     ):  # fmt: skip
         i = wp.tid()
         Fi = wp.mat33d(F[i])
-        trial = Fi + dt * (wp.mat33d(C_affine[i]) * Fi)
+        Ci = wp.mat33d(C_affine[i])
+        trial = Fi + dt * (Ci * Fi)
         U, S, V = svd(trial)
         R = rotation(trial, U * wp.transpose(V))
         H = hencky_material(trial, U, S, V)
@@ -92,7 +93,7 @@ def return_kernel(return_map, scalar, adapted: bool):
             # as an increment, so that a zero operator leaves the plain map bit for bit
             E = E + deviator(unvech(mat66(G[i]) * vech(E) + vec6(h[i])))
         mapped, yielded = return_map(
-            trial, R, U, S, V, H, wp.ddot(E, E), norm_eps, LawParameters(parameters[i]), dt
+            trial, Fi, Ci, R, U, S, V, H, wp.ddot(E, E), norm_eps, LawParameters(parameters[i]), dt
         )
         if yielded == 0 and rebuild == 1:
             mapped = contract(trial, U, S, V, wp.float64(1.0))

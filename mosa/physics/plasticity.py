@@ -1,8 +1,9 @@
 """Return mappings: what leaves of a trial F once a law has yielded (method.md, sections 2 and 4).
 
-A mapping gets the trial F with its factors, the material Hencky strain H = log W, and n2 = |E'|^2, the squared norm that enters
-the yield function: E' = dev(H) for a plain law, its corrected form when the adapter has a plastic part. It returns the mapped F
-and whether the particle yielded. The flow is coaxial: the deviator is scaled by max(0, 1 - dgamma/|E'|).
+A mapping gets the trial F = (I + dt C_affine) F_before with its factors, F_before and C_affine themselves (for flows that follow a
+rate), the material Hencky strain H = log W, and n2 = |E'|^2, the squared norm that enters the yield function: E' = dev(H) for a
+plain law, its corrected form when the adapter has a plastic part. It returns the mapped F and whether the particle yielded. The
+flow is coaxial: the deviator is scaled by max(0, 1 - dgamma/|E'|).
 Where |E'| can vanish the argument is replaced *before* the root: 0 x NaN is NaN in a backward pass.
 """
 
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from mosa.errors import ConfigError
 from mosa.physics.elasticity import stvk
+from mosa.physics.energies import stvk_energy
 from mosa.physics.kinematics import contract
 from mosa.physics.laws import LawParameters, register_law
 
@@ -51,8 +53,9 @@ def safe_norm(n2: wp.float64, norm_eps: wp.float64):
 
 
 @wp.func
-def von_mises_return(F: wp.mat33d, R: wp.mat33d, U: wp.mat33d, S: wp.vec3d, V: wp.mat33d, H: wp.mat33d, n2: wp.float64,
-                     norm_eps: wp.float64, p: LawParameters, dt: wp.float64):  # fmt: skip
+def von_mises_return(F: wp.mat33d, before: wp.mat33d, C_affine: wp.mat33d, R: wp.mat33d, U: wp.mat33d, S: wp.vec3d,
+                     V: wp.mat33d, H: wp.mat33d, n2: wp.float64, norm_eps: wp.float64, p: LawParameters,
+                     dt: wp.float64):  # fmt: skip
     """dgamma = |E'| - yield_stress/(2 mu); where positive the deviator shrinks by dgamma. p: mu, lam, yield_stress [Pa]."""
     n = safe_norm(n2, norm_eps)
     dgamma = n - p[2] / (_TWO * p[0])
@@ -65,8 +68,9 @@ def von_mises_return(F: wp.mat33d, R: wp.mat33d, U: wp.mat33d, S: wp.vec3d, V: w
 
 
 @wp.func
-def drucker_prager_return(F: wp.mat33d, R: wp.mat33d, U: wp.mat33d, S: wp.vec3d, V: wp.mat33d, H: wp.mat33d, n2: wp.float64,
-                          norm_eps: wp.float64, p: LawParameters, dt: wp.float64):  # fmt: skip
+def drucker_prager_return(F: wp.mat33d, before: wp.mat33d, C_affine: wp.mat33d, R: wp.mat33d, U: wp.mat33d, S: wp.vec3d,
+                          V: wp.mat33d, H: wp.mat33d, n2: wp.float64, norm_eps: wp.float64, p: LawParameters,
+                          dt: wp.float64):  # fmt: skip
     """t = tr(eps) - 3c; t >= 0: the tip exp(c) R. dgamma = |E'| + alpha (3 lam + 2 mu)/(2 mu) t, where positive the deviator
     shrinks by it. p: mu, lam [Pa], friction_alpha, cohesion c (a strain). Klar et al. 2016 without volume correction."""
     t = wp.trace(H) - _THREE * p[3]
@@ -85,7 +89,10 @@ def drucker_prager_return(F: wp.mat33d, R: wp.mat33d, U: wp.mat33d, S: wp.vec3d,
     return A, yielded
 
 
-register_law("von_mises", stvk, {"mu": 1, "lam": 1, "yield_stress": 1}, return_map=von_mises_return)
 register_law(
-    "drucker_prager", stvk, {"mu": 1, "lam": 1, "friction_alpha": 1, "cohesion": 1}, return_map=drucker_prager_return
+    "von_mises", stvk, {"mu": 1, "lam": 1, "yield_stress": 1}, return_map=von_mises_return, energy=stvk_energy
 )
+register_law(
+    "drucker_prager", stvk, {"mu": 1, "lam": 1, "friction_alpha": 1, "cohesion": 1}, return_map=drucker_prager_return,
+    energy=stvk_energy,
+)  # fmt: skip

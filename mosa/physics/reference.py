@@ -50,10 +50,20 @@ def hencky_material(F: Tensor) -> Tensor:
     return V @ torch.diag_embed(torch.log(values.clamp_min(0.05**2)) / 2) @ V.mT
 
 
-def stress(law: str, F: Tensor, p: dict[str, Tensor]) -> Tensor:
-    """Kirchhoff stress (N, 3, 3) [Pa]; p: (N,) or () tensors, `reference` (N, 3, 3) for `linear`."""
-    mu, lam = (torch.as_tensor(p[k], dtype=torch.float64).expand(len(F))[:, None, None] for k in ("mu", "lam"))
+RATED = ("herschel_bulkley", "herschel_bulkley_hencky")
+"""Laws in mu and kappa that flow at a rate; with `newtonian` those of `viscosity`."""
+
+
+def stress(law: str, F: Tensor, p: dict[str, Tensor], C_affine: Tensor | None = None) -> Tensor:
+    """Kirchhoff stress (N, 3, 3) [Pa]; p: (N,) or () tensors, `reference` (N, 3, 3) for `linear`; C_affine: for `newtonian`."""
     J = torch.linalg.det(F)[:, None, None]
+    mu, lam, kappa = (
+        torch.as_tensor(p.get(k, 0.0), dtype=torch.float64).expand(len(F))[:, None, None] for k in ("mu", "lam", "kappa")
+    )
+    if law == "newtonian":
+        return kappa * (J - J**-6) * EYE + mu * J * 0.5 * (C_affine + C_affine.mT)
+    if law == "herschel_bulkley":
+        return 0.5 * kappa * (J**2 - 1) * EYE + mu * deviator(J ** (-2 / 3) * F @ F.mT)
     if law == "neo_hookean":
         return mu * (F @ F.mT - EYE) + lam * torch.log(J) * EYE
     if law == "linear":
@@ -63,16 +73,22 @@ def stress(law: str, F: Tensor, p: dict[str, Tensor]) -> Tensor:
     R = polar(F)
     if law == "corotated":
         return 2 * mu * (F - R) @ F.mT + lam * (J - 1) * J * EYE
-    if law in ("stvk", "stvk_paper", "von_mises", "drucker_prager"):
+    if law == "herschel_bulkley_hencky":
+        lam = kappa - 2 * mu / 3
+    if law in ("stvk", "stvk_paper", "von_mises", "drucker_prager", "herschel_bulkley_hencky"):
         H = hencky_material(F)
         T = R @ (2 * mu * H + lam * trace(H)[:, None, None] * EYE) @ R.mT
         return T @ R @ F.mT if law == "stvk_paper" else T
     raise ConfigError(f"reference law: found {law!r}, which the torch twin does not have")
 
 
-def return_map(law: str, F: Tensor, p: dict[str, Tensor], operator=None, norm_eps: float = 0.0) -> Tensor:
-    """Mapped F (N, 3, 3) of a trial F; operator: (plastic_G, plastic_h) or None."""
-    if law not in ("von_mises", "drucker_prager"):
+def return_map(law: str, F: Tensor, p: dict[str, Tensor], operator=None, norm_eps: float = 0.0, before: Tensor | None = None,
+               C_affine: Tensor | None = None, dt: float = 0.0) -> Tensor:  # fmt: skip
+    """Mapped F (N, 3, 3) of a trial F = (I + dt C_affine) before; operator: (plastic_G, plastic_h) or None."""
+    if law == "newtonian":
+        J = ((1 + dt * trace(C_affine)) * torch.linalg.det(before)).clamp_min(0.05)
+        return J[:, None, None] ** (1 / 3) * polar((EYE + 0.5 * dt * (C_affine - C_affine.mT)) @ before)
+    if law not in ("von_mises", "drucker_prager", *RATED):
         return F
     p = {k: torch.as_tensor(v, dtype=torch.float64).expand(len(F)) for k, v in p.items()}
     H = hencky_material(F)
@@ -81,6 +97,8 @@ def return_map(law: str, F: Tensor, p: dict[str, Tensor], operator=None, norm_ep
     if operator is not None:
         e = vech(E)
         corrected = deviator(unvech(e + (operator[0] @ e[..., None])[..., 0] + operator[1]))
+    if law in RATED:
+        return _rated_return(law, F, p, H, (corrected**2).sum((1, 2)), norm_eps, dt)
     n = torch.sqrt((corrected**2).sum((1, 2)) + norm_eps + 1e-300)
     if law == "von_mises":
         dgamma = n - p["yield_stress"] / (2 * p["mu"])
@@ -98,9 +116,43 @@ def return_map(law: str, F: Tensor, p: dict[str, Tensor], operator=None, norm_ep
     return mapped
 
 
-def adapted_stress(law: str, F: Tensor, p: dict[str, Tensor], operator=None) -> Tensor:
+def _rated_return(law: str, F: Tensor, p: dict[str, Tensor], H: Tensor, n2: Tensor, norm_eps: float, dt: float) -> Tensor:
+    """Herschel-Bulkley: |s| = |s_trial| - y/(1 + viscosity/(2 mu' dt)) where y = |s_trial| - sqrt(2/3) yield_stress > 0."""
+    b = F @ F.mT
+    J = torch.linalg.det(F)[:, None, None]
+    if law == "herschel_bulkley":
+        d = deviator(J ** (-2 / 3) * b)
+        measure = (d**2).sum((1, 2)).sqrt() + 2 * (n2.sqrt() - (deviator(H) ** 2).sum((1, 2)).sqrt())
+        n = torch.sqrt((p["mu"] * measure) ** 2 + norm_eps)
+        modulus = p["mu"]
+    else:
+        n = torch.sqrt(4 * p["mu"] ** 2 * n2 + norm_eps)
+        modulus = p["mu"] * trace(b) / 3
+    y = n - (2 / 3) ** 0.5 * p["yield_stress"]
+    c = (1 - y / n / (1 + p["viscosity"] / (2 * modulus * dt)))[:, None, None]
+    R = polar(F)
+    if law == "herschel_bulkley_hencky":
+        flowed = R @ torch.linalg.matrix_exp(c * deviator(H) + trace(H)[:, None, None] / 3 * EYE)
+    else:
+        # c F^T F + a I with the determinant of F^T F: a by bisection, then Newton steps that carry its derivative
+        square, V = torch.linalg.eigh(F.mT @ F)
+        known, weight = square.detach(), c[:, 0].detach()
+        low, high = -weight[:, 0] * known[:, 0], known[:, 2]
+        for _ in range(100):
+            middle = 0.5 * (low + high)
+            below = (weight * known + middle[:, None]).prod(1) < known.prod(1)
+            low, high = torch.where(below, middle, low), torch.where(below, high, middle)
+        a = 0.5 * (low + high)
+        for _ in range(2):
+            q = c[:, 0] * square + a[:, None]
+            a = a - (torch.log(q) - torch.log(square)).sum(1) / (1 / q).sum(1)
+        flowed = R @ V @ torch.diag_embed(torch.sqrt(c[:, 0] * square + a[:, None])) @ V.mT
+    return torch.where((y > 0)[:, None, None], flowed, F)
+
+
+def adapted_stress(law: str, F: Tensor, p: dict[str, Tensor], operator=None, C_affine: Tensor | None = None) -> Tensor:
     """tau + R mat(G vech(R^T tau R) + h) R^T; operator: (G, h) or None."""
-    tau = stress(law, F, p)
+    tau = stress(law, F, p, C_affine)
     if operator is None:
         return tau
     R = polar(F)
@@ -134,7 +186,7 @@ def substep(law: str, state: ParticleState, p: dict[str, Tensor], volume: Tensor
             cutoff: float = 0.0) -> ParticleState:  # fmt: skip
     """One substep of `rollout`'s algorithm (method.md, section 6)."""
     x, v, C, F = state.x, state.v, state.C_affine, state.F
-    tau = adapted_stress(law, F, p, operator)
+    tau = adapted_stress(law, F, p, operator, C)
     mass = density * volume
     base = torch.floor(x.detach() / dx - 0.5)
     f = x / dx - base
@@ -169,5 +221,5 @@ def substep(law: str, state: ParticleState, p: dict[str, Tensor], volume: Tensor
         new_C = new_C + 4 / dx**2 * u[:, :, None] * arm[:, None, :]
     trial = F + dt * new_C @ F
     total = state.F_tot + dt * new_C @ state.F_tot
-    mapped = return_map(law, trial, p, plastic_operator, norm_eps)
+    mapped = return_map(law, trial, p, plastic_operator, norm_eps, F, new_C, dt)
     return ParticleState(x + dt * new_v, new_v, new_C, mapped, mapped if mapped is trial else total)
