@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from mosa.physics.factorisation import singular_value_decomposition
+
 TINY = 1e-8
 STRAIN_FLOOR = 1e-3
 """e of the stretch term: strains below it have no direction to compare (and would give gradients like 1/strain)."""
@@ -112,28 +114,23 @@ def rotation_loss(F_tot: Tensor, cue: Tensor, weight: Tensor, start: Tensor) -> 
 
 
 class _Stretches(torch.autograd.Function):
-    """Singular values of F (..., 3, 3) by the eigenvectors V of F^T F: dS_i = u_i . dF v_i, u_i = F v_i / S_i."""
+    """Singular values of F (..., 3, 3): dS_i = u_i . dF v_i."""
 
     @staticmethod
     def forward(ctx, F: Tensor) -> Tensor:
-        if not torch.isfinite(F).all():  # the solver would stop without a word on the cause; a NaN loss is reported
-            ctx.save_for_backward(F, F, F[..., 0])
+        if not torch.isfinite(F).all():  # a NaN loss is reported
+            ctx.save_for_backward(F, F[..., 0], F)
             return torch.full_like(F[..., 0], torch.nan)
-        squares, V = torch.linalg.eigh(F.mT @ F)
-        S = squares.flip(-1).clamp(min=0).sqrt()
-        inverted = torch.linalg.det(F) < 0
-        S = torch.cat([S[..., :2], torch.where(inverted, -S[..., 2], S[..., 2])[..., None]], -1)
-        ctx.save_for_backward(F, V.flip(-1), S)
-        return S
+        factors = singular_value_decomposition(F)
+        ctx.save_for_backward(*factors)
+        return factors[1]
 
     @staticmethod
     @once_differentiable
     def backward(ctx, seed: Tensor) -> Tensor:
-        F, V, S = ctx.saved_tensors
+        U, S, V = ctx.saved_tensors
         seed = shared_where_equal(seed, S, 100 * torch.finfo(S.dtype).eps)
-        # where S vanishes F v does too: the quotient is bounded, but not determined
-        safe = torch.where(S.abs() < TINY, torch.full_like(S, TINY), S)
-        return F @ (V * (seed / safe)[..., None, :]) @ V.mT
+        return (U * seed[..., None, :]) @ V.mT
 
 
 def shared_where_equal(seed: Tensor, values: Tensor, tolerance: float) -> Tensor:

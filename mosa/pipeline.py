@@ -250,7 +250,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     folder = run_folder()
     twin = Twin.load(cfg.ckpt_path, cfg.device)
     simulate = plain(cfg.simulate)
-    if any(simulate[k] is not None for k in ("velocity", "rotation", "height", "angular_velocity")):
+    if any(simulate[k] is not None for k in ("velocity", "rotation", "height", "angular_velocity", "colliders")):
         rollout = twin.simulate(**simulate, progress=True)
         print(f"simulated {len(rollout.x)} frames into {twin.export(rollout, folder)}")
         return None
@@ -279,9 +279,6 @@ def quiet() -> None:
     """Keep library chatter off the screen; errors and our own output stay."""
     import logging
 
-    import warp
-
-    warp.config.quiet = True
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", module="lightning.*")

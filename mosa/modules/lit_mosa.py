@@ -188,7 +188,7 @@ class LitMosa(L.LightningModule):
             self.body.thaw(stage.start)
         adapter, material = self.body.adapter, self.body.material
         if stage.name == "joint" and adapter is not None:
-            adapter.switch_on(material.reference_modulus(), material.physical().get("nu", torch.tensor(0.3)).detach())
+            adapter.switch_on(material.reference_modulus(), material.poisson())
             if getattr(getattr(adapter, "operator", None), "no_prior_stress", False):
                 parameters = {k: v.detach() for k, v in material.per_particle(1.0).items()}
                 warm_start(adapter, material_states(material.law, parameters))

@@ -126,6 +126,14 @@ class Material(nn.Module):
         factor = factor.detach() if isinstance(factor, Tensor) else factor
         return wave_modulus(self.law, {n: v.detach() for n, v in self.per_particle(factor).items()})
 
+    def poisson(self) -> Tensor:
+        """Poisson number of the small-strain response, (), without gradient: nu, or that of mu and kappa, at most 0.49."""
+        p = {n: v.detach() for n, v in self.physical().items()}
+        if "nu" in p:
+            return p["nu"]
+        mu = p.get("mu", torch.zeros_like(p["kappa"]))
+        return ((3 * p["kappa"] - 2 * mu) / (2 * (3 * p["kappa"] + mu))).clamp(max=NU_MAX)
+
     def reference_modulus(self) -> Tensor:
         """E, or kappa where the law has no E [Pa], (), without gradient: the unit the adapter measures stress in."""
         return self.physical()[self.stiffness].detach()

@@ -138,8 +138,8 @@ class Simulator:
                 columns.append(rotation.detach().reshape(particles, 9))
                 continue
             value = torch.as_tensor(parameters[name], dtype=self.dtype, device=self.device)
-            if name == "yield_stress":
-                value = value * self.yield_factor
+            if name == "yield_stress" and "von_mises" in self.law.name.split("+"):
+                value = value * self.yield_factor  # the other laws that yield have their radius fixed
             try:
                 columns.append((value[..., None] if size == 1 else value).expand(particles, size))
             except RuntimeError:

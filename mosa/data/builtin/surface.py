@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from mosa.data.builtin.shapes import Shape
 
-wp.config.quiet = True
+wp.config.log_level = wp.LOG_WARNING
 
 
 @dataclass(frozen=True)
