@@ -64,6 +64,11 @@ PEANUT = HiddenMaterial(
     E=3e5, nu=0.35, ratio=1.9, fibre=(0.2, 0.5, 1.0), amplitude=0.25, period=0.16, axis=(0.3, 0.9, 0.3)
 )  # fmt: skip
 
+MANDARIN = HiddenMaterial(
+    E=2.5e5, nu=0.32, ratio=1.7, fibre=(0.4, 1.0, 0.3), amplitude=0.2, period=0.14, axis=(0.2, 0.3, 0.9)
+)  # fmt: skip
+CHICK = HiddenMaterial(E=2.2e5, nu=0.28, ratio=1.8, fibre=(0.3, -0.2, 1.0), amplitude=0.15, period=0.13, axis=(0.0, 1.0, 0.3))
+
 DROPS = {
     "train": Drop(speed=2.5),
     "test_60": Drop(speed=2.5, axis=(0.3, 0.2, 1.0), degrees=60.0, offset=(-0.035, -0.010)),
@@ -78,6 +83,13 @@ OBJECTS = {
          "test_40": replace(DROPS["test_40"], offset=(-0.065, -0.01))},
         Footage(target=0.26), spacing=0.006,
     ),
+    "mandarin": BuiltinObject(
+        "mandarin", 0.17, MANDARIN,
+        {"train": DROPS["train"], "test_60": replace(DROPS["test_60"], offset=(0.0, 0.0)),
+         "test_40": replace(DROPS["test_40"], offset=(0.0, 0.0))},
+        Footage(target=0.28), spacing=0.0065,
+    ),
+    "chick1": BuiltinObject("chick1", 0.22, CHICK, DROPS, Footage(target=0.31), spacing=0.007),
     # the rabbit, small and short, for tests and sweeps: every stage of the program, none of its accuracy
     "tiny": BuiltinObject(
         "rabbit", 0.25, RABBIT,

@@ -177,7 +177,57 @@ def peanut_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.clip(color, 0.02, 1.0)
 
 
+# --- mandarin -------------------------------------------------------------------------------------------------------------
+
+
+def mandarin_distance(points: np.ndarray) -> np.ndarray:
+    """A mandarin, 0.17 m high and 0.21 m wide: a flattened ball with shallow lobes and a stub of a stalk, leaning a little."""
+    centre = np.array([0.0, 0.085, 0.0])
+    x, y, z = (points - centre).T
+    leaning = np.stack([0.985 * x - 0.174 * y, 0.174 * x + 0.985 * y, z], -1)
+    away = np.hypot(leaning[:, 0], leaning[:, 2])
+    angle = np.arctan2(leaning[:, 2], leaning[:, 0])
+    lobes = 0.0025 * np.cos(10 * angle) * np.clip(away / 0.06, 0, 1) ** 2
+    ball = ellipsoid(leaning, (0.0, 0.0, 0.0), (0.105, 0.083, 0.100)) - lobes
+    return join(ball, capsule(leaning, (0.0, 0.070, 0.0), (0.012, 0.092, 0.004), 0.022, 0.019), 0.012)
+
+
+def mandarin_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Orange peel with green and dark patches, a green stalk, a pale label on one side."""
+    color = coat(points, rng, (0.95, 0.56, 0.12), (0.98, 0.78, 0.26), (0.66, 0.26, 0.10), patch=0.09, grain=0.026)
+    color = blend(color, (0.26, 0.46, 0.18), step(points[:, 1], 0.158, 0.012))
+    color = blend(color, (0.95, 0.95, 0.90), step(-sphere(points, (0.080, 0.105, 0.055), 0.028), 0.0, 0.004))
+    color = blend(color, (0.16, 0.30, 0.60), step(-sphere(points, (0.084, 0.105, 0.060), 0.016), 0.0, 0.004))
+    return np.clip(color, 0.02, 1.0)
+
+
+# --- chick ----------------------------------------------------------------------------------------------------------------
+
+
+def chick_distance(points: np.ndarray) -> np.ndarray:
+    """A sitting chick, 0.22 m high: an egg of a body, a round head, a blunt beak, wings and a tail."""
+    both = mirrored(points)
+    body = ellipsoid(points, (-0.010, 0.075, 0.0), (0.095, 0.075, 0.080))
+    body = join(body, sphere(points, (0.035, 0.160, 0.0), 0.060), 0.030)
+    body = join(body, capsule(points, (0.080, 0.156, 0.0), (0.105, 0.150, 0.0), 0.024, 0.020), 0.012)
+    body = join(body, ellipsoid(both, (-0.020, 0.085, 0.078), (0.055, 0.036, 0.024)), 0.016)
+    return join(body, capsule(points, (-0.085, 0.095, 0.0), (-0.118, 0.122, 0.0), 0.028, 0.021), 0.016)
+
+
+def chick_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Yellow down with brown and pale patches, an orange beak, dark eyes of two sizes."""
+    both = mirrored(points)
+    color = coat(points, rng, (0.96, 0.84, 0.36), (0.72, 0.50, 0.20), (0.98, 0.95, 0.80), patch=0.09, grain=0.026)
+    beak = capsule(points, (0.090, 0.154, 0.0), (0.112, 0.149, 0.0), 0.026, 0.024)
+    color = blend(color, (0.93, 0.48, 0.14), step(-beak, 0.0, 0.006))
+    color = blend(color, (0.07, 0.05, 0.05), step(-sphere(both, (0.074, 0.184, 0.038), 0.013), 0.0, 0.003))
+    color = blend(color, (0.24, 0.38, 0.62), step(-sphere(points, (-0.010, 0.080, 0.100), 0.022), 0.0, 0.005))
+    return np.clip(color, 0.02, 1.0)
+
+
 SHAPES = {
     "rabbit": Shape(rabbit_distance, rabbit_color, np.array([[-0.15, -0.01, -0.10], [0.13, 0.27, 0.10]])),
     "peanut": Shape(peanut_distance, peanut_color, np.array([[-0.15, -0.03, -0.09], [0.15, 0.16, 0.09]])),
+    "mandarin": Shape(mandarin_distance, mandarin_color, np.array([[-0.13, -0.02, -0.12], [0.13, 0.21, 0.12]])),
+    "chick1": Shape(chick_distance, chick_color, np.array([[-0.16, -0.02, -0.12], [0.15, 0.24, 0.12]])),
 }
