@@ -84,7 +84,7 @@ OBJECTS = {
         Footage(target=0.26), spacing=0.006,
     ),
     "mandarin": BuiltinObject(
-        "mandarin", 0.17, MANDARIN,
+        "mandarin", 0.1915, MANDARIN,
         {"train": DROPS["train"], "test_60": replace(DROPS["test_60"], offset=(0.0, 0.0)),
          "test_40": replace(DROPS["test_40"], offset=(0.0, 0.0))},
         Footage(target=0.28), spacing=0.0065,
