@@ -73,3 +73,15 @@ def finite_elements(reference_data: Path) -> tuple[np.ndarray, np.ndarray]:
 def distance(times: np.ndarray, tip: np.ndarray, reference: tuple[np.ndarray, np.ndarray]) -> float:
     """Root mean square over time [m]."""
     return float(np.sqrt(np.mean((tip - np.interp(times, *reference)) ** 2)))
+
+
+def held_face_bound(cells: int, reference: tuple[np.ndarray, np.ndarray]) -> float:
+    """Root mean square [m] of what a relative change of stiffness s = 0.21/cells does to the reference u(t).
+
+    A bar softer by s moves as u(t sqrt(1 - s))/(1 - s) = u + s (u - t u'/2): the first-order error of a face held at a plane of
+    nodes (`stiffness_error(0)`), the largest one of the discretisation.
+    """
+    s = -stiffness_error(0.0) / cells
+    times = np.linspace(0.0, END, 501)
+    u = np.interp(times, *reference)
+    return float(np.sqrt(np.mean((s * (u - 0.5 * times * np.gradient(u, times))) ** 2)))
