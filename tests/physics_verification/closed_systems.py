@@ -1,13 +1,13 @@
 """Bodies that nothing from outside acts on: conserved quantities (checks 1 to 3) and free vibration (check 26)."""
 
-from __future__ import annotations
-
 import math
 
 import torch
+import warp as wp
 from bodies import DENSITY, LAM, MU, agitated, eyes, lattice, parameters_of, random_adapter, resting, uniform_volume
 from torch import Tensor
 
+from mosa.physics.laws import LawParameters, register_law
 from mosa.physics.rollout import Simulator
 from mosa.types import ParticleState
 
@@ -52,6 +52,17 @@ def conservation(law: str, dtype: torch.dtype, *, adapted: bool = True, interval
             for name, before, now, scale in zip(("linear", "angular"), start, momenta(state, mass, DX), scales):
                 worst[name] = max(worst[name], float((now - before).abs().max()) / scale)
     return {**worst, "changed": float((state.v - first).abs().max())}
+
+
+@wp.func
+def asymmetric(F: wp.mat33d, R: wp.mat33d, C_affine: wp.mat33d, p: LawParameters):
+    return p[0] * (F - wp.identity(n=3, dtype=wp.float64))
+
+
+def asymmetric_control() -> dict[str, float]:
+    """`conservation` of tau = mu (F - I), whose skew part is a torque on every particle."""
+    register_law("verification_asymmetric", asymmetric, ("mu", "lam"))
+    return conservation("verification_asymmetric", torch.float64, adapted=False, parameters={"mu": MU, "lam": LAM})
 
 
 def vibration(law: str = "corotated", *, periods: int = 20, size: int = 8, amplitude: float = 0.02, dtype=torch.float64,

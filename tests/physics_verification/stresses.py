@@ -13,12 +13,12 @@ from mosa.physics.rollout import Simulator
 from mosa.physics.workspace import SCALARS
 
 
-def stress(law: str, F: Tensor, C: Tensor | None = None, operator=None, reference: Tensor | None = None) -> Tensor:
-    """tau (N, 3, 3) [Pa] in the precision of F (N, 3, 3). operator: what an adapter answered; reference: (N, 3, 3) start rotation."""
+def stress(law: str, F: Tensor, C: Tensor | None = None, operator=None, parameters: dict | None = None) -> Tensor:
+    """tau (N, 3, 3) [Pa] in the precision of F (N, 3, 3). operator: what an adapter answered; `linear` is relative to I."""
     n, dtype = len(F), F.dtype
     C = torch.zeros_like(F) if C is None else C
     sim = Simulator(law, dx=0.1, substeps=1, frame_dt=1e-3, dtype=dtype)
-    packed = sim.pack(parameters_of(law), n, eyes(n, dtype) if reference is None else reference)
+    packed = sim.pack(parameters or parameters_of(law), n, eyes(n, dtype))
     mat33, vec6, mat66, vecp = field_types(SCALARS[dtype])
     G, h = (torch.zeros(1, 6, 6, dtype=dtype), torch.zeros(1, 6, dtype=dtype)) if operator is None else operator[:2]
     tau = torch.zeros(n, 3, 3, dtype=dtype)
@@ -53,6 +53,15 @@ def frame_error(law: str, adapted: bool) -> float:
     tau, turned = function(law, F, C), function(law, Q @ F, Q @ C @ Q.mT)
     expected = Q @ tau @ Q.mT
     return float(((turned - expected).abs().amax((1, 2)) / expected.abs().amax((1, 2))).max())
+
+
+def energy_error(law: str) -> float:
+    """Largest |tau - dPsi/dF F^T| / max |tau| over 200 deformations; of `linear` the symmetric part."""
+    F = deformations(200, 6).requires_grad_()
+    (P,) = torch.autograd.grad(law_named(law).energy(F, **parameters_of(law)).sum(), F)
+    tau = P @ F.detach().mT
+    tau = 0.5 * (tau + tau.mT) if law == "linear" else tau
+    return float((stress(law, F.detach()) - tau).abs().max() / tau.abs().max())
 
 
 def moduli(law: str) -> tuple[float, float]:
