@@ -34,6 +34,7 @@ import bar as bars
 import closed_systems
 import elastic_bodies
 import incline
+import lagrangian
 import stresses
 import unit_figures as units
 from bodies import DENSITY, ELASTIC, LAWS, PRECISIONS, E, is_fluid
@@ -281,13 +282,19 @@ def bar(data, cells: int = 30):
     reference = bars.finite_elements(data)
     axes, rows = panels(2), []
     axes[0].plot(*reference, "k-", lw=2, label="finite elements")
-    for n, across in ((10, 2), (20, 2), (cells, 2)):
-        times, tip = bars.bar(n, across=across)
+    own = lagrangian.elements(16)
+    axes[1].plot(own[0], own[1] - np.interp(own[0], *reference), "k--", lw=1, label="own finite elements, 16 per metre")
+    what = "RMS distance to the finite-element bar"
+    rows.append(["bar", f"{what}, own finite elements, 16 per metre", "-", f"{bars.distance(*own, reference):.4f} m"])
+    for n in (10, 20, cells):
+        times, tip = bars.bar(n)
         rms = bars.distance(times, tip, reference)
         axes[0].plot(times, tip, lw=1, label=f"{n} cells per metre, {rms:.4f} m")
         axes[1].plot(times, tip - np.interp(times, *reference), lw=1)
         asked = "0.05 m, aim 0.02" if n == 30 else f"{bars.held_face_bound(n, reference):.3f} m (derived)"
-        rows.append(["bar", f"RMS distance to the finite-element bar, {n} cells per metre", asked, f"{rms:.4f} m"])
+        reached = f"{rms:.4f} m ({bars.distance(times, tip, own):.4f} m)"
+        rows.append(["bar", f"{what}, {n} cells per metre (to own elements)", asked, reached])
+    axes[1].legend(fontsize=7)
     axes[0].set(xlabel="s", ylabel="displacement of the corner [m]", title="hanging bar")
     axes[1].set(xlabel="s", ylabel="m", title="difference to finite elements")
     axes[0].legend(fontsize=7)
