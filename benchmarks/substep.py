@@ -57,7 +57,9 @@ def measure(dtype: torch.dtype, particles: int, grid: int | None, substeps: int,
     window = grid_window(state[0], state[1], dx, 2 * substeps * sim.dt, 2) if grid is None else ((0, 0, 0), (grid,) * 3)
     results = []
     for with_adjoint in (False, True):
-        work = solver.prepare(state, held, substeps, window, with_adjoint)
+        work = solver.workspace(substeps, False, False, with_adjoint)
+        work.set_window(*window)
+        work.load(state, held, volume, solver.mass, 0.0)
         if law is None:
             launch = work._run
             work._run = lambda kernel, *rest, launch=launch, skip=work.stress: None if kernel is skip else launch(kernel, *rest)
