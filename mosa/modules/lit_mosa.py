@@ -19,6 +19,8 @@ from mosa.modules.stages import Stage
 from mosa.modules.warm_start import warm_start
 from mosa.types import MotionCues, Rollout
 
+MISFIT = 0.01
+"""Misfit of the calibrated prior, over the object's size, at which the penalty of the operator has its stated weight."""
 TERMS = ("image", "mask", "flow", "rotation", "stretch", "heterogeneity", "position", "operator", "operator_variance")
 
 
@@ -55,6 +57,7 @@ class LitMosa(L.LightningModule):
         self.frame_dt, self.first_contact, self.stages = frame_dt, first_contact, list(stages)
         self.weights, self.clip, self.config = dict(weights), clip, config or {}
         self.stage_index, self.losses, self.steps_done = 0, [], 0
+        self.misfit = MISFIT  # of the model the joint stage starts from, measured when it begins
         self.last: dict[str, float] = {}
 
     # ---------------------------------------------------------------- state
@@ -65,7 +68,7 @@ class LitMosa(L.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict) -> None:
         checkpoint["mosa"] = {"config": self.config, "stage": self.stage_index, "losses": list(self.losses),
-                              "steps_done": self.steps_done, "particles": len(self.body.rest)}
+                              "steps_done": self.steps_done, "particles": len(self.body.rest), "misfit": self.misfit}
         checkpoint["mosa"]["start"] = {k: getattr(self.start, k).tolist() for k in
                                        ("rotation", "center", "velocity", "angular_velocity")}
 
@@ -77,6 +80,7 @@ class LitMosa(L.LightningModule):
             raise ConfigError(f"ckpt_path: expected a body of {len(self.body.rest)} particles, found {saved['particles']}: the "
                               "checkpoint belongs to another scene, reconstruction or simulation.particles")
         self.stage_index, self.losses, self.steps_done = saved["stage"], list(saved["losses"]), saved["steps_done"]
+        self.misfit = saved.get("misfit", MISFIT)
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
         return [torch.optim.Adam(self.groups(stage), betas=(0.9, 0.95)) for stage in self.stages]
@@ -163,7 +167,8 @@ class LitMosa(L.LightningModule):
         if collected:
             over_all = pool(collected)  # a variance over time as well as over particles
             if on("operator"):
-                terms["operator"] = (over_all.mean_square + 1e-8).sqrt()
+                # what the prior leaves unexplained is what there is to learn: the expected size of the operator grows with it
+                terms["operator"] = MISFIT / self.misfit * (over_all.mean_square + 1e-8).sqrt()
             if on("operator_variance"):
                 terms["operator_variance"] = over_all.variance
             self.last["mean_abs_C"] = float(over_all.mean_abs_C.detach())
@@ -192,6 +197,14 @@ class LitMosa(L.LightningModule):
             if getattr(getattr(adapter, "operator", None), "no_prior_stress", False):
                 parameters = {k: v.detach() for k, v in material.per_particle(1.0).items()}
                 warm_start(adapter, material_states(material.law, parameters))
+            if self.weights.get("operator", 0.0) != 0:
+                self.misfit = max(self.measure_misfit(), 0.01 * MISFIT)
+
+    @torch.no_grad()
+    def measure_misfit(self) -> float:
+        """Mean distance of the particles from the reconstruction's, over the object's size, without adapter."""
+        rollout = self.body.simulate(self.start, self.world, len(self.cues.positions), self.frame_dt, with_adapter=False)
+        return float(losses.position_loss(rollout.x, self.cues.positions, self.body.size))
 
     def finish(self, stage: Stage) -> None:
         """Keep the stage's result as a backbone and go on to the next; stop the trainer after the last."""

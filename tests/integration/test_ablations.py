@@ -31,10 +31,12 @@ def first_step(tmp_path_factory):
             module.begin(joint)
             with torch.no_grad():
                 terms, _ = module.terms(joint, [0, 1], scene.frames)
+            compute.modules[ablation] = module
             known[ablation] = ({k: float(v) for k, v in terms.items()},
                                {n for n, p in body.named_parameters() if p.requires_grad})
         return known[ablation]
 
+    compute.modules = {}
     return compute
 
 
@@ -78,3 +80,13 @@ def test_no_prior_stress_starts_near_the_prior(first_step):
     assert terms.keys() == full.keys()
     assert terms != full  # the stress now comes from a network
     assert terms["position"] == pytest.approx(full["position"], rel=0.05)  # which was fitted to the prior's
+
+
+def test_the_penalty_of_the_operator_weighs_less_the_more_the_prior_leaves_unexplained(first_step):
+    terms, _ = first_step("full")
+    module = first_step.modules["full"]
+    assert module.misfit == pytest.approx(terms["position"], rel=1e-6)  # the adapter has not moved: the prior's own
+    with torch.no_grad():
+        penalty = [module.terms(module.stages[-1], [0, 1], 3)[0]["operator"] for module.misfit in (0.01, 0.04)]
+    assert float(penalty[0] / penalty[1]) == pytest.approx(4.0, rel=1e-6)
+    assert float(penalty[0]) == pytest.approx(1e-4, rel=1e-3)  # of an operator that is nothing yet

@@ -181,7 +181,7 @@ def peanut_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def mandarin_distance(points: np.ndarray) -> np.ndarray:
-    """A mandarin, 0.19 m high with its stalk and 0.21 m wide: a flattened ball with shallow lobes and a stub of a stalk, leaning a little."""
+    """A mandarin, 0.19 m high and 0.21 m wide: a flattened ball with shallow lobes and a stub of a stalk, leaning a little."""
     centre = np.array([0.0, 0.085, 0.0])
     x, y, z = (points - centre).T
     leaning = np.stack([0.985 * x - 0.174 * y, 0.174 * x + 0.985 * y, z], -1)
