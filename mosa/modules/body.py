@@ -115,8 +115,9 @@ class Body(nn.Module):
         self.contact = ContactOffset(settings.dx, settings.contact_offset)
         backbone = nn.ModuleDict({"material": material, "contact": self.contact})
         self.frozen = nn.ModuleDict({"prior": copy.deepcopy(backbone), "prior_eta": copy.deepcopy(backbone)})
-        if heterogeneity is not None:
-            self.frozen["prior_eta"]["heterogeneity"] = copy.deepcopy(heterogeneity)
+        if heterogeneity is not None:  # the prior's is what a stage that starts from it goes back to; it is never simulated
+            for variant in self.frozen.values():
+                variant["heterogeneity"] = copy.deepcopy(heterogeneity)
         self.frozen.requires_grad_(False)
 
     @property
@@ -142,7 +143,8 @@ class Body(nn.Module):
         if variant not in self.frozen:
             raise ConfigError(f"variant: expected one of {', '.join(VARIANTS)}, found {variant!r}")
         frozen = self.frozen[variant]
-        return frozen["material"], frozen["contact"], frozen["heterogeneity"] if "heterogeneity" in frozen else None, None
+        heterogeneity = frozen["heterogeneity"] if variant == "prior_eta" and "heterogeneity" in frozen else None
+        return frozen["material"], frozen["contact"], heterogeneity, None
 
     def freeze(self, variant: str) -> None:
         """Keep the live parameters as the calibrated backbone `variant` (prior | prior_eta)."""

@@ -167,8 +167,9 @@ class LitMosa(L.LightningModule):
         if collected:
             over_all = pool(collected)  # a variance over time as well as over particles
             if on("operator"):
-                # what the prior leaves unexplained is what there is to learn: the expected size of the operator grows with it
-                terms["operator"] = MISFIT / self.misfit * (over_all.mean_square + 1e-8).sqrt()
+                # what the prior leaves unexplained is what there is to learn: the size that one expects of the operator grows with
+                # it, and the pull of a loss that is a distance, not its square, does not fade as it should with a small misfit
+                terms["operator"] = (MISFIT / self.misfit) ** 2 * (over_all.mean_square + 1e-8).sqrt()
             if on("operator_variance"):
                 terms["operator_variance"] = over_all.variance
             self.last["mean_abs_C"] = float(over_all.mean_abs_C.detach())
@@ -198,7 +199,7 @@ class LitMosa(L.LightningModule):
                 parameters = {k: v.detach() for k, v in material.per_particle(1.0).items()}
                 warm_start(adapter, material_states(material.law, parameters))
             if self.weights.get("operator", 0.0) != 0:
-                self.misfit = max(self.measure_misfit(), 0.01 * MISFIT)
+                self.misfit = max(self.measure_misfit(), 0.1 * MISFIT)
 
     @torch.no_grad()
     def measure_misfit(self) -> float:

@@ -88,5 +88,18 @@ def test_the_penalty_of_the_operator_weighs_less_the_more_the_prior_leaves_unexp
     assert module.misfit == pytest.approx(terms["position"], rel=1e-6)  # the adapter has not moved: the prior's own
     with torch.no_grad():
         penalty = [module.terms(module.stages[-1], [0, 1], 3)[0]["operator"] for module.misfit in (0.01, 0.04)]
-    assert float(penalty[0] / penalty[1]) == pytest.approx(4.0, rel=1e-6)
+    assert float(penalty[0] / penalty[1]) == pytest.approx(16.0, rel=1e-6)
     assert float(penalty[0]) == pytest.approx(1e-4, rel=1e-3)  # of an operator that is nothing yet
+
+
+def test_a_stage_that_starts_from_the_prior_forgets_eta(first_step):
+    first_step("full")
+    body = first_step.modules["full"].body
+    body.freeze("prior")
+    with torch.no_grad():
+        body.heterogeneity.net[-1].bias.fill_(0.3)
+    body.freeze("prior_eta")
+    body.thaw("prior")
+    assert (body.heterogeneity(body.rest) == 0).all() and body.parts("prior")[2] is None
+    body.thaw("prior_eta")
+    assert (body.heterogeneity(body.rest) == 0.3).all()
