@@ -184,8 +184,10 @@ class Body(nn.Module):
     def step_control(self, adapted: bool) -> StepControl:
         """Bounds of adaptive substeps. Errors: ConfigError naming the field."""
         settings = self.settings
-        multiple = settings.stride * -(-8 // settings.stride)
-        return StepControl(settings.courant, ADAPTER_MARGIN if adapted else 1.0, settings.min_substeps, settings.max_substeps, multiple)
+        return StepControl(
+            courant=settings.courant, factor=ADAPTER_MARGIN if adapted else 1.0, minimum=settings.min_substeps,
+            maximum=settings.max_substeps, multiple=settings.stride * -(-8 // settings.stride),
+        )  # fmt: skip
 
     def simulate(
         self,
@@ -203,8 +205,8 @@ class Body(nn.Module):
     ) -> Rollout:
         """Roll `frames` frames out (frame 0 is the start). Differentiable in every parameter and in `start`.
 
-        collect: called with every adapter operator (penalties, mean |C|). counts: substeps of the frame intervals, to replay those of
-        an adaptive rollout. Errors: SimulationDiverged, ConfigError (time step).
+        collect: called with every adapter operator (penalties, mean |C|). counts: of substeps, to replay those of an
+        adaptive rollout. Errors: SimulationDiverged, ConfigError (time step).
         """
         material, contact, heterogeneity, adapter = self.parts(variant)
         if not with_heterogeneity:

@@ -55,7 +55,7 @@ class StepControl:
 def current_modulus(law: Law, F: Tensor, C_affine: Tensor, parameters: Tensor) -> Tensor:
     """(N,) modulus [Pa] of the longitudinal wave as the material is deformed now, without an adapter: c = sqrt(M/rho_0).
 
-    Largest over the principal axes n of F F^T of d tau_nn/d log(lambda_n) + max(-tau_nn, 0), by central differences of the law's own
+    Largest over the principal axes n of F F^T of d tau_nn/d log(lambda_n) + max(-tau_nn, 0), by central differences of the law's
     stress at fixed C_affine. The first term is the material's, the second that of the moving particles (the acoustic tensor has
     -tau_nn in tension too, where it softens; that is not relied on). F: (N, 3, 3); parameters: packed, (N, SLOTS).
     """
@@ -118,9 +118,10 @@ class StepChooser:
         if needed > control.maximum:
             raise ConfigError(
                 f"simulation.max_substeps: expected at least {needed} for frame {frame}, found {control.maximum}: particle "
-                f"{stiffest} has wave speed {c:.3g} m/s at det F = {float(J[stiffest]):.3g} (modulus {float(modulus[stiffest]):.3g} "
-                f"Pa, at rest {float(self.rest_modulus[stiffest]):.3g}, viscosity {mu:.3g} Pa s), speeds reach {fastest:.3g} m/s, dx "
-                f"{dx:.3g} m, frame {self.frame_dt:.3g} s; use a coarser grid (simulation.dx), a softer start, or raise the limit"
+                f"{stiffest} has wave speed {c:.3g} m/s at det F = {float(J[stiffest]):.3g} (modulus "
+                f"{float(modulus[stiffest]):.3g} Pa, at rest {float(self.rest_modulus[stiffest]):.3g}, viscosity {mu:.3g} Pa s), "
+                f"speeds reach {fastest:.3g} m/s, dx {dx:.3g} m, frame {self.frame_dt:.3g} s; use a coarser grid "
+                "(simulation.dx), a softer start, or raise the limit"
             )
         wanted = max(needed, control.minimum)
         return min(-(-wanted // control.multiple) * control.multiple, control.maximum)

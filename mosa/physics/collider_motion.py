@@ -170,8 +170,8 @@ class Motion:
         count = max(len(_vectors(name, getattr(self, name))) for name in ("velocity", "angular_velocity"))
         if count not in (1, frames):
             raise ConfigError(
-                f"motion: velocity and angular_velocity: expected 1 or {frames} (per frame interval) vectors where no times are given "
-                f"and the substeps are adaptive, found {count}; give times"
+                f"motion: velocity and angular_velocity: expected 1 or {frames} (per frame interval) vectors where no times are "
+                f"given and the substeps vary, found {count}; give times"
             )
         return replace(self, times=frame_dt * torch.arange(count, dtype=torch.float64))
 
@@ -216,8 +216,8 @@ def sample_frame(
 ) -> Poses:  # fmt: skip
     """Poses at the substeps of frame interval `frame` (from 0) of `frames`, where every interval has its own count.
 
-    counts: substeps of the intervals up to this one; replayed: whether they were given beforehand. A trajectory, substep by substep,
-    fits given counts alone. Errors: ConfigError.
+    counts: substeps of the intervals up to this one; replayed: whether they were given beforehand. A trajectory fits given
+    counts alone. Errors: ConfigError.
     """
     count, done = counts[frame], sum(counts[:frame])
     dt, parts = frame_dt / count, []
@@ -227,8 +227,8 @@ def sample_frame(
             continue
         if not replayed or start != 0:
             raise ConfigError(
-                "trajectory: it gives poses substep by substep: expected given `counts` and start_time 0, found adaptive substeps or "
-                f"start_time {start}; use a Motion with times or waypoints, or replay with counts"
+                "trajectory: it gives poses substep by substep: expected given `counts` and start_time 0, found adaptive substeps "
+                f"or start_time {start}; use a Motion with times or waypoints, or replay with counts"
             )
         if len(motion.position) < done + count:
             raise ConfigError(f"trajectory: expected poses of at least {done + count} substeps, found {len(motion.position)}")

@@ -67,7 +67,8 @@ class ColliderBuffers:
     def adjoint(self, step: int, place: list, time: float, adj_velocity) -> None:
         """Turns the adjoint of node velocities after contact into that before it; `before` holds those velocities."""
         self._run(self.kernels.adj_collide_nodes, len(adj_velocity), [
-            *self._arguments(place, step, time), self.before_wp, *self._adj_reaction, adj_velocity, self._adj_mass, *self._adj_poses,
+            *self._arguments(place, step, time), self.before_wp, *self._adj_reaction, adj_velocity, self._adj_mass,
+            *self._adj_poses,
         ])  # fmt: skip
 
     def add_mass(self, adj_grid) -> None:

@@ -226,29 +226,18 @@ class Simulator:
             if frame > 1:
                 taken.append(substeps_of(frame, current[1], current[2], current[3]))
             count, first = taken[-1], sum(taken[:-1])
-            dt, offset, steps, forces = self.frame_dt / count, first, None, []
+            dt = self.frame_dt / count
             if variable:
-                offset = 0
                 steps = Steps(dt if lag is None else 0.5 * (lag + dt), dt)
-                if self.colliders:
-                    poses = sample_frame(motions, frame - 1, frames - 1, taken, self.frame_dt, start_time, self.dtype, self.device,
-                                         given is not None)  # fmt: skip
-            done, kick = 0, steps.kick if variable else dt
-            # sizes that few counts share, where counts vary
-            for length in _segments(count, stride if adapter is not None else SEGMENT if variable else None):
-                if adapter is not None:
-                    held.update(self._ask(adapter, current[3], current[2], packed))
-                along = tuple(part[offset + done : offset + done + length] for part in poses)
-                current, reaction = advance_segment(solver, current, held, length, first + done, along, steps)
-                forces += [torch.cat(reaction, -1)] if reaction else []
-                steps = Steps(dt, dt) if variable else None
-                done += length
+                along = self._poses_of_frame(motions, frames, taken, start_time, given is not None)
+                lengths = _segments(count, stride if adapter is not None else SEGMENT)  # sizes that many counts share
+            else:
+                steps, along = None, tuple(part[first : first + count] for part in poses)
+                lengths = _segments(count, stride if adapter is not None else None)
+            current, forces = self._frame(solver, adapter, packed, current, held, lengths, first, along, steps)
             lag = dt
-            if forces:
-                forces = torch.cat(forces)
-                if variable:  # impulse over the time in which it acted
-                    forces = (forces[:1] * (kick / dt - 1) + forces.sum(0, keepdim=True)) / (count - 1 + kick / dt)
-                reactions.append(forces)
+            if forces is not None:
+                reactions.append(_mean_force(forces, steps) if variable else forces)
             for name, value in zip(recorded, (current[0], current[1], current[3], current[4])):
                 recorded[name].append(value)
             if progress is not None:
@@ -264,6 +253,22 @@ class Simulator:
             **stacked, times=times, final=ParticleState(*current), inverted=inverted, reactions=per_frame, counts=tuple(taken)
         )
 
+    def _frame(
+        self, solver: SegmentSolver, adapter: Callable | None, packed: Tensor, state: tuple[Tensor, ...], held: dict,
+        lengths: list[int], first: int, poses: tuple[Tensor, ...], steps: Steps | None,
+    ) -> tuple[tuple[Tensor, ...], Tensor | None]:  # fmt: skip
+        """(state after the segments of a frame, reactions (substeps, K, 6) or None). first: number of its first substep."""
+        forces, done = [], 0
+        for length in lengths:
+            if adapter is not None:
+                held.update(self._ask(adapter, state[3], state[2], packed))
+            along = tuple(part[done : done + length] for part in poses)
+            state, reaction = advance_segment(solver, state, held, length, first + done, along, steps)
+            forces += [torch.cat(reaction, -1)] if reaction else []
+            steps = None if steps is None else Steps(steps.dt, steps.dt)
+            done += length
+        return state, torch.cat(forces) if forces else None
+
     def _motions(self, motions: Sequence[Motion | Trajectory] | None) -> Sequence[Motion | Trajectory]:
         motions = [collider.motion for collider in self.colliders] if motions is None else motions
         if len(motions) != len(self.colliders):
@@ -274,6 +279,14 @@ class Simulator:
         if not self.colliders:
             return ()
         return sample_poses(motions, frames - 1, self.substeps, self.dt, start_time, self.dtype, self.device)
+
+    def _poses_of_frame(
+        self, motions: Sequence[Motion | Trajectory], frames: int, counts: list[int], start_time: float, replayed: bool
+    ) -> tuple[Tensor, ...]:
+        if not self.colliders:
+            return ()
+        last = len(counts) - 1
+        return sample_frame(motions, last, frames - 1, counts, self.frame_dt, start_time, self.dtype, self.device, replayed)
 
     def material_state(self, F: Tensor, C_affine: Tensor, parameters: dict[str, Tensor]) -> MaterialState:
         """What an adapter would read at deformation gradients F (N, 3, 3); differentiable. For analysis and tests."""
@@ -315,6 +328,12 @@ def _segments(substeps: int, stride: int | None) -> list[int]:
         count = -(-substeps // SEGMENT)
         return [substeps // count + (i < substeps % count) for i in range(count)]
     return [min(stride, substeps - i) for i in range(0, substeps, stride)]
+
+
+def _mean_force(forces: Tensor, steps: Steps) -> Tensor:
+    """(1, K, 6) of (S, K, 6): the impulse over the time in which it acted, the first substep's being its kick."""
+    longer = steps.kick / steps.dt - 1
+    return (longer * forces[:1] + forces.sum(0, keepdim=True)) / (len(forces) + longer)
 
 
 def _polar(F: Tensor) -> Tensor:

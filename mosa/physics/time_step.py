@@ -18,7 +18,7 @@ def wave_speed(modulus_max: float, density: float, factor: float = 1.0) -> float
 
 
 def step_rate(speed: float, viscosity: float, density: float, dx: float, v_max: float, courant: float) -> float:
-    """1/dt [1/s] of the largest stable step. speed: wave speed c [m/s]; viscosity [Pa s] of a stress that follows the last C_affine.
+    """1/dt [1/s] of the largest stable step. speed: wave speed c [m/s]; viscosity [Pa s] of a stress mu sym(C_affine).
 
     max(c/(courant dx) + viscosity/(VISCOUS_NUMBER rho dx^2), v_max/(dx/2)). The first two add up: with the damping of the last
     substep the limit of an oscillator is (2/omega)(sqrt(1 + zeta^2) - zeta) >= (2/omega)/(1 + 2 zeta).

@@ -22,9 +22,9 @@ SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
 
 @dataclass(frozen=True)
 class Numerics:
-    """What is constant over a rollout. dx [m], dt [s] (of a rollout with a fixed step), gravity (3,) [m/s^2], planes (P, 5) and modes (P,) from `pack_planes`,
-    low and high (3,) [m] corners of the admissible domain, norm_eps under the root of yield norms, colliders None where there
-    are none."""
+    """What is constant over a rollout. dx [m], dt [s] where the step is fixed, gravity (3,) [m/s^2], planes (P, 5) and modes (P,)
+    from `pack_planes`, low and high (3,) [m] corners of the admissible domain, norm_eps under the root of yield norms, colliders
+    None where there are none."""
 
     law: Law
     dtype: torch.dtype
@@ -295,7 +295,8 @@ class Workspace:
                 self.colliders.add_mass(self.adj_grid_wp)
             self._run(kernels.adj_p2g, n, [
                 self.x_wp[step], self.v_wp[step], self.C_wp[step], self.tau_wp[step], self.mass_wp, self.volume_wp,
-                *self._geometry(self._kick(step)), self.adj_grid_wp, self.adj_x_wp[a], self.adj_v_wp[a], self.adj_C_wp[a], self.adj_tau_wp,
+                *self._geometry(self._kick(step)), self.adj_grid_wp, self.adj_x_wp[a], self.adj_v_wp[a], self.adj_C_wp[a],
+                self.adj_tau_wp,
             ])  # fmt: skip
             self._run(self.stress, n, self._stress_arguments(step, step), [
                 self.adj_F_wp[a], self.adj_C_wp[a], held["parameters"], held["G"], held["h"], self.adj_tau_wp,
