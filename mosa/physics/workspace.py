@@ -242,7 +242,7 @@ class Workspace:
     def _advance(self) -> None:
         kernels, numerics, n = self.kernels, self.numerics, self.particles
         states, grids = len(self.x), len(self.grid)
-        geometry = self._geometry(self.steps.dt)
+        geometry, kicked = self._geometry(self.steps.dt), self._geometry(self.steps.kick)
         low, high = kernels.vec3(*numerics.low), kernels.vec3(*numerics.high)
         if self.colliders is not None:
             self.colliders.reset()
@@ -252,7 +252,7 @@ class Workspace:
             self._run(self.stress, n, self._stress_arguments(a, g))
             self._run(kernels.p2g, n, [
                 self.x_wp[a], self.v_wp[a], self.C_wp[a], self.F_wp[a], self.tau_wp[g], self.mass_wp, self.volume_wp,
-                *self._geometry(self._kick(step)), int(numerics.check_J), step, self.flags_wp, self.grid_wp[g],
+                *(geometry if step else kicked), int(numerics.check_J), step, self.flags_wp, self.grid_wp[g],
             ])  # fmt: skip
             self._run(kernels.grid_update, len(self.grid[g]), [*self._grid_arguments(g, step), self.velocity_wp[g]])
             if self.colliders is not None:
@@ -266,7 +266,7 @@ class Workspace:
 
     def _adjoint(self) -> None:
         kernels, n, held = self.kernels, self.particles, self.adj_held_wp
-        geometry = self._geometry(self.steps.dt)
+        geometry, kicked = self._geometry(self.steps.dt), self._geometry(self.steps.kick)
         for array in held.values():
             array.zero_()
         if self.colliders is not None:
@@ -295,7 +295,7 @@ class Workspace:
                 self.colliders.add_mass(self.adj_grid_wp)
             self._run(kernels.adj_p2g, n, [
                 self.x_wp[step], self.v_wp[step], self.C_wp[step], self.tau_wp[step], self.mass_wp, self.volume_wp,
-                *self._geometry(self._kick(step)), self.adj_grid_wp, self.adj_x_wp[a], self.adj_v_wp[a], self.adj_C_wp[a],
+                *(geometry if step else kicked), self.adj_grid_wp, self.adj_x_wp[a], self.adj_v_wp[a], self.adj_C_wp[a],
                 self.adj_tau_wp,
             ])  # fmt: skip
             self._run(self.stress, n, self._stress_arguments(step, step), [
