@@ -219,7 +219,8 @@ class Body(nn.Module):
         gravity, up = world.gravity.to(self.rest), world.up.to(self.rest)
         timing = {}
         if self.settings.adaptive or counts is not None:
-            # velocities at frame 0 itself: the rollout starts with half a kick, whatever its first substep
+            # every variant takes the substeps its own states ask for; velocities at frame 0 itself: the rollout starts with half a
+            # kick, whatever its first substep
             timing = {"control": self.step_control(self.adapter is not None), "counts": counts, "lag": 0.0}
             substeps = self.settings.max_substeps
             state = self.initial_state(start, 0.0, gravity)

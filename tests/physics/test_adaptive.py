@@ -95,6 +95,19 @@ def test_gradient_is_exact_for_the_counts_taken(law, make_block):
         assert min(abs(value - e) / abs(e) for e in estimates) < 1e-6, (name, value, estimates)
 
 
+def test_single_precision_follows_double_at_the_same_counts(make_block):
+    counts, gradients = (30, 47, 39), []
+    for dtype in (torch.float32, torch.float64):
+        state = make_block(dtype=dtype, velocity=(0.3, -2.0, 0.1))
+        E, v0 = torch.tensor(4e4, dtype=dtype, requires_grad=True), torch.zeros(3, dtype=dtype, requires_grad=True)
+        rollout = simulator("corotated", dx=0.04, dtype=dtype).rollout(
+            replace(state, v=state.v + v0), parameters_of(E), volume_of(state), DENSITY, 4, counts=counts, lag=0.0
+        )
+        gradients.append(torch.autograd.grad((rollout.x[1:] ** 2).sum() / 100, [E, v0]))
+    for single, double in zip(*gradients):
+        assert (single.double() - double).abs().max() < 1e-3 * double.abs().max()
+
+
 def parameters_of(E):
     mu, lam = lame(E, torch.tensor(0.3, dtype=E.dtype))
     return {"mu": mu, "lam": lam}
