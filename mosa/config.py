@@ -55,7 +55,8 @@ def build_body(config: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Body
     torch.manual_seed(cfg["seed"])
     settings = SimulationSettings(
         dx=config["dx"], **{k: cfg["simulation"][k] for k in
-                            ("stride", "max_substeps", "courant", "precision", "contact_offset")})
+                            ("stride", "max_substeps", "courant", "precision", "contact_offset")},
+        **{k: cfg["simulation"][k] for k in ("adaptive", "min_substeps") if k in cfg["simulation"]})  # newer than some checkpoints
     law = dict(cfg["prior"])
     options = law.pop("options", {})
     material = Material(**{k: v for k, v in law.items() if k != "_target_"})

@@ -150,10 +150,11 @@ def vector(name: str, value: Sequence[float]) -> Tensor:
 
 
 def save_rollout(path: str | Path, parts: dict[str, Rollout]) -> None:
-    """npz with x [T, N, 3], F and F_tot [T, N, 3, 3] and times [T] under `<name>/...`."""
+    """npz with x [T, N, 3], F and F_tot [T, N, 3, 3], times [T] and counts [T - 1] (substeps) under `<name>/...`."""
     arrays = {}
     for name, r in parts.items():
-        arrays |= {f"{name}/x": r.x, f"{name}/F": r.F, f"{name}/F_tot": r.F_tot, f"{name}/times": r.times}
+        arrays |= {f"{name}/x": r.x, f"{name}/F": r.F, f"{name}/F_tot": r.F_tot, f"{name}/times": r.times,
+                   f"{name}/counts": torch.tensor(r.counts, dtype=torch.int64)}
     np.savez_compressed(path, **{k: v.detach().cpu().numpy() for k, v in arrays.items()})
 
 

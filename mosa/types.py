@@ -159,6 +159,7 @@ class Rollout:
 
     inverted: number of (particle, frame) pairs with det F <= 0. reactions: (T - 1, substeps, K, 6) force [N] and torque about the
     collider's origin [N m] that the body exerts on each of K colliders, None without colliders; a frame's mean is `.mean(1)`.
+    Where the substeps vary by frame they are (T - 1, 1, K, 6), that mean. counts: substeps of each of the T - 1 frame intervals.
     """
 
     x: Tensor
@@ -169,3 +170,4 @@ class Rollout:
     final: ParticleState
     inverted: int = 0
     reactions: Tensor | None = None
+    counts: tuple[int, ...] = ()

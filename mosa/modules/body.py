@@ -6,7 +6,7 @@ One module for fitting, evaluation and later use, so that what is learned is wha
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from mosa.errors import ConfigError
 from mosa.modules.heterogeneity import HeterogeneityField
 from mosa.modules.material import Material
+from mosa.physics.adaptive import StepControl
 from mosa.physics.boundary import Plane
 from mosa.physics.colliders import Collider, reach
 from mosa.physics.rollout import Simulator
@@ -50,7 +51,8 @@ class World:
 
 @dataclass(frozen=True)
 class SimulationSettings:
-    """dx [m]; `stride`: substeps between evaluations of the networks; `max_substeps` per frame; `precision`: 32 | 64."""
+    """dx [m]; `stride`: substeps between evaluations of the networks; `max_substeps` per frame; `precision`: 32 | 64;
+    `adaptive`: choose the substeps of each frame from the state at its start, at least `min_substeps` (see `physics.adaptive`)."""
 
     dx: float
     stride: int = 8
@@ -58,6 +60,8 @@ class SimulationSettings:
     courant: float = 0.6
     precision: int = 32
     contact_offset: bool = True
+    adaptive: bool = False
+    min_substeps: int = 1
 
 
 def skew(w: Tensor) -> Tensor:
@@ -169,14 +173,23 @@ class Body(nn.Module):
         F = Q.expand(n, 3, 3).contiguous()
         return ParticleState(arm + start.center, v, skew(start.angular_velocity).expand(n, 3, 3).contiguous(), F, F)
 
-    def substeps(self, parameters_modulus: float, frame_dt: float, speed: float, adapted: bool) -> int:
+    def substeps(self, parameters_modulus: float, frame_dt: float, speed: float, adapted: bool, viscosity: float = 0.0) -> int:
         """Substeps per frame that the time step bound asks for, rounded up to whole strides of the adapter."""
         settings = self.settings
         count = required_substeps(
             modulus_max=parameters_modulus, density=self.density, frame_dt=frame_dt, dx=settings.dx, v_max=speed,
             factor=ADAPTER_MARGIN if adapted else 1.0, courant=settings.courant, limit=settings.max_substeps,
+            viscosity=viscosity,
         )
         return -(-count // settings.stride) * settings.stride
+
+    def step_control(self, adapted: bool) -> StepControl:
+        """Bounds of adaptive substeps. Errors: ConfigError naming the field."""
+        settings = self.settings
+        return StepControl(
+            courant=settings.courant, factor=ADAPTER_MARGIN if adapted else 1.0, minimum=settings.min_substeps,
+            maximum=settings.max_substeps, multiple=settings.stride * -(-8 // settings.stride),
+        )  # fmt: skip
 
     def simulate(
         self,
@@ -190,10 +203,12 @@ class Body(nn.Module):
         with_heterogeneity: bool = True,
         collect: Callable | None = None,
         progress: Callable[[int], None] | None = None,
+        counts: Sequence[int] | None = None,
     ) -> Rollout:
         """Roll `frames` frames out (frame 0 is the start). Differentiable in every parameter and in `start`.
 
-        collect: called with every adapter operator (penalties, mean |C|). Errors: SimulationDiverged, ConfigError (time step).
+        collect: called with every adapter operator (penalties, mean |C|). counts: of substeps, to replay those of an
+        adaptive rollout. Errors: SimulationDiverged, ConfigError (time step).
         """
         material, contact, heterogeneity, adapter = self.parts(variant)
         if not with_heterogeneity:
@@ -204,15 +219,25 @@ class Body(nn.Module):
         factor = self.factor(heterogeneity)
         parameters = material.per_particle(factor)
         gravity, up = world.gravity.to(self.rest), world.up.to(self.rest)
-        fall = float(gravity.norm()) * frames * frame_dt
-        speed = float(start.velocity.detach().norm()) + fall
-        speed += float(start.angular_velocity.detach().norm()) * self.size
-        speed += max((c.motion.max_speed(reach(c.shape)) for c in world.colliders), default=0.0)
-        # one time step for all variants of a body: their difference is then the law's, not the integrator's
-        substeps = self.substeps(float(material.max_modulus(factor.detach())), frame_dt, speed, self.adapter is not None)
-        self.last_substeps = substeps
+        timing = {}
+        if self.settings.adaptive or counts is not None:
+            # every variant takes the substeps its own states ask for; velocities at frame 0 itself: the rollout starts with half a
+            # kick, whatever its first substep
+            timing = {"control": self.step_control(self.adapter is not None), "counts": counts, "lag": 0.0}
+            substeps = self.settings.max_substeps
+            state = self.initial_state(start, 0.0, gravity)
+        else:
+            fall = float(gravity.norm()) * frames * frame_dt
+            speed = float(start.velocity.detach().norm()) + fall
+            speed += float(start.angular_velocity.detach().norm()) * self.size
+            speed += max((c.motion.max_speed(reach(c.shape)) for c in world.colliders), default=0.0)
+            # one time step for all variants of a body: their difference is then the law's, not the integrator's
+            substeps = self.substeps(
+                float(material.max_modulus(factor.detach())), frame_dt, speed, self.adapter is not None,
+                float(material.max_viscosity(factor.detach())),
+            )  # fmt: skip
+            state = self.initial_state(start, frame_dt / substeps, gravity)
         simulator = self.simulator(material.law, substeps, frame_dt, world)
-        state = self.initial_state(start, frame_dt / substeps, gravity)
         lift = contact() * up
         state = replace(state, x=state.x + lift)
         state = ParticleState(*(getattr(state, name).to(dtype) for name in ("x", "v", "C_affine", "F", "F_tot")))
@@ -227,7 +252,9 @@ class Body(nn.Module):
             state, {k: p.to(dtype) for k, p in parameters.items()}, self.volume.to(dtype), self.density, frames,
             adapter=operator, stride=self.settings.stride, progress=progress,
             motions=[c.motion.shifted(lift) for c in world.colliders],  # the offset is the ground's: they keep their place
+            **timing,
         )
+        self.last_substeps = -(-sum(rollout.counts) // len(rollout.counts)) if rollout.counts else substeps
         fields = {name: getattr(rollout, name).to(self.rest.dtype) for name in ("x", "v", "F", "F_tot")}
         return replace(rollout, **{**fields, "x": fields["x"] - lift})
 

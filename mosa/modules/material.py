@@ -126,6 +126,12 @@ class Material(nn.Module):
         factor = factor.detach() if isinstance(factor, Tensor) else factor
         return wave_modulus(self.law, {n: v.detach() for n, v in self.per_particle(factor).items()})
 
+    def max_viscosity(self, factor: Tensor | float = 1.0) -> Tensor:
+        """Largest viscosity [Pa s] that bounds the time step, (), 0 where a law's flow is implicit; no gradient."""
+        factor = factor.detach() if isinstance(factor, Tensor) else factor
+        values = {n: v.detach() for n, v in self.per_particle(factor).items()}
+        return law_named(self.law).explicit_viscosity(values).max()
+
     def poisson(self) -> Tensor:
         """Poisson number of the small-strain response, (), without gradient: nu, or that of mu and kappa, at most 0.49."""
         p = {n: v.detach() for n, v in self.physical().items()}

@@ -160,6 +160,21 @@ class Motion:
             )
         return length[count] * torch.arange(count, dtype=torch.float64), count
 
+    def timed(self, frames: int, frame_dt: float) -> "Motion":
+        """The same motion with `times` said: what one velocity per frame interval means, whatever the substeps.
+
+        Errors: ConfigError for another number of velocities without times: substeps of varying length have no such list.
+        """
+        if self.times is not None:
+            return self
+        count = max(len(_vectors(name, getattr(self, name))) for name in ("velocity", "angular_velocity"))
+        if count not in (1, frames):
+            raise ConfigError(
+                f"motion: velocity and angular_velocity: expected 1 or {frames} (per frame interval) vectors where no times are "
+                f"given and the substeps vary, found {count}; give times"
+            )
+        return replace(self, times=frame_dt * torch.arange(count, dtype=torch.float64))
+
     def max_speed(self, reach: float) -> float:
         """Bound of the speed [m/s] of a point within `reach` [m] of the origin."""
         linear, angular = (_vectors("", v).detach().norm(dim=1).max() for v in (self.velocity, self.angular_velocity))
@@ -193,6 +208,45 @@ class Trajectory:
     def max_speed(self, reach: float) -> float:
         linear, angular = (v.detach().norm(dim=1).max() for v in (self.velocity, self.angular_velocity))
         return float(linear + reach * angular)
+
+
+def sample_frame(
+    motions: Sequence[Motion | Trajectory], frame: int, frames: int, counts: Sequence[int], frame_dt: float, start: float,
+    dtype: torch.dtype, device: torch.device, replayed: bool,
+) -> Poses:  # fmt: skip
+    """Poses at the substeps of frame interval `frame` (from 0) of `frames`, where every interval has its own count.
+
+    counts: substeps of the intervals up to this one; replayed: whether they were given beforehand. A trajectory fits given
+    counts alone. Errors: ConfigError.
+    """
+    count, done = counts[frame], sum(counts[:frame])
+    dt, parts = frame_dt / count, []
+    for motion in motions:
+        if isinstance(motion, Motion):
+            parts.append(motion.timed(frames, frame_dt))
+            continue
+        if not replayed or start != 0:
+            raise ConfigError(
+                "trajectory: it gives poses substep by substep: expected given `counts` and start_time 0, found adaptive substeps "
+                f"or start_time {start}; use a Motion with times or waypoints, or replay with counts"
+            )
+        if len(motion.position) < done + count:
+            raise ConfigError(f"trajectory: expected poses of at least {done + count} substeps, found {len(motion.position)}")
+        cut = slice(done, done + count)
+        piece = Trajectory(motion.position[cut], motion.rotation[cut], motion.velocity[cut], motion.angular_velocity[cut])
+        # seen from the frame's own start
+        parts.append(_Shifted(piece, start + frame * frame_dt))
+    return sample_poses(parts, 1, count, dt, start + frame * frame_dt, dtype, device)
+
+
+class _Shifted(NamedTuple):
+    """A trajectory whose first substep is at time `origin` [s]."""
+
+    trajectory: Trajectory
+    origin: float
+
+    def sample(self, frames: int, substeps: int, dt: float, start: float = 0.0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return self.trajectory.sample(frames, substeps, dt, start - self.origin)
 
 
 def sample_poses(

@@ -14,8 +14,8 @@ class ColliderBuffers:
     about the collider's origin (S, K, 3), as the body exerts them on the collider in world axes.
     """
 
-    def __init__(self, packed: PackedColliders, scalar, substeps: int, dt: float, allocate, run, with_adjoint: bool) -> None:
-        self.count, self.inverse_dt = len(packed), 1.0 / dt
+    def __init__(self, packed: PackedColliders, scalar, substeps: int, allocate, run, with_adjoint: bool) -> None:
+        self.count = len(packed)
         self.kernels = collider_kernels(scalar)
         self._scalar, self._allocate, self._run, self.with_adjoint = scalar, allocate, run, with_adjoint
         self._packed = [
@@ -56,17 +56,19 @@ class ColliderBuffers:
         for array in self._adj_poses:
             array.zero_()
 
-    def _arguments(self, place: list, step: int) -> list:
-        return [*place, self.inverse_dt, self.count, step, *self._packed, *self._poses]
+    def _arguments(self, place: list, step: int, time: float) -> list:
+        return [*place, 1.0 / time, self.count, step, *self._packed, *self._poses]
 
-    def apply(self, step: int, place: list, velocity) -> None:
-        """Contact at substep `step`, on node velocities in place. place: grid, cutoff, origin, dims, dx."""
-        self._run(self.kernels.collide_nodes, len(velocity), [*self._arguments(place, step), velocity, *self._reaction])
+    def apply(self, step: int, place: list, time: float, velocity) -> None:
+        """Contact at substep `step`, on node velocities in place. place: grid, cutoff, origin, dims, dx; time [s]: for which the
+        substep's forces act."""
+        self._run(self.kernels.collide_nodes, len(velocity), [*self._arguments(place, step, time), velocity, *self._reaction])
 
-    def adjoint(self, step: int, place: list, adj_velocity) -> None:
+    def adjoint(self, step: int, place: list, time: float, adj_velocity) -> None:
         """Turns the adjoint of node velocities after contact into that before it; `before` holds those velocities."""
         self._run(self.kernels.adj_collide_nodes, len(adj_velocity), [
-            *self._arguments(place, step), self.before_wp, *self._adj_reaction, adj_velocity, self._adj_mass, *self._adj_poses,
+            *self._arguments(place, step, time), self.before_wp, *self._adj_reaction, adj_velocity, self._adj_mass,
+            *self._adj_poses,
         ])  # fmt: skip
 
     def add_mass(self, adj_grid) -> None:

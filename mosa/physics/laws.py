@@ -7,6 +7,7 @@ own with `register_law`. Bodies of different laws in one grid: `mixture`.
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import torch
 import warp as wp
 from torch import Tensor
 
@@ -32,6 +33,8 @@ class Law:
     energy: torch function (F (..., 3, 3), **parameters) -> energy per rest volume [J/m^3], or None; see `energies`.
     modulus: torch function (**parameters) -> P wave modulus M at rest [Pa] for the time step, elementwise; None: lam + 2 mu or
     kappa + 4 mu/3, whichever the parameters give.
+    viscosity: torch function (**parameters) -> viscosity mu [Pa s] of a stress mu J sym(C_affine), for the time step, elementwise;
+    None: the stress does not take C_affine, or a flow that is integrated implicitly.
     """
 
     name: str
@@ -43,6 +46,7 @@ class Law:
     needs_positive_J: bool = False
     energy: Callable | None = None
     modulus: Callable | None = None
+    viscosity: Callable | None = None
     offsets: dict[str, int] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -71,6 +75,12 @@ class Law:
             f"law {self.name!r}: expected parameters mu and lam, or mu and kappa, found {', '.join(parameters)}; register the "
             "law with `modulus`"
         )
+
+    def explicit_viscosity(self, parameters: dict[str, Tensor]) -> Tensor:
+        """Viscosity [Pa s] that bounds the time step, of the parameters' shape, 0 where the law has none. Physical values."""
+        if self.viscosity is None:
+            return torch.as_tensor(next(iter(parameters.values()))).new_zeros(())
+        return self.viscosity(**parameters)
 
 
 _LAWS: dict[str, Law] = {}

@@ -44,21 +44,23 @@ def register_mixture(name: str, laws: Sequence[Law]) -> Law:
     return register_law(
         name, stress, parameters, return_map=mapping, uses_rotation=any(law.uses_rotation for law in laws),
         reference=next(iter(references), None), needs_positive_J=any(law.needs_positive_J for law in laws),
-        energy=None, modulus=_modulus(laws),
+        energy=None, modulus=_by_law(laws, Law.wave_modulus), viscosity=_by_law(laws, Law.explicit_viscosity),
     )  # fmt: skip
 
 
-def _modulus(laws: Sequence[Law]) -> Callable:
-    def modulus(**parameters: Tensor) -> Tensor:
+def _by_law(laws: Sequence[Law], quantity: Callable) -> Callable:
+    """quantity (law, its parameters) of each particle's own law, as a function of the mixture's parameters."""
+
+    def chosen(**parameters: Tensor) -> Tensor:
         index = torch.as_tensor(parameters[INDEX])
-        parts = [law.wave_modulus({k: parameters[k] for k in law.parameters if k in parameters}) for law in laws]
+        parts = [quantity(law, {k: parameters[k] for k in law.parameters if k in parameters}) for law in laws]
         result = torch.zeros(torch.broadcast_shapes(index.shape, *(p.shape for p in parts)), dtype=parts[0].dtype)
         result = result.to(parts[0].device)
         for i, part in enumerate(parts):
             result = torch.where(index == i, part, result)
         return result
 
-    return modulus
+    return chosen
 
 
 def _gather(law: Law, parameters: dict[str, int]) -> Callable:

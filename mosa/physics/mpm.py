@@ -12,9 +12,9 @@ from torch import Tensor
 
 from mosa.errors import SimulationDiverged
 from mosa.physics.laws import Law
-from mosa.physics.material_kernels import field_types, return_kernel, state_kernel
+from mosa.physics.material_kernels import field_types, return_kernel, state_kernel, stress_kernel
 from mosa.physics.mpm_kernels import INVERTED, NO_EVENT, NONFINITE, OUTSIDE, WINDOW
-from mosa.physics.workspace import SCALARS, Numerics, Workspace
+from mosa.physics.workspace import SCALARS, Numerics, Steps, Workspace
 
 HELD = ("parameters", "G", "h", "plastic_G", "plastic_h")
 MAX_NODES = 2**23
@@ -63,34 +63,40 @@ class SegmentSolver:
             )  # fmt: skip
         return self._workspaces[key]
 
-    def prepare(self, state: tuple[Tensor, ...], held: dict, poses, substeps: int, window, with_adjoint: bool) -> Workspace:
+    def prepare(
+        self, state: tuple[Tensor, ...], held: dict, poses, substeps: int, window, with_adjoint: bool,
+        steps: Steps | None = None,
+    ) -> Workspace:  # fmt: skip
         """A workspace loaded with the start of a segment. poses: of the colliders at its substeps, None where there are none."""
         work = self.workspace(substeps, held["G"] is not None, held["plastic_G"] is not None, with_adjoint)
         work.set_window(*window)
-        work.load(state, held, self.volume, self.mass, self.cutoff, poses)
+        work.load(state, held, self.volume, self.mass, self.cutoff, poses, steps)
         return work
 
-    def advance(self, state: tuple[Tensor, ...], held: dict, poses, substeps: int, first: int) -> tuple[tuple, tuple, tuple]:
+    def advance(
+        self, state: tuple[Tensor, ...], held: dict, poses, substeps: int, first: int, steps: Steps | None = None
+    ) -> tuple[tuple, tuple, tuple]:
         """(state after `substeps`, reactions (force, torque) of the colliders or (), grid window used).
 
-        first: number of the first substep, for messages.
+        first: number of the first substep, for messages; steps: their times, the numerics' dt by default.
 
         Errors: SimulationDiverged naming substep and particle.
         """
         # the speed at the start tells the window; a body that is being accelerated may need the most that the time step bound
         # allows, half a cell per substep
+        steps = steps or Steps(self.numerics.dt, self.numerics.dt)
         for margin in (2, 3 + substeps // 2):
-            origin, dims = grid_window(state[0], state[1], self.numerics.dx, 2 * substeps * self.numerics.dt, margin)
+            origin, dims = grid_window(state[0], state[1], self.numerics.dx, 2 * substeps * steps.dt, margin)
             self._dims = dims = tuple(max(a, b) for a, b in zip(dims, self._dims))
-            work = self.prepare(state, held, poses, substeps, (origin, dims), with_adjoint=False)
+            work = self.prepare(state, held, poses, substeps, (origin, dims), with_adjoint=False, steps=steps)
             work.advance()
             flags = work.flags.tolist()
-            if not self._left_window(flags, first):
+            if not self._left_window(flags, first, steps.dt):
                 reaction = () if work.colliders is None else tuple(t.clone() for t in work.colliders.reaction)
                 return work.final(), reaction, (origin, dims)
-        raise self._error(WINDOW, flags[WINDOW], first)
+        raise self._error(WINDOW, flags[WINDOW], first, steps.dt)
 
-    def _left_window(self, flags: list[int], first: int) -> bool:
+    def _left_window(self, flags: list[int], first: int, dt: float) -> bool:
         """Whether a particle left the grid's window; any other event raises."""
         if min(flags) == NO_EVENT:
             return False
@@ -98,9 +104,9 @@ class SegmentSolver:
         event = min(range(4), key=lambda i: (flags[i] // n, i != INVERTED, i == WINDOW, flags[i]))
         if event == WINDOW:
             return True
-        raise self._error(event, flags[event], first)
+        raise self._error(event, flags[event], first, dt)
 
-    def _error(self, event: int, flag: int, first: int) -> SimulationDiverged:
+    def _error(self, event: int, flag: int, first: int, dt: float) -> SimulationDiverged:
         substep, particle = first + flag // len(self.volume), flag % len(self.volume)
         law, numerics = self.numerics.law, self.numerics
         what = {
@@ -111,19 +117,19 @@ class SegmentSolver:
             + (f"law {law.name} has no value for" if law.needs_positive_J else "on_inversion=error forbids"),
         }[event]
         return SimulationDiverged(
-            f"substep {substep}, particle {particle}: {what} (dt {numerics.dt:.3g} s, dx {numerics.dx:.3g} m); "
+            f"substep {substep}, particle {particle}: {what} (dt {dt:.3g} s, dx {numerics.dx:.3g} m); "
             "use more substeps, a larger box, or parameters nearer to the calibrated ones"
         )
 
 
 class _Segment(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, solver: SegmentSolver, substeps: int, first: int, *inputs):
+    def forward(ctx, solver: SegmentSolver, substeps: int, first: int, steps: Steps | None, *inputs):
         """inputs: state (5), held (5), and, where there are colliders, their poses at the segment's substeps (4)."""
         state = tuple(t.detach().contiguous() for t in inputs[:5])
         held, poses = dict(zip(HELD, inputs[5:10], strict=True)), inputs[10:] or None
-        result, reaction, window = solver.advance(state, held, poses, substeps, first)
-        ctx.solver, ctx.substeps, ctx.window = solver, substeps, window
+        result, reaction, window = solver.advance(state, held, poses, substeps, first, steps)
+        ctx.solver, ctx.substeps, ctx.window, ctx.steps = solver, substeps, window, steps
         ctx.states = 5 if solver.numerics.law.plastic else 4
         ctx.save_for_backward(*state, *inputs[5:])
         return *result[: ctx.states], *reaction
@@ -133,7 +139,7 @@ class _Segment(torch.autograd.Function):
     def backward(ctx, *seeds):
         saved = ctx.saved_tensors
         state, held, poses = saved[:5], dict(zip(HELD, saved[5:10], strict=True)), saved[10:] or None
-        work = ctx.solver.prepare(state, held, poses, ctx.substeps, ctx.window, with_adjoint=True)
+        work = ctx.solver.prepare(state, held, poses, ctx.substeps, ctx.window, with_adjoint=True, steps=ctx.steps)
         work.advance()
         slot = ctx.substeps % 2
         targets = [work.adj_x, work.adj_v, work.adj_C, work.adj_F, work.adj_A][: ctx.states]
@@ -144,18 +150,19 @@ class _Segment(torch.autograd.Function):
         gradients = [target[0].clone() for target in targets] + [None] * (5 - ctx.states)
         gradients += [None if held[name] is None else work.adj_held[name].clone() for name in HELD]
         gradients += [] if poses is None else [t.clone() for t in work.colliders.adj_poses]
-        return None, None, None, *gradients
+        return None, None, None, None, *gradients
 
 
 def advance_segment(
-    solver: SegmentSolver, state: tuple[Tensor, ...], held: dict, substeps: int, first: int, poses: tuple[Tensor, ...] = ()
+    solver: SegmentSolver, state: tuple[Tensor, ...], held: dict, substeps: int, first: int, poses: tuple[Tensor, ...] = (),
+    steps: Steps | None = None,
 ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
     """((x, v, C_affine, F, F_tot) after `substeps`, reactions), differentiable in state, everything in `held`, and poses.
 
     poses: of K colliders at the segment's S substeps, as `collider_motion.Poses`, () where there are none; reactions: force [N]
-    and torque about each collider's origin [N m], (S, K, 3), or ().
+    and torque about each collider's origin [N m], (S, K, 3), or (). steps: times of the substeps, the numerics' dt by default.
     """
-    result = _Segment.apply(solver, substeps, first, *state, *(held[name] for name in HELD), *poses)
+    result = _Segment.apply(solver, substeps, first, steps, *state, *(held[name] for name in HELD), *poses)
     count = 5 if solver.numerics.law.plastic else 4
     final, reaction = result[:count], result[count:]
     return (final if count == 5 else (*final, final[3])), reaction
@@ -169,6 +176,19 @@ def _stream(device: torch.device):
 
 def _arrays(tensors: list[Tensor], kinds: list) -> list:
     return [wp.from_torch(t.detach().contiguous(), dtype=kind) for t, kind in zip(tensors, kinds, strict=True)]
+
+
+@torch.no_grad()
+def kirchhoff_stress(law: Law, F: Tensor, C_affine: Tensor, parameters: Tensor) -> Tensor:
+    """tau (N, 3, 3) [Pa] of the law alone, without an adapter. No gradient."""
+    scalar = SCALARS[F.dtype]
+    mat33, vec6, mat66, vecp = field_types(scalar)
+    kernel = stress_kernel(law.stress, law.uses_rotation, scalar, False)
+    blank, tau = F.new_zeros(1, 6, 6), torch.zeros_like(F, memory_format=torch.contiguous_format)
+    with _stream(F.device):
+        arrays = _arrays([F, C_affine, parameters, blank, blank[0, :1], tau], [mat33, mat33, vecp, mat66, vec6, mat33])
+        wp.launch(kernel, len(F), inputs=arrays, device=arrays[0].device)
+    return tau
 
 
 class _MaterialState(torch.autograd.Function):

@@ -9,19 +9,21 @@ the order of method.md, section 6, cut at another place.
 import math
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
+from mosa.physics.adaptive import StepChooser, StepControl, check_counts
 from mosa.physics.boundary import Plane, ground_plane, pack_planes
-from mosa.physics.collider_motion import Motion, Trajectory, sample_poses
-from mosa.physics.colliders import Collider, pack_colliders
+from mosa.physics.collider_motion import Motion, Trajectory, sample_frame, sample_poses
+from mosa.physics.colliders import Collider, pack_colliders, reach
 from mosa.physics.laws import SLOTS, law_named
 from mosa.physics.mpm import SegmentSolver, advance_segment, first_advance, material_state
 from mosa.physics.plasticity import yield_factor
-from mosa.physics.workspace import SCALARS, Numerics
+from mosa.physics.workspace import SCALARS, Numerics, Steps
 from mosa.types import Ground, ParticleState, Rollout
 
 SEGMENT = 32
@@ -164,6 +166,9 @@ class Simulator:
         started: bool = False,
         motions: Sequence[Motion | Trajectory] | None = None,
         start_time: float = 0.0,
+        control: StepControl | None = None,
+        counts: Sequence[int] | None = None,
+        lag: float | None = None,
     ) -> Rollout:
         """`frames` frames, the start being frame 0 (so frames - 1 intervals are simulated).
 
@@ -171,6 +176,10 @@ class Simulator:
         rollout). parameters: physical values the law names, per particle (N,) or scalar; volume: (N,) [m^3]; density [kg/m^3].
         adapter: asked every `stride` substeps from the start of each frame. progress: called with the number of each frame.
         motions: of the colliders, instead of their own; start_time [s]: time of frame 0 in these motions.
+        control: choose the substeps of each frame from the state at its start (see `adaptive`) instead of taking `substeps`;
+        counts: of the frames - 1 intervals, instead of choosing: a replay, in which differences hold the substeps fixed.
+        lag [s]: with either, the start's velocities are those lag/2 before its positions: 0 for velocities at frame 0 itself,
+        frame_dt/counts[-1] of an earlier rollout that this one goes on from, None: the first substep's dt, as with a fixed step.
         Frame 0 of the result holds the state as given. Errors: SimulationDiverged naming substep and particle; ConfigError.
         """
         if frames < 1 or stride < 1:
@@ -188,26 +197,47 @@ class Simulator:
         solver = SegmentSolver(self.numerics, volume, density, cutoff, self._workspaces)
         held = {"parameters": packed, "G": None, "h": None, "plastic_G": None, "plastic_h": None}
         recorded = {"x": [state.x], "v": [state.v], "F": [F], "F_tot": [F_tot]}
+        motions = self._motions(motions)
+        given, chooser, variable = None, None, control is not None or counts is not None
+        if counts is not None:
+            given = check_counts(counts, frames)
+        elif variable:
+            solids = max((m.max_speed(reach(c.shape)) for m, c in zip(motions, self.colliders)), default=0.0)
+            chooser = StepChooser(control, self.numerics, parameters, packed, density, self.frame_dt, solids)
+
+        def substeps_of(frame: int, v: Tensor, C: Tensor, F: Tensor) -> int:
+            if not variable:
+                return self.substeps
+            return given[frame - 1] if given is not None else chooser.choose(frame, v, C, F)
+
+        taken = [substeps_of(1, state.v, C, F)] if frames > 1 else []
         if not started:
+            numerics = replace(self.numerics, dt=self.frame_dt / taken[0]) if taken else self.numerics
             if self.law.plastic:
-                F_tot = F_tot + self.dt * (C @ F_tot)
+                F_tot = F_tot + numerics.dt * (C @ F_tot)
                 operator = self._ask(adapter, F, C, packed) if adapter is not None else held
-                F = first_advance(self.numerics, F, C, packed, operator["plastic_G"], operator["plastic_h"])
+                F = first_advance(numerics, F, C, packed, operator["plastic_G"], operator["plastic_h"])
             else:
-                F = F_tot = first_advance(self.numerics, F, C, packed)
+                F = F_tot = first_advance(numerics, F, C, packed)
         current = (state.x, state.v, C, F, F_tot)
-        poses = self._poses(motions, frames, start_time)
+        poses = () if variable else self._poses(motions, frames, start_time)
         reactions = []
-        lengths = _segments(self.substeps, stride if adapter is not None else None)
         for frame in range(1, frames):
-            first = (frame - 1) * self.substeps
-            for length in lengths:
-                if adapter is not None:
-                    held.update(self._ask(adapter, current[3], current[2], packed))
-                along = tuple(part[first : first + length] for part in poses)
-                current, reaction = advance_segment(solver, current, held, length, first, along)
-                reactions += [torch.cat(reaction, -1)] if reaction else []
-                first += length
+            if frame > 1:
+                taken.append(substeps_of(frame, current[1], current[2], current[3]))
+            count, first = taken[-1], sum(taken[:-1])
+            dt = self.frame_dt / count
+            if variable:
+                steps = Steps(dt if lag is None else 0.5 * (lag + dt), dt)
+                along = self._poses_of_frame(motions, frames, taken, start_time, given is not None)
+                lengths = _segments(count, stride if adapter is not None else SEGMENT)  # sizes that many counts share
+            else:
+                steps, along = None, tuple(part[first : first + count] for part in poses)
+                lengths = _segments(count, stride if adapter is not None else None)
+            current, forces = self._frame(solver, adapter, packed, current, held, lengths, first, along, steps)
+            lag = dt
+            if forces is not None:
+                reactions.append(_mean_force(forces, steps) if variable else forces)
             for name, value in zip(recorded, (current[0], current[1], current[3], current[4])):
                 recorded[name].append(value)
             if progress is not None:
@@ -218,16 +248,45 @@ class Simulator:
         inverted = int((torch.linalg.det(stacked["F"].detach()) <= 0).sum())
         if inverted and self.on_inversion == "warn":
             warnings.warn(f"{inverted} particle states with det F <= 0 in {frames} frames", stacklevel=2)
-        per_frame = torch.cat(reactions).unflatten(0, (frames - 1, self.substeps)) if reactions else None
-        return Rollout(**stacked, times=times, final=ParticleState(*current), inverted=inverted, reactions=per_frame)
+        per_frame = torch.stack(reactions) if reactions else None
+        return Rollout(
+            **stacked, times=times, final=ParticleState(*current), inverted=inverted, reactions=per_frame, counts=tuple(taken)
+        )
 
-    def _poses(self, motions: Sequence[Motion | Trajectory] | None, frames: int, start_time: float) -> tuple[Tensor, ...]:
+    def _frame(
+        self, solver: SegmentSolver, adapter: Callable | None, packed: Tensor, state: tuple[Tensor, ...], held: dict,
+        lengths: list[int], first: int, poses: tuple[Tensor, ...], steps: Steps | None,
+    ) -> tuple[tuple[Tensor, ...], Tensor | None]:  # fmt: skip
+        """(state after the segments of a frame, reactions (substeps, K, 6) or None). first: number of its first substep."""
+        forces, done = [], 0
+        for length in lengths:
+            if adapter is not None:
+                held.update(self._ask(adapter, state[3], state[2], packed))
+            along = tuple(part[done : done + length] for part in poses)
+            state, reaction = advance_segment(solver, state, held, length, first + done, along, steps)
+            forces += [torch.cat(reaction, -1)] if reaction else []
+            steps = None if steps is None else Steps(steps.dt, steps.dt)
+            done += length
+        return state, torch.cat(forces) if forces else None
+
+    def _motions(self, motions: Sequence[Motion | Trajectory] | None) -> Sequence[Motion | Trajectory]:
         motions = [collider.motion for collider in self.colliders] if motions is None else motions
         if len(motions) != len(self.colliders):
             raise ConfigError(f"motions: expected one for each of {len(self.colliders)} colliders, found {len(motions)}")
+        return motions
+
+    def _poses(self, motions: Sequence[Motion | Trajectory], frames: int, start_time: float) -> tuple[Tensor, ...]:
         if not self.colliders:
             return ()
         return sample_poses(motions, frames - 1, self.substeps, self.dt, start_time, self.dtype, self.device)
+
+    def _poses_of_frame(
+        self, motions: Sequence[Motion | Trajectory], frames: int, counts: list[int], start_time: float, replayed: bool
+    ) -> tuple[Tensor, ...]:
+        if not self.colliders:
+            return ()
+        last = len(counts) - 1
+        return sample_frame(motions, last, frames - 1, counts, self.frame_dt, start_time, self.dtype, self.device, replayed)
 
     def material_state(self, F: Tensor, C_affine: Tensor, parameters: dict[str, Tensor]) -> MaterialState:
         """What an adapter would read at deformation gradients F (N, 3, 3); differentiable. For analysis and tests."""
@@ -269,6 +328,12 @@ def _segments(substeps: int, stride: int | None) -> list[int]:
         count = -(-substeps // SEGMENT)
         return [substeps // count + (i < substeps % count) for i in range(count)]
     return [min(stride, substeps - i) for i in range(0, substeps, stride)]
+
+
+def _mean_force(forces: Tensor, steps: Steps) -> Tensor:
+    """(1, K, 6) of (S, K, 6): the impulse over the time in which it acted, the first substep's being its kick."""
+    longer = steps.kick / steps.dt - 1
+    return (longer * forces[:1] + forces.sum(0, keepdim=True)) / (len(forces) + longer)
 
 
 def _polar(F: Tensor) -> Tensor:

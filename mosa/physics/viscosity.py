@@ -135,6 +135,11 @@ def newtonian_modulus(kappa: Tensor, **unused: Tensor) -> Tensor:
     return 7 * kappa
 
 
+def newtonian_viscosity(mu: Tensor, **unused: Tensor) -> Tensor:
+    """mu [Pa s]: its stress takes the last C_affine, which bounds the time step."""
+    return mu
+
+
 _SOLID = {"mu": 1, "kappa": 1, "yield_stress": 1, "viscosity": 1}
 register_law(
     "herschel_bulkley", herschel_bulkley, _SOLID, return_map=herschel_bulkley_return, needs_positive_J=True,
@@ -146,5 +151,5 @@ register_law(
 )  # fmt: skip
 register_law(
     "newtonian", newtonian, {"mu": 1, "kappa": 1}, return_map=newtonian_return, energy=newtonian_energy,
-    modulus=newtonian_modulus,
+    modulus=newtonian_modulus, viscosity=newtonian_viscosity,
 )  # fmt: skip

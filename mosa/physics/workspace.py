@@ -1,10 +1,11 @@
 """Device buffers of a segment of substeps, and the launches that advance it and run its adjoint.
 
 Everything is allocated once per (particles, slots, grid window); nothing allocates inside the substep loop. On CUDA the
-launches of a segment are captured as one graph the second time they are asked for.
+launches of a segment are captured as one graph the second time they are asked for with the same time step.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import warp as wp
@@ -21,9 +22,9 @@ SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
 
 @dataclass(frozen=True)
 class Numerics:
-    """What is constant over a rollout. dx [m], dt [s], gravity (3,) [m/s^2], planes (P, 5) and modes (P,) from `pack_planes`,
-    low and high (3,) [m] corners of the admissible domain, norm_eps under the root of yield norms, colliders None where there
-    are none."""
+    """What is constant over a rollout. dx [m], dt [s] where the step is fixed, gravity (3,) [m/s^2], planes (P, 5) and modes (P,)
+    from `pack_planes`, low and high (3,) [m] corners of the admissible domain, norm_eps under the root of yield norms, colliders
+    None where there are none."""
 
     law: Law
     dtype: torch.dtype
@@ -40,6 +41,21 @@ class Numerics:
     rebuild: bool
     check_J: bool
     colliders: PackedColliders | None = None
+
+
+class Steps(NamedTuple):
+    """Times [s] of a segment's substeps: each moves particles by `dt`; the first one's forces act for `kick`, the others' for dt.
+
+    Velocities lie between positions, half a substep back. Where dt changes, the way from the middle of the last substep to that
+    of the next is the mean of the two: with that kick the scheme stays the leapfrog that it is at a constant dt.
+    """
+
+    kick: float
+    dt: float
+
+
+MAX_GRAPHS = 64
+"""Captured graphs a workspace keeps: one per pass and time step."""
 
 
 class Workspace:
@@ -95,11 +111,12 @@ class Workspace:
         self.colliders = None
         if numerics.colliders is not None:
             self.colliders = ColliderBuffers(
-                numerics.colliders, self.scalar, substeps, numerics.dt, self._array, self._run, with_adjoint
+                numerics.colliders, self.scalar, substeps, self._array, self._run, with_adjoint
             )
         self.cutoff = 0.0
         self.dims = (0, 0, 0)
-        self._graphs: dict[str, object] = {}
+        self.steps = Steps(numerics.dt, numerics.dt)
+        self._graphs: dict[tuple, object] = {}
 
     def _array(self, shape: tuple[int, ...], kind, dtype: torch.dtype | None = None):
         tensor = torch.zeros(shape, dtype=dtype or self.numerics.dtype, device=self.numerics.device)
@@ -127,9 +144,12 @@ class Workspace:
 
     def load(
         self, state: tuple[Tensor, ...], held: dict[str, Tensor | None], volume: Tensor, mass: Tensor, cutoff: float,
-        poses: tuple[Tensor, ...] | None = None,
+        poses: tuple[Tensor, ...] | None = None, steps: Steps | None = None,
     ) -> None:  # fmt: skip
-        """Copy the start of a segment in: (x, v, C_affine, F, F_tot), the parameters, the adapter's operator, colliders' poses."""
+        """Copy the start of a segment in: (x, v, C_affine, F, F_tot), the parameters, the adapter's operator, colliders' poses.
+
+        steps: the numerics' dt by default."""
+        self.steps = steps or Steps(self.numerics.dt, self.numerics.dt)
         if self.colliders is not None:
             self.colliders.load(poses)
         for slots, value in zip((self.x, self.v, self.C, self.F), state[:4], strict=True):
@@ -167,16 +187,19 @@ class Workspace:
             body()
             return
         stream = wp.stream_from_torch(torch.cuda.current_stream(self.numerics.device))
-        graph = self._graphs.get(name)
+        key = (name, *self.steps)
+        graph = self._graphs.get(key)
+        if len(self._graphs) > MAX_GRAPHS:
+            self._graphs.clear()
         if graph == "loaded":
             # on Warp's own stream: torch's default one cannot be captured
             with wp.ScopedCapture(device=self.origin_wp.device, force_module_load=False) as capture:
                 body()
-            graph = self._graphs[name] = capture.graph
+            graph = self._graphs[key] = capture.graph
         if graph is None:
             with wp.ScopedStream(stream):
                 body()  # the first pass compiles and loads the kernels, which a capture must not do
-            self._graphs[name] = "loaded"
+            self._graphs[key] = "loaded"
         else:
             wp.capture_launch(graph, stream=stream)
 
@@ -187,12 +210,16 @@ class Workspace:
         else:
             wp.launch(kernel, dim, inputs=inputs, adj_inputs=adj_inputs, adjoint=True, device=device)
 
-    def _geometry(self) -> list:
-        return [self.origin_wp, wp.vec3i(*self.dims), self.numerics.dx, 1.0 / self.numerics.dx, self.numerics.dt]
+    def _geometry(self, dt: float) -> list:
+        return [self.origin_wp, wp.vec3i(*self.dims), self.numerics.dx, 1.0 / self.numerics.dx, dt]
 
-    def _grid_arguments(self, slot: int) -> list:
+    def _kick(self, step: int) -> float:
+        """For how long [s] the forces of a substep act."""
+        return self.steps.kick if step == 0 else self.steps.dt
+
+    def _grid_arguments(self, slot: int, step: int) -> list:
         numerics = self.numerics
-        impulse = self.kernels.vec3(*(numerics.dt * g for g in numerics.gravity))
+        impulse = self.kernels.vec3(*(self._kick(step) * g for g in numerics.gravity))
         return [
             self.grid_wp[slot], impulse, self.cutoff, self.origin_wp, wp.vec3i(*self.dims), numerics.dx, self.planes_wp,
             self.modes_wp, numerics.plane_count,
@@ -208,14 +235,14 @@ class Workspace:
     def _mapping_arguments(self, state: int, new: int) -> list:
         held, numerics = self.held_wp, self.numerics
         return [
-            self.F_wp[state], self.C_wp[new], held["parameters"], held["plastic_G"], held["plastic_h"], numerics.dt,
+            self.F_wp[state], self.C_wp[new], held["parameters"], held["plastic_G"], held["plastic_h"], self.steps.dt,
             numerics.norm_eps, int(numerics.rebuild), self.F_wp[new],
         ]  # fmt: skip
 
     def _advance(self) -> None:
         kernels, numerics, n = self.kernels, self.numerics, self.particles
         states, grids = len(self.x), len(self.grid)
-        geometry = self._geometry()
+        geometry, kicked = self._geometry(self.steps.dt), self._geometry(self.steps.kick)
         low, high = kernels.vec3(*numerics.low), kernels.vec3(*numerics.high)
         if self.colliders is not None:
             self.colliders.reset()
@@ -225,11 +252,11 @@ class Workspace:
             self._run(self.stress, n, self._stress_arguments(a, g))
             self._run(kernels.p2g, n, [
                 self.x_wp[a], self.v_wp[a], self.C_wp[a], self.F_wp[a], self.tau_wp[g], self.mass_wp, self.volume_wp,
-                *geometry, int(numerics.check_J), step, self.flags_wp, self.grid_wp[g],
+                *(geometry if step else kicked), int(numerics.check_J), step, self.flags_wp, self.grid_wp[g],
             ])  # fmt: skip
-            self._run(kernels.grid_update, len(self.grid[g]), [*self._grid_arguments(g), self.velocity_wp[g]])
+            self._run(kernels.grid_update, len(self.grid[g]), [*self._grid_arguments(g, step), self.velocity_wp[g]])
             if self.colliders is not None:
-                self.colliders.apply(step, self._collider_place(g), self.velocity_wp[g])
+                self.colliders.apply(step, self._collider_place(g), self._kick(step), self.velocity_wp[g])
             self._run(kernels.g2p, n, [
                 self.x_wp[a], self.A_wp[a], self.velocity_wp[g], *geometry, low, high, step, self.flags_wp,
                 self.x_wp[b], self.v_wp[b], self.C_wp[b], self.A_wp[b],
@@ -239,7 +266,7 @@ class Workspace:
 
     def _adjoint(self) -> None:
         kernels, n, held = self.kernels, self.particles, self.adj_held_wp
-        geometry = self._geometry()
+        geometry, kicked = self._geometry(self.steps.dt), self._geometry(self.steps.kick)
         for array in held.values():
             array.zero_()
         if self.colliders is not None:
@@ -260,15 +287,16 @@ class Workspace:
             ])  # fmt: skip
             if self.colliders is not None:
                 # the velocities that the colliders found are cheaper to compute again than to keep
-                self._run(kernels.grid_update, len(self.grid[step]), [*self._grid_arguments(step), self.colliders.before_wp])
-                self.colliders.adjoint(step, self._collider_place(step), self.adj_velocity_wp)
+                self._run(kernels.grid_update, len(self.grid[step]), [*self._grid_arguments(step, step), self.colliders.before_wp])
+                self.colliders.adjoint(step, self._collider_place(step), self._kick(step), self.adj_velocity_wp)
             self._run(kernels.adj_grid, len(self.grid[step]),
-                      [*self._grid_arguments(step), self.adj_velocity_wp, self.adj_grid_wp])  # fmt: skip
+                      [*self._grid_arguments(step, step), self.adj_velocity_wp, self.adj_grid_wp])  # fmt: skip
             if self.colliders is not None:
                 self.colliders.add_mass(self.adj_grid_wp)
             self._run(kernels.adj_p2g, n, [
-                self.x_wp[step], self.v_wp[step], self.C_wp[step], self.tau_wp[step], self.mass_wp, self.volume_wp, *geometry,
-                self.adj_grid_wp, self.adj_x_wp[a], self.adj_v_wp[a], self.adj_C_wp[a], self.adj_tau_wp,
+                self.x_wp[step], self.v_wp[step], self.C_wp[step], self.tau_wp[step], self.mass_wp, self.volume_wp,
+                *(geometry if step else kicked), self.adj_grid_wp, self.adj_x_wp[a], self.adj_v_wp[a], self.adj_C_wp[a],
+                self.adj_tau_wp,
             ])  # fmt: skip
             self._run(self.stress, n, self._stress_arguments(step, step), [
                 self.adj_F_wp[a], self.adj_C_wp[a], held["parameters"], held["G"], held["h"], self.adj_tau_wp,

@@ -1,6 +1,8 @@
 """Built-in scenes: repeatable, cached, true to their physics, and filmed where the truth is."""
 
+import math
 import shutil
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,6 +18,10 @@ from mosa.data.builtin.shapes import SHAPES
 from mosa.data.builtin.surface import Surface, bind, extract_surface, fill
 from mosa.data.scene import held_out_sequences, load_scene
 from mosa.errors import ConfigError
+from mosa.modules.body import World
+from mosa.physics.boundary import Plane
+from mosa.physics.collider_motion import Motion
+from mosa.physics.colliders import Collider, HalfSpace
 from mosa.rendering.cameras import project
 
 
@@ -206,7 +212,7 @@ def test_the_floor_is_the_truth_itself_on_the_truth_s_own_particles_and_grid(tra
     """float32 rounding over about 240 substeps, grown by contact, stays far below the millimetres that a floor measures."""
     spacing = OBJECTS["tiny"].spacing
     scene = held_out[0]
-    world = SimpleNamespace(ground=scene.ground, gravity=scene.gravity, up=scene.up, box=scene.box)
+    world = World(scene.ground, scene.gravity, scene.up, scene.box)
     rest = training.truth.rest
     body = SimpleNamespace(
         rest=rest, volume=torch.full((len(rest),), spacing**3), contact=lambda: torch.tensor(CONTACT_CELLS * 2 * spacing),
@@ -215,4 +221,15 @@ def test_the_floor_is_the_truth_itself_on_the_truth_s_own_particles_and_grid(tra
     found = floor_rollout(body, scene, world)
     assert (found - scene.truth.positions).norm(dim=-1).max() < 1e-4
     body.settings.dx *= 2
-    assert (floor_rollout(body, scene, world) - scene.truth.positions).norm(dim=-1).max() > 1e-3
+    coarse = floor_rollout(body, scene, world)
+    assert (coarse - scene.truth.positions).norm(dim=-1).max() > 1e-3
+    # a shelf in the way, and a wall beside the body that its spreading pushes against
+    shelf = float(scene.truth.positions[0][:, 1].min()) - 0.02
+    plate = Collider(HalfSpace(), "sticky", motion=Motion((0.0, shelf, 0.0), (-0.5 * math.pi, 0.0, 0.0)))
+    held = floor_rollout(body, scene, replace(world, colliders=(plate,)))
+    sunk = 0.25 * body.settings.dx  # what an impact presses particles into a grid's contact
+    assert held[..., 1].min() > shelf - sunk > coarse[..., 1].min() + sunk
+    right = float(scene.truth.positions[0][:, 0].max())
+    wall = Plane((right, 0.0, 0.0), (-1.0, 0.0, 0.0), "separate")
+    walled = floor_rollout(body, scene, replace(world, planes=(wall,)))
+    assert walled[..., 0].max() < right + 0.005 < coarse[..., 0].max() - 0.005  # spreading by 13 mm is held within 2

@@ -8,6 +8,7 @@ from torch import Tensor
 from mosa.data.builtin.hidden_material import LAW
 from mosa.data.builtin.objects import object_named
 from mosa.errors import ConfigError
+from mosa.physics.colliders import reach
 from mosa.physics.rollout import Simulator
 from mosa.physics.time_step import required_substeps
 from mosa.types import ParticleState, Scene
@@ -17,6 +18,7 @@ from mosa.types import ParticleState, Scene
 def floor_rollout(body, scene: Scene, world) -> Tensor:
     """Positions (T, N, 3) [m] of the body's particles under the hidden material of a built-in scene.
 
+    world: `mosa.modules.body.World`; its ground, walls and colliders act as in `Body.simulate`.
     body: `mosa.modules.body.Body`; its particles, volumes, grid and learned contact height are used, its law is not. What is
     left between this and the truth is the learner's discretisation: differences below it mean nothing.
     Errors: ConfigError where the scene is not a built-in one; SimulationDiverged.
@@ -30,6 +32,7 @@ def floor_rollout(body, scene: Scene, world) -> Tensor:
     Q = truth.rotation.float()
     start = (rest - truth.rest.mean(0)) @ Q.T + truth.positions[0].mean(0)
     speed = float(truth.velocity.norm()) + float(world.gravity.norm()) * frame_dt * scene.frames
+    speed += max((c.motion.max_speed(reach(c.shape)) for c in world.colliders), default=0.0)
     substeps = required_substeps(
         hidden.wave_modulus(),
         hidden.density,
@@ -47,11 +50,16 @@ def floor_rollout(body, scene: Scene, world) -> Tensor:
         gravity=world.gravity,
         up=world.up,
         ground=world.ground,
+        planes=world.planes,
+        colliders=world.colliders,
     )
     n, gravity, up = len(rest), world.gravity.float().cpu(), world.up.float().cpu()
     lift = body.contact().detach().float().cpu() * up
     F = Q.expand(n, 3, 3).contiguous()
     velocity = (truth.velocity.float() - 0.5 * frame_dt / substeps * gravity).expand(n, 3).contiguous()
     state = ParticleState(start + lift, velocity, torch.zeros(n, 3, 3), F, F)
-    rollout = simulator.rollout(state, hidden.parameters(rest), body.volume.float().cpu(), hidden.density, scene.frames)
+    rollout = simulator.rollout(
+        state, hidden.parameters(rest), body.volume.float().cpu(), hidden.density, scene.frames,
+        motions=[c.motion.shifted(lift) for c in world.colliders],  # the lift is the ground's: they keep their place
+    )  # fmt: skip
     return rollout.x - lift
