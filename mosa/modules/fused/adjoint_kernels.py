@@ -46,7 +46,7 @@ def store_input_adjoint(gw, gs, g, r, M):
     c = tl.arange(0, 16)
     store_by_column(gw, g, r, c, M, 6)
     row, column = r[:, None], c[None, :]
-    tl.store(gs + (column - 6) * M + row, g, mask=(row < M) & (column >= 6) & (column < 12))
+    tl.store(gs + (column - 6) * M + row, g, mask=(column >= 6) & (column < 12))
 
 
 @triton.jit
@@ -56,7 +56,6 @@ def theta_backward(
 ):  # fmt: skip
     """gl2 (H, M), gw, gs2 (6, M) from the adjoints gb (M, 6) of b and extra (N, 6) of post."""
     h, c = tl.arange(0, H), tl.arange(0, 16)
-    V2, V3 = matrix(W2, h, h, H, H, H), matrix(W3, c, h, H, 6, H)
     A1, A2, A3 = tl.zeros((H, H), tl.float32), tl.zeros((H, H), tl.float32), tl.zeros((16, H), tl.float32)
     A1b = tl.zeros((H, 16), tl.float32)
     a1, a2, a3 = tl.zeros((H,), tl.float32), tl.zeros((H,), tl.float32), tl.zeros((16,), tl.float32)
@@ -64,15 +63,15 @@ def theta_backward(
         r = tile * BLOCK + tl.arange(0, BLOCK)
         x, rest, z1 = theta_hidden(l2, w, s2, W1, b1, r, N, M, scale, H, P)
         h1, d1 = silu(z1)
-        h2, d2 = silu(dense(h1, V2, tl.load(b2 + h), P))
-        g = by_row(gb, r, c, M)
+        h2, d2 = silu(dense(h1, matrix(W2, h, h, H, H, H), tl.load(b2 + h), P))
+        g = by_row(gb, r, c, N + 1)
         if EXTRA:
             g += by_row(extra, r, c, N)
         if BOUNDED:
-            y = tanh(dense(h2, V3, vector(b3, c, 6), P))
+            y = tanh(dense(h2, matrix(W3, c, h, H, 6, H), vector(b3, c, 6), P))
             g *= bound * (1.0 - y * y)
-        g2 = tl.dot(g, V3, input_precision=P) * d2
-        g1 = tl.dot(g2, V2, input_precision=P) * d1
+        g2 = tl.dot(g, matrix(W3, c, h, H, 6, H), input_precision=P) * d2
+        g1 = tl.dot(g2, matrix(W2, h, h, H, H, H), input_precision=P) * d1
         if WEIGHTS:
             A3 += outer(g, h2, P)
             A2 += outer(g2, h1, P)
@@ -102,13 +101,12 @@ def normal_adjoint(gt, t, s1, g, r, M, plane: tl.constexpr, c1: tl.constexpr, c2
     """Stores the adjoints of u00, u01, u02, l00 of a plane, rows 4 plane to 4 plane + 3 of gt (12, M); returns those of the three
     components of s1. g: adjoint of the normal traction."""
     v0, v1, v2, u00, u01, u02, l00 = normal(t, s1, r, M, plane, c1, c2)
-    m = r < M
     k = g * (1.0 + l00)
     first = gt + 4 * plane * M + r
-    tl.store(first, k * v0, mask=m)
-    tl.store(first + M, k * v1, mask=m)
-    tl.store(first + 2 * M, k * v2, mask=m)
-    tl.store(first + 3 * M, g * (v0 + u00 * v0 + u01 * v1 + u02 * v2), mask=m)
+    tl.store(first, k * v0)
+    tl.store(first + M, k * v1)
+    tl.store(first + 2 * M, k * v2)
+    tl.store(first + 3 * M, g * (v0 + u00 * v0 + u01 * v1 + u02 * v2))
     return k * (1.0 + u00), k * u01, k * u02
 
 
@@ -119,7 +117,6 @@ def psi2_backward(
 ):  # fmt: skip
     """gl1 (H, M) and, through the normals, gtn (12, M) and gsn (6, M), from gt (48, M), its last 12 rows, and gl2 (H, M)."""
     h, c = tl.arange(0, H), tl.arange(0, 16)
-    V2, V3, V3b = matrix(W2, h, h, H, H, H), matrix(W3, c, h, H, 12, H), matrix(W3 + 12 * H, h, h, H, H, H)
     A1, A2, A3b = tl.zeros((H, H), tl.float32), tl.zeros((H, H), tl.float32), tl.zeros((H, H), tl.float32)
     A3 = tl.zeros((16, H), tl.float32)
     a1, a2, a3b = tl.zeros((H,), tl.float32), tl.zeros((H,), tl.float32), tl.zeros((H,), tl.float32)
@@ -129,13 +126,16 @@ def psi2_backward(
         r = tile * BLOCK + tl.arange(0, BLOCK)
         x, nx, ny, nz, z1 = psi2_hidden(l1, t, s1, W1, b1, r, M, scale, H, P)
         h1, d1 = silu(z1)
-        h2, d2 = silu(dense(h1, V2, tl.load(b2 + h), P))
+        h2, d2 = silu(dense(h1, matrix(W2, h, h, H, H, H), tl.load(b2 + h), P))
         y = by_column(t + 36 * M, r, c, M, 12)
         g = by_column(gt + 36 * M, r, c, M, 12) * (alpha - y * y / alpha)
         yb = by_column(l2, r, h, M, H)
         gb = by_column(gl2, r, h, M, H) * (alpha - yb * yb / alpha)
-        g2 = (tl.dot(g, V3, input_precision=P) + tl.dot(gb, V3b, input_precision=P)) * d2
-        g1 = tl.dot(g2, V2, input_precision=P) * d1
+        g2 = (
+            tl.dot(g, matrix(W3, c, h, H, 12, H), input_precision=P)
+            + tl.dot(gb, matrix(W3 + 12 * H, h, h, H, H, H), input_precision=P)
+        ) * d2
+        g1 = tl.dot(g2, matrix(W2, h, h, H, H, H), input_precision=P) * d1
         if WEIGHTS:
             A3 += outer(g, h2, P)
             A3b += outer(gb, h2, P)
@@ -155,13 +155,12 @@ def psi2_backward(
         xa, xb, xc = normal_adjoint(gtn, t, s1, kx, r, M, 0, 5, 4)
         ya, yb_, yc = normal_adjoint(gtn, t, s1, ky, r, M, 1, 3, 5)
         za, zb, zc = normal_adjoint(gtn, t, s1, kz, r, M, 2, 4, 3)
-        m = r < M
-        tl.store(gsn + r, xa, mask=m)
-        tl.store(gsn + M + r, ya, mask=m)
-        tl.store(gsn + 2 * M + r, za, mask=m)
-        tl.store(gsn + 3 * M + r, yb_ + zc, mask=m)
-        tl.store(gsn + 4 * M + r, zb + xc, mask=m)
-        tl.store(gsn + 5 * M + r, xb + yc, mask=m)
+        tl.store(gsn + r, xa)
+        tl.store(gsn + M + r, ya)
+        tl.store(gsn + 2 * M + r, za)
+        tl.store(gsn + 3 * M + r, yb_ + zc)
+        tl.store(gsn + 4 * M + r, zb + xc)
+        tl.store(gsn + 5 * M + r, xb + yc)
     if WEIGHTS:
         at = partial + tl.program_id(0) * size
         store_matrix(at, A1, h, h, H + 3, H, H)
@@ -190,8 +189,6 @@ def psi1_backward(
     place = planes % 12
     through_normals = (planes < 36) & ((place < 3) | (place == 6))
     source = 4 * (planes // 12) + tl.where(place == 6, 3, place)
-    V1, V2, V3 = matrix(W1, h, c, 12, H, 12), matrix(W2, h, h, H, H, H), matrix(W3, h, h, H, H, H)
-    Vp = matrix(Wp, planes, h, H, 36, H)
     A1, A2, A3 = tl.zeros((H, 16), tl.float32), tl.zeros((H, H), tl.float32), tl.zeros((H, H), tl.float32)
     Ap = tl.zeros((64, H), tl.float32)
     a1, a2, a3 = tl.zeros((H,), tl.float32), tl.zeros((H,), tl.float32), tl.zeros((H,), tl.float32)
@@ -199,15 +196,15 @@ def psi1_backward(
     for tile in range(tl.program_id(0), tl.cdiv(M, BLOCK), tl.num_programs(0)):
         r = tile * BLOCK + tl.arange(0, BLOCK)
         x = network_input(w, s1, r, N, M, scale, False)
-        h1, d1 = silu(dense(x, V1, tl.load(b1 + h), P))
-        h2, d2 = silu(dense(h1, V2, tl.load(b2 + h), P))
+        h1, d1 = silu(dense(x, matrix(W1, h, c, 12, H, 12), tl.load(b1 + h), P))
+        h2, d2 = silu(dense(h1, matrix(W2, h, h, H, H, H), tl.load(b2 + h), P))
         y = by_column(t, r, planes, M, 36)
         gp = by_column(gt, r, planes, M, 36)
-        gp += tl.load(gtn + source[None, :] * M + r[:, None], mask=(r[:, None] < M) & through_normals[None, :], other=0.0)
+        gp += tl.load(gtn + source[None, :] * M + r[:, None], mask=through_normals[None, :], other=0.0)
         gp *= alpha - y * y / alpha
-        g = by_column(gl1, r, h, M, H) + tl.dot(gp, Vp, input_precision=P)
-        g2 = tl.dot(g, V3, input_precision=P) * d2
-        g1 = tl.dot(g2, V2, input_precision=P) * d1
+        g = by_column(gl1, r, h, M, H) + tl.dot(gp, matrix(Wp, planes, h, H, 36, H), input_precision=P)
+        g2 = tl.dot(g, matrix(W3, h, h, H, H, H), input_precision=P) * d2
+        g1 = tl.dot(g2, matrix(W2, h, h, H, H, H), input_precision=P) * d1
         if WEIGHTS:
             Ap += outer(gp, by_column(l1, r, h, M, H), P)
             A3 += outer(g, h2, P)
@@ -217,7 +214,7 @@ def psi1_backward(
             a3 += tl.sum(g, 0)
             a2 += tl.sum(g2, 0)
             a1 += tl.sum(g1, 0)
-        store_input_adjoint(gw, gs, scale * tl.dot(g1, V1, input_precision=P), r, M)
+        store_input_adjoint(gw, gs, scale * tl.dot(g1, matrix(W1, h, c, 12, H, 12), input_precision=P), r, M)
     if WEIGHTS:
         at = partial + tl.program_id(0) * size
         store_matrix(at, A1, h, c, 12, H, 12)
@@ -241,22 +238,21 @@ def phi_backward(
     """gw, gs (N, 6), everything added up: gs1, gsn, gsx (6, M) reach s1 from the assembly, the normals and Psi1; gpre (6, M) and
     extra (N, 6) reach pre, as s1 does; gwx, gwt (6, M) reach w from Psi1 and Theta."""
     h, c = tl.arange(0, H), tl.arange(0, 16)
-    V1, V2, V3 = matrix(W1, h, c, 12, H, 12), matrix(W2, h, h, H, H, H), matrix(W3, c, h, H, 6, H)
     A1, A2, A3 = tl.zeros((H, 16), tl.float32), tl.zeros((H, H), tl.float32), tl.zeros((16, H), tl.float32)
     a1, a2, a3 = tl.zeros((H,), tl.float32), tl.zeros((H,), tl.float32), tl.zeros((16,), tl.float32)
     for tile in range(tl.program_id(0), tl.cdiv(M, BLOCK), tl.num_programs(0)):
         r = tile * BLOCK + tl.arange(0, BLOCK)
         x = network_input(w, s, r, N, M, scale, True)
-        h1, d1 = silu(dense(x, V1, tl.load(b1 + h), P))
-        h2, d2 = silu(dense(h1, V2, tl.load(b2 + h), P))
+        h1, d1 = silu(dense(x, matrix(W1, h, c, 12, H, 12), tl.load(b1 + h), P))
+        h2, d2 = silu(dense(h1, matrix(W2, h, h, H, H, H), tl.load(b2 + h), P))
         g = by_column(gs1, r, c, M, 6) + by_column(gsn, r, c, M, 6) + by_column(gsx, r, c, M, 6) + by_column(gpre, r, c, M, 6)
         if EXTRA:
             g += by_row(extra, r, c, N)
         if BOUNDED:
             y = by_column(pre, r, c, M, 6)
             g *= bound - y * y / bound
-        g2 = tl.dot(g, V3, input_precision=P) * d2
-        g1 = tl.dot(g2, V2, input_precision=P) * d1
+        g2 = tl.dot(g, matrix(W3, c, h, H, 6, H), input_precision=P) * d2
+        g1 = tl.dot(g2, matrix(W2, h, h, H, H, H), input_precision=P) * d1
         if WEIGHTS:
             A3 += outer(g, h2, P)
             A2 += outer(g2, h1, P)
@@ -264,7 +260,7 @@ def phi_backward(
             a3 += tl.sum(g, 0)
             a2 += tl.sum(g2, 0)
             a1 += tl.sum(g1, 0)
-        gx = scale * tl.dot(g1, V1, input_precision=P)
+        gx = scale * tl.dot(g1, matrix(W1, h, c, 12, H, 12), input_precision=P)
         row, column = r[:, None], c[None, :]
         direct = by_column(gwx, r, c, M, 6) + by_column(gwt, r, c, M, 6)
         tl.store(gw + row * 6 + column, gx + direct, mask=(row < N) & (column < 6))

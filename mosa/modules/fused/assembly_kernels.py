@@ -13,12 +13,12 @@ import triton.language as tl
 @triton.jit
 def numbers(t, r, M, first: tl.constexpr):
     """The 12 numbers of a matrix: upper triangle row by row, then lower."""
-    m, p = r < M, t + first * M + r
+    p = t + first * M + r
     return (
-        tl.load(p, mask=m, other=0.0), tl.load(p + M, mask=m, other=0.0), tl.load(p + 2 * M, mask=m, other=0.0),
-        tl.load(p + 3 * M, mask=m, other=0.0), tl.load(p + 4 * M, mask=m, other=0.0), tl.load(p + 5 * M, mask=m, other=0.0),
-        tl.load(p + 6 * M, mask=m, other=0.0), tl.load(p + 7 * M, mask=m, other=0.0), tl.load(p + 8 * M, mask=m, other=0.0),
-        tl.load(p + 9 * M, mask=m, other=0.0), tl.load(p + 10 * M, mask=m, other=0.0), tl.load(p + 11 * M, mask=m, other=0.0),
+        tl.load(p), tl.load(p + M), tl.load(p + 2 * M),
+        tl.load(p + 3 * M), tl.load(p + 4 * M), tl.load(p + 5 * M),
+        tl.load(p + 6 * M), tl.load(p + 7 * M), tl.load(p + 8 * M),
+        tl.load(p + 9 * M), tl.load(p + 10 * M), tl.load(p + 11 * M),
     )  # fmt: skip
 
 
@@ -57,16 +57,15 @@ def correction_adjoint(
 def adjoint(gt, extra, r, N, M, row: tl.constexpr, EXTRA: tl.constexpr, value):
     if EXTRA:
         value += tl.load(extra + r * 48 + row, mask=r < N, other=0.0)
-    tl.store(gt + row * M + r, value, mask=r < M)
+    tl.store(gt + row * M + r, value)
 
 
 @triton.jit
 def components(v, r, M, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr):
-    m = r < M
     return (
-        tl.load(v + plane * M + r, mask=m, other=0.0),
-        tl.load(v + c1 * M + r, mask=m, other=0.0),
-        tl.load(v + c2 * M + r, mask=m, other=0.0),
+        tl.load(v + plane * M + r),
+        tl.load(v + c1 * M + r),
+        tl.load(v + c2 * M + r),
     )
 
 
@@ -80,13 +79,12 @@ def on_plane(v, r, M, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr, C
 @triton.jit
 def store_moved(out, r, M, K, x, y, z):
     """(I + G) v (6, M) from (I + C) of v on the three planes; K: entries of C_xyz."""
-    m = r < M
-    tl.store(out + r, x[0] + K[0] * x[0] + K[1] * y[0] + K[2] * z[0], mask=m)
-    tl.store(out + M + r, y[0] + K[3] * x[0] + K[4] * y[0] + K[5] * z[0], mask=m)
-    tl.store(out + 2 * M + r, z[0] + K[6] * x[0] + K[7] * y[0] + K[8] * z[0], mask=m)
-    tl.store(out + 3 * M + r, 0.5 * (y[1] + z[2]), mask=m)
-    tl.store(out + 4 * M + r, 0.5 * (z[1] + x[2]), mask=m)
-    tl.store(out + 5 * M + r, 0.5 * (x[1] + y[2]), mask=m)
+    tl.store(out + r, x[0] + K[0] * x[0] + K[1] * y[0] + K[2] * z[0])
+    tl.store(out + M + r, y[0] + K[3] * x[0] + K[4] * y[0] + K[5] * z[0])
+    tl.store(out + 2 * M + r, z[0] + K[6] * x[0] + K[7] * y[0] + K[8] * z[0])
+    tl.store(out + 3 * M + r, 0.5 * (y[1] + z[2]))
+    tl.store(out + 4 * M + r, 0.5 * (z[1] + x[2]))
+    tl.store(out + 5 * M + r, 0.5 * (x[1] + y[2]))
 
 
 @triton.jit
@@ -131,22 +129,22 @@ def assemble(t, s1, pre, G, s2, moved, N, M, OPERATOR: tl.constexpr, BLOCK: tl.c
 
 
 @triton.jit
-def moved_adjoint(v, seed, r, M, p: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr, C, k0, k1, k2, ROWS: tl.constexpr):
-    """Of out = (I + G) v, seen from plane p. seed: adjoint of out, (M, 6) where ROWS, else (6, M); k: column p of C_xyz.
+def moved_adjoint(v, seed, r, N, M, p: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr, C, k0, k1, k2, ROWS: tl.constexpr):
+    """Of out = (I + G) v, seen from plane p. seed: adjoint of out, (N + 1, 6) where ROWS, else (6, M); k: column p of C_xyz.
 
     Returns the normal traction n, the seeds of the three normals, those of the plane's tractions, its components of v, and the
     adjoints of these components.
     """
-    m = r < M
     row = 1 if ROWS else M
     at = seed + (r * 6 if ROWS else r)
-    g0 = tl.load(at, mask=m, other=0.0)
-    g1 = tl.load(at + row, mask=m, other=0.0)
-    g2 = tl.load(at + 2 * row, mask=m, other=0.0)
+    known = (r <= N) if ROWS else (r >= 0)
+    g0 = tl.load(at, mask=known, other=0.0)
+    g1 = tl.load(at + row, mask=known, other=0.0)
+    g2 = tl.load(at + 2 * row, mask=known, other=0.0)
     own = g0 if p == 0 else (g1 if p == 1 else g2)
     y0 = own + k0 * g0 + k1 * g1 + k2 * g2
-    y1 = 0.5 * tl.load(at + c1 * row, mask=m, other=0.0)
-    y2 = 0.5 * tl.load(at + c2 * row, mask=m, other=0.0)
+    y1 = 0.5 * tl.load(at + c1 * row, mask=known, other=0.0)
+    y2 = 0.5 * tl.load(at + c2 * row, mask=known, other=0.0)
     a, b, c = components(v, r, M, p, c1, c2)
     n = a + C[0] * a + C[1] * b + C[2] * c
     return (
@@ -168,8 +166,8 @@ def plane_adjoint(
     """Stores the adjoints of the plane's numbers; returns those of column p of C_xyz (3), of the plane's components of s1 (3) and
     of pre (3)."""
     C = correction(t, r, M, 12 * p)
-    n, g0, g1, g2, y0, y1, y2, a, b, c, v0, v1, v2 = moved_adjoint(s1, gs2, r, M, p, c1, c2, C, k0, k1, k2, False)
-    j, f0, f1, f2, x0, x1, x2, d, e, f, p0, p1, p2 = moved_adjoint(pre, gb, r, M, p, c1, c2, C, k0, k1, k2, True)
+    n, g0, g1, g2, y0, y1, y2, a, b, c, v0, v1, v2 = moved_adjoint(s1, gs2, r, N, M, p, c1, c2, C, k0, k1, k2, False)
+    j, f0, f1, f2, x0, x1, x2, d, e, f, p0, p1, p2 = moved_adjoint(pre, gb, r, N, M, p, c1, c2, C, k0, k1, k2, True)
     q00, q01, q02 = seed_of(gG, r, N, 0, p), seed_of(gG, r, N, 0, c1), seed_of(gG, r, N, 0, c2)
     q10, q11, q12 = seed_of(gG, r, N, 1, p), seed_of(gG, r, N, 1, c1), seed_of(gG, r, N, 1, c2)
     q20, q21, q22 = seed_of(gG, r, N, 2, p), seed_of(gG, r, N, 2, c1), seed_of(gG, r, N, 2, c2)
@@ -196,13 +194,12 @@ def plane_adjoint(
 
 @triton.jit
 def store_six(out, r, M, a, b, c, d, e, f):
-    m = r < M
-    tl.store(out + r, a, mask=m)
-    tl.store(out + M + r, b, mask=m)
-    tl.store(out + 2 * M + r, c, mask=m)
-    tl.store(out + 3 * M + r, d, mask=m)
-    tl.store(out + 4 * M + r, e, mask=m)
-    tl.store(out + 5 * M + r, f, mask=m)
+    tl.store(out + r, a)
+    tl.store(out + M + r, b)
+    tl.store(out + 2 * M + r, c)
+    tl.store(out + 3 * M + r, d)
+    tl.store(out + 4 * M + r, e)
+    tl.store(out + 5 * M + r, f)
 
 
 @triton.jit

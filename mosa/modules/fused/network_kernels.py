@@ -41,12 +41,12 @@ def vector(p, i, count):
 @triton.jit
 def by_column(p, r, c, M, count):
     """(BLOCK, columns) tile of an array stored by column, 0 beyond."""
-    return tl.load(p + c[None, :] * M + r[:, None], mask=(r[:, None] < M) & (c[None, :] < count), other=0.0)
+    return tl.load(p + c[None, :] * M + r[:, None], mask=(c[None, :] < count), other=0.0)
 
 
 @triton.jit
 def store_by_column(p, value, r, c, M, count):
-    tl.store(p + c[None, :] * M + r[:, None], value, mask=(r[:, None] < M) & (c[None, :] < count))
+    tl.store(p + c[None, :] * M + r[:, None], value, mask=(c[None, :] < count))
 
 
 @triton.jit
@@ -64,7 +64,7 @@ def network_input(w, s, r, N, M, scale, ROWS: tl.constexpr):
     if ROWS:
         second = tl.load(s + row * 6 + c - 6, mask=(row < N) & of_s, other=0.0)
     else:
-        second = tl.load(s + (c - 6) * M + row, mask=(row < M) & of_s, other=0.0)
+        second = tl.load(s + (c - 6) * M + row, mask=of_s, other=0.0)
     return scale * (first + second)
 
 
@@ -72,16 +72,15 @@ def network_input(w, s, r, N, M, scale, ROWS: tl.constexpr):
 def normal(t, s1, r, M, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr):
     """(BLOCK,) parts (v0, v1, v2, u00, u01, u02, l00) of n = (1 + l00) ((1 + u00) v0 + u01 v1 + u02 v2), the normal traction
     on a plane after its correction: row 0 of (I + L)(I + U) on its components v of s1."""
-    m = r < M
     first = t + 12 * plane * M + r
     return (
-        tl.load(s1 + plane * M + r, mask=m, other=0.0),
-        tl.load(s1 + c1 * M + r, mask=m, other=0.0),
-        tl.load(s1 + c2 * M + r, mask=m, other=0.0),
-        tl.load(first, mask=m, other=0.0),
-        tl.load(first + M, mask=m, other=0.0),
-        tl.load(first + 2 * M, mask=m, other=0.0),
-        tl.load(first + 6 * M, mask=m, other=0.0),
+        tl.load(s1 + plane * M + r),
+        tl.load(s1 + c1 * M + r),
+        tl.load(s1 + c2 * M + r),
+        tl.load(first),
+        tl.load(first + M),
+        tl.load(first + 2 * M),
+        tl.load(first + 6 * M),
     )
 
 
@@ -187,4 +186,4 @@ def theta_forward(
         y = bound * tanh(y)
     store_by_column(post, y, r, c, M, 6)
     y += by_column(moved, r, c, M, 6)
-    tl.store(b + r[:, None] * 6 + c[None, :], y, mask=(r[:, None] < M) & (c[None, :] < 6))
+    tl.store(b + r[:, None] * 6 + c[None, :], y, mask=(r[:, None] <= N) & (c[None, :] < 6))

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-import triton
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -19,7 +18,7 @@ from mosa.modules.fused.assembly_kernels import assemble, assemble_adjoint
 from mosa.modules.fused.network_kernels import phi_forward, psi1_forward, psi2_forward, theta_forward
 
 LANES = 128
-"""Particles a program of the assembly."""
+"""Particles a program of the assembly; rows are padded to a multiple, so that arrays stored by column need no mask."""
 INTERPRETED_PROGRAMS = 2
 
 
@@ -46,6 +45,11 @@ class _Buffers(NamedTuple):
     moved: Tensor
 
 
+def _rows(n: int) -> int:
+    """M: the particles, the state at rest, and as many more of these as fill the last program."""
+    return -(-(n + 1) // LANES) * LANES
+
+
 def _programs(device: torch.device, tiles: int) -> int:
     """Programs of a backward kernel, each with its own sums of weight gradients: one a multiprocessor."""
     if device.type != "cuda":
@@ -56,17 +60,17 @@ def _programs(device: torch.device, tiles: int) -> int:
 def _evaluate(w: Tensor, s: Tensor, settings: Settings, weights: Sequence[Tensor], G: Tensor | None) -> _Buffers:
     """Steps 1 to 4, and G (N, 6, 6) where it is given to be filled."""
     n, hidden = len(w), weights[0].shape[0]
-    m = n + 1
+    m = _rows(n)
     buffers = _Buffers(*(w.new_empty(k, m) for k in (6, 6, hidden, 48, hidden, 6, 6)))
     phi, psi1, psi2 = weights[:6], weights[6:14], weights[14:20]
     bound, scale, alpha = settings.l_max or 0.0, settings.scale, settings.alpha
     size = {"H": hidden, "BLOCK": settings.block, "P": settings.precision}
-    tiles = (triton.cdiv(m, settings.block),)
+    tiles = (m // settings.block,)
     b = buffers
     phi_forward[tiles](w, s, *phi, b.pre, b.s1, n, m, scale, bound, BOUNDED=settings.l_max is not None, **size)
     psi1_forward[tiles](w, b.s1, *psi1, b.l1, b.t, n, m, scale, alpha, **size)
     psi2_forward[tiles](b.l1, b.t, b.s1, *psi2, b.l2, n, m, scale, alpha, **size)
-    lanes = (triton.cdiv(m, LANES),)
+    lanes = (m // LANES,)
     operator = G is not None
     assemble[lanes](b.t, b.s1, b.pre, G if operator else b.t, b.s2, b.moved, n, m, OPERATOR=operator, BLOCK=LANES)
     return buffers
@@ -81,23 +85,23 @@ class _FusedOperator(torch.autograd.Function):
         G, b = w.new_empty(n, 6, 6), w.new_empty(n + 1, 6)
         buffers = _evaluate(w, s, settings, weights, G)
         post = torch.empty_like(buffers.pre)
-        theta_forward[(triton.cdiv(n + 1, settings.block),)](
-            buffers.l2, w, buffers.s2, buffers.moved, *weights[20:], post, b, n, n + 1, settings.scale, settings.l_max or 0.0,
+        theta_forward[(_rows(n) // settings.block,)](
+            buffers.l2, w, buffers.s2, buffers.moved, *weights[20:], post, b, n, _rows(n), settings.scale, settings.l_max or 0.0,
             BOUNDED=settings.l_max is not None, H=weights[0].shape[0], BLOCK=settings.block, P=settings.precision,
         )  # fmt: skip
         ctx.settings = settings
         ctx.save_for_backward(w, s, *weights)
         ctx.set_materialize_grads(False)
-        return G, b, buffers.t.T[:-1], buffers.pre.T[:-1], post.T[:-1]
+        return G, b, buffers.t.T[:n], buffers.pre.T[:n], post.T[:n]
 
     @staticmethod
     @once_differentiable
     def backward(ctx, gG, gb, gt, gpre, gpost):
         w, s, *weights = ctx.saved_tensors
         settings, n, hidden = ctx.settings, len(w), weights[0].shape[0]
-        m = n + 1
+        m = _rows(n)
         extra = any(g is not None for g in (gt, gpre, gpost))
-        shapes = {"G": (n, 36), "b": (m, 6), "t": (n, 48), "pre": (n, 6), "post": (n, 6)}
+        shapes = {"G": (n, 36), "b": (n + 1, 6), "t": (n, 48), "pre": (n, 6), "post": (n, 6)}
         seeds = {}
         for (name, shape), seed in zip(shapes.items(), (gG, gb, gt, gpre, gpost)):
             if seed is None and (extra or name in "Gb"):
@@ -105,7 +109,7 @@ class _FusedOperator(torch.autograd.Function):
             seeds[name] = w if seed is None else seed.contiguous()  # w: never read
         buffers = _evaluate(w, s, settings, weights, None)
         needs = ctx.needs_input_grad[3:]
-        tiles = triton.cdiv(m, settings.block)
+        tiles = m // settings.block
         programs = _programs(w.device, tiles)
         partials = []
 
@@ -123,9 +127,11 @@ class _FusedOperator(torch.autograd.Function):
         b, bound = buffers, settings.l_max or 0.0
         flags = {"BOUNDED": settings.l_max is not None, "EXTRA": extra}
         gl2, gw_theta, gs2 = torch.empty_like(b.l2), six(), six()
-        launch(adjoint.theta_backward, (b.l2, w, b.s2, seeds["b"], seeds["post"]), weights[20:], (gl2, gw_theta, gs2), bound, **flags)
+        launch(
+            adjoint.theta_backward, (b.l2, w, b.s2, seeds["b"], seeds["post"]), weights[20:], (gl2, gw_theta, gs2), bound, **flags
+        )
         gt, gs1, gmoved = torch.empty_like(b.t), six(), six()
-        assemble_adjoint[(triton.cdiv(m, LANES),)](
+        assemble_adjoint[(m // LANES,)](
             b.t, b.s1, b.pre, seeds["G"], seeds["b"], gs2, seeds["t"], gt, gs1, gmoved, n, m, EXTRA=extra, BLOCK=LANES
         )
         gl1, gt_normals, gs_normals = torch.empty_like(b.l1), w.new_empty(12, m), six()
