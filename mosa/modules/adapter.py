@@ -112,7 +112,8 @@ class StressAdapter(Adapter):
     def __init__(
         self, *, alpha: float = 0.1, l_max: float | None = 0.1, input_scale: float = 10.0, hidden: int = 64,
         rest_free: bool = True, plastic: bool = False, major_symmetry: bool = False, state_dependence: str = "full",
-        recompute: bool = False, fused: bool | str = "auto", precision: str = "accurate", no_C: bool = False, no_pre: bool = False, no_post: bool = False, no_prior_stress: bool = False,
+        recompute: bool = False, fused: bool | str = "auto", precision: str = "accurate",
+        no_C: bool = False, no_pre: bool = False, no_post: bool = False, no_prior_stress: bool = False,
     ) -> None:  # fmt: skip
         super().__init__()
         if not 0 < alpha < 1:
