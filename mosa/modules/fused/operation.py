@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mosa.modules.fused import adjoint_kernels as adjoint
+from mosa.modules.fused.adjoint_kernels import phi_backward, psi1_backward, psi2_backward, theta_backward, weight_gradients
 from mosa.modules.fused.assembly_kernels import assemble, assemble_adjoint
 from mosa.modules.fused.network_kernels import phi_forward, psi1_forward, psi2_forward, theta_forward
 
@@ -33,8 +33,8 @@ class Settings(NamedTuple):
 
 
 class _Buffers(NamedTuple):
-    """What the kernels leave for one another, by column, M = N + 1 rows each: s1, pre, s2, moved = (I + G) pre (6, M); l1, l2
-    (H, M); t (48, M), the bounded numbers of C_x, C_y, C_z, C_xyz."""
+    """What the kernels leave for one another, by column, M rows each. s1, pre, s2, moved = (I + G) pre: (6, M); l1 (H + 3, M) and
+    l2 (H + 12, M), with room for what else the next network reads; t (48, M): the bounded numbers of C_x, C_y, C_z, C_xyz."""
 
     pre: Tensor
     s1: Tensor
@@ -61,7 +61,7 @@ def _evaluate(w: Tensor, s: Tensor, settings: Settings, weights: Sequence[Tensor
     """Steps 1 to 4, and G (N, 6, 6) where it is given to be filled."""
     n, hidden = len(w), weights[0].shape[0]
     m = _rows(n)
-    buffers = _Buffers(*(w.new_empty(k, m) for k in (6, 6, hidden, 48, hidden, 6, 6)))
+    buffers = _Buffers(*(w.new_empty(k, m) for k in (6, 6, hidden + 3, 48, hidden + 12, 6, 6)))
     phi, psi1, psi2 = weights[:6], weights[6:14], weights[14:20]
     bound, scale, alpha = settings.l_max or 0.0, settings.scale, settings.alpha
     size = {"H": hidden, "BLOCK": settings.block, "P": settings.precision}
@@ -83,23 +83,24 @@ class _FusedOperator(torch.autograd.Function):
         weights = tuple(weight.contiguous() for weight in weights)
         n = len(w)
         G, b = w.new_empty(n, 6, 6), w.new_empty(n + 1, 6)
-        buffers = _evaluate(w, s, settings, weights, G)
-        post = torch.empty_like(buffers.pre)
-        theta_forward[(_rows(n) // settings.block,)](
-            buffers.l2, w, buffers.s2, buffers.moved, *weights[20:], post, b, n, _rows(n), settings.scale, settings.l_max or 0.0,
-            BOUNDED=settings.l_max is not None, H=weights[0].shape[0], BLOCK=settings.block, P=settings.precision,
-        )  # fmt: skip
+        with torch.cuda.device_of(w):
+            buffers = _evaluate(w, s, settings, weights, G)
+            post = torch.empty_like(buffers.pre)
+            theta_forward[(post.shape[1] // settings.block,)](
+                buffers.l2, w, buffers.s2, buffers.moved, *weights[20:], post, b, n, post.shape[1], settings.scale,
+                settings.l_max or 0.0, BOUNDED=settings.l_max is not None, H=weights[0].shape[0], BLOCK=settings.block,
+                P=settings.precision,
+            )  # fmt: skip
         ctx.settings = settings
-        ctx.save_for_backward(w, s, *weights)
+        ctx.save_for_backward(w, s, post, *weights)
         ctx.set_materialize_grads(False)
         return G, b, buffers.t.T[:n], buffers.pre.T[:n], post.T[:n]
 
     @staticmethod
     @once_differentiable
     def backward(ctx, gG, gb, gt, gpre, gpost):
-        w, s, *weights = ctx.saved_tensors
-        settings, n, hidden = ctx.settings, len(w), weights[0].shape[0]
-        m = _rows(n)
+        w, s, post, *weights = ctx.saved_tensors
+        settings, n = ctx.settings, len(w)
         extra = any(g is not None for g in (gt, gpre, gpost))
         shapes = {"G": (n, 36), "b": (n + 1, 6), "t": (n, 48), "pre": (n, 6), "post": (n, 6)}
         seeds = {}
@@ -107,51 +108,77 @@ class _FusedOperator(torch.autograd.Function):
             if seed is None and (extra or name in "Gb"):
                 seed = w.new_zeros(shape)
             seeds[name] = w if seed is None else seed.contiguous()  # w: never read
-        buffers = _evaluate(w, s, settings, weights, None)
         needs = ctx.needs_input_grad[3:]
-        tiles = m // settings.block
-        programs = _programs(w.device, tiles)
-        partials = []
+        with torch.cuda.device_of(w):
+            gw, gs, gradients = _backward(w, s, post, settings, weights, seeds, extra, any(needs))
+        gradients = [g if need else None for g, need in zip(gradients, needs, strict=True)]
+        return None, gw, gs, *gradients
 
-        def launch(kernel, inputs, parameters, outputs, bound, **flags):
-            length = sum(p.numel() for p in parameters)
-            partials.append(w.new_empty(programs, length) if any(needs) else w)
-            kernel[(programs,)](
-                *inputs, *parameters, *outputs, partials[-1], length, n, m, settings.scale, bound,
-                WEIGHTS=any(needs), H=hidden, BLOCK=settings.block, P=settings.precision, **flags, num_warps=8, num_stages=1,
+
+def _backward(
+    w: Tensor, s: Tensor, post: Tensor, settings: Settings, weights: Sequence[Tensor], seeds: dict[str, Tensor], extra: bool,
+    wanted: bool,
+) -> tuple[Tensor, Tensor, Sequence[Tensor | None]]:  # fmt: skip
+    """Adjoints of w, s (N, 6) and, where wanted, of the weights. post: (6, M) of the forward pass; seeds: adjoints of the outputs;
+    extra: of the last three too."""
+    n, hidden = len(w), weights[0].shape[0]
+    m = _rows(n)
+    b = _evaluate(w, s, settings, weights, None)
+    h1, h2, g1, g2 = (w.new_empty(hidden if wanted else 0, m) for _ in range(4))  # of one network after the other
+    grid = (m // settings.block,)
+    scale, bound, alpha = settings.scale, settings.l_max or 0.0, settings.alpha
+    size = {"H": hidden, "BLOCK": settings.block, "P": settings.precision}
+    flags = {"BOUNDED": settings.l_max is not None, "EXTRA": extra, "WEIGHTS": wanted}
+    programs = _programs(w.device, m // settings.block)
+    partial = w.new_empty(programs, sum(p.numel() for p in weights) if wanted else 0)
+    tile = max(64, hidden)
+
+    def empty(rows: int) -> Tensor:
+        return w.new_empty(rows, m)
+
+    def sums(first: int, inputs: Tensor, outputs: Tensor, more: tuple[Tensor, Tensor] | None = None) -> None:
+        """Gradients of the network whose first weight is weights[first]."""
+        if wanted:
+            start = sum(p.numel() for p in weights[:first])
+            g4, x4 = more or (g1, h1)
+            weight_gradients[(programs, 5)](
+                g1, inputs, g2, h1, outputs, h2, g4, x4, partial, start, partial.shape[1], m, IN1=weights[first].shape[1],
+                OUT3=weights[first + 4].shape[0], OUT4=len(g4) if more else 0, H=hidden, TILE=tile, BLOCK=settings.block // 2,
+                P=settings.precision, num_warps=8 if tile > 64 else 4,
             )  # fmt: skip
 
-        def six():
-            return w.new_empty(6, m)
-
-        b, bound = buffers, settings.l_max or 0.0
-        flags = {"BOUNDED": settings.l_max is not None, "EXTRA": extra}
-        gl2, gw_theta, gs2 = torch.empty_like(b.l2), six(), six()
-        launch(
-            adjoint.theta_backward, (b.l2, w, b.s2, seeds["b"], seeds["post"]), weights[20:], (gl2, gw_theta, gs2), bound, **flags
-        )
-        gt, gs1, gmoved = torch.empty_like(b.t), six(), six()
-        assemble_adjoint[(m // LANES,)](
-            b.t, b.s1, b.pre, seeds["G"], seeds["b"], gs2, seeds["t"], gt, gs1, gmoved, n, m, EXTRA=extra, BLOCK=LANES
-        )
-        gl1, gt_normals, gs_normals = torch.empty_like(b.l1), w.new_empty(12, m), six()
-        inputs = (b.l1, b.t, b.s1, b.l2, gt, gl2)
-        launch(adjoint.psi2_backward, inputs, weights[14:20], (gl1, gt_normals, gs_normals), settings.alpha)
-        gw_psi, gs_psi = six(), six()
-        inputs = (w, b.s1, b.l1, b.t, gt, gt_normals, gl1)
-        launch(adjoint.psi1_backward, inputs, weights[6:14], (gw_psi, gs_psi), settings.alpha)
-        gw, gs = torch.empty_like(w), torch.empty_like(s)
-        inputs = (w, s, b.pre, gmoved, seeds["pre"], gs1, gs_normals, gs_psi, gw_psi, gw_theta)
-        launch(adjoint.phi_backward, inputs, weights[:6], (gw, gs), bound, **flags)
-        gradients = [None] * len(weights)
-        if any(needs):
-            groups = (weights[20:], weights[14:20], weights[6:14], weights[:6])  # in the order of the launches
-            ordered = []
-            for partial, group in zip(partials, groups, strict=True):
-                parts = partial.sum(0).split([p.numel() for p in group])
-                ordered = [part.view_as(p) for part, p in zip(parts, group, strict=True)] + ordered
-            gradients = [g if need else None for g, need in zip(ordered, needs, strict=True)]
-        return None, gw, gs, *gradients
+    gl2, gw_theta, gs2, out = empty(hidden), empty(6), empty(6), empty(6)
+    theta_backward[grid](
+        b.l2, w, b.s2, post, seeds["b"], seeds["post"], *weights[20:], h1, h2, g1, g2, out, gl2, gw_theta, gs2, n, m, scale, bound,
+        **flags, **size,
+    )  # fmt: skip
+    sums(20, b.l2, out)
+    gt, gs1, gmoved = torch.empty_like(b.t), empty(6), empty(6)
+    assemble_adjoint[(m // LANES,)](
+        b.t, b.s1, b.pre, seeds["G"], seeds["b"], gs2, seeds["t"], gt, gs1, gmoved, n, m, EXTRA=extra, BLOCK=LANES
+    )
+    gl1, gt_normals, gs_normals, out = empty(hidden), empty(12), empty(6), empty(12 + hidden)
+    psi2_backward[grid](
+        b.l1, b.t, b.s1, b.l2, gt, gl2, *weights[14:20], h1, h2, g1, g2, out, gl1, gt_normals, gs_normals, n, m, scale, alpha,
+        WEIGHTS=wanted, **size,
+    )  # fmt: skip
+    sums(14, b.l1, out)
+    x, gplanes, out, gw_psi, gs_psi = empty(12), empty(36), empty(hidden), empty(6), empty(6)
+    psi1_backward[grid](
+        w, b.s1, b.t, gt, gt_normals, gl1, *weights[6:14], h1, h2, g1, g2, x, gplanes, out, gw_psi, gs_psi, n, m, scale, alpha,
+        WEIGHTS=wanted, **size,
+    )  # fmt: skip
+    sums(6, x, out, (gplanes, b.l1))
+    gw, gs, out = torch.empty_like(w), torch.empty_like(s), empty(6)
+    phi_backward[grid](
+        w, s, b.pre, gmoved, seeds["pre"], gs1, gs_normals, gs_psi, gw_psi, gw_theta, *weights[:6], h1, h2, g1, g2, x, out, gw, gs,
+        n, m, scale, bound, **flags, **size,
+    )  # fmt: skip
+    sums(0, x, out)
+    if not wanted:
+        return gw, gs, [None] * len(weights)
+    parts = partial.sum(0).split([p.numel() for p in weights])
+    return gw, gs, [part.view_as(p) for part, p in zip(parts, weights, strict=True)]
 
 
 def fused_operator(w: Tensor, s: Tensor, settings: Settings, weights: Sequence[Tensor]) -> tuple[Tensor, ...]:
