@@ -105,7 +105,7 @@ class StressAdapter(Adapter):
     major_symmetry: a projection after which a constant operator has an energy; state_dependence: full | constant;
     recompute: evaluate the networks again in the backward pass instead of storing 4 kB per particle and evaluation;
     fused: auto | true | false: Triton kernels on CUDA, which always recompute; auto: where they can take these options;
-    precision: of their products, accurate (as float32) | tf32 (relative errors of 1e-3, faster);
+    precision: of their products, accurate (as float32) | tf32 (relative errors to 5e-3, of gradients to 2e-2; faster);
     no_C, no_pre, no_post, no_prior_stress: ablations. Errors: ConfigError naming the key for values out of range.
     """
 
@@ -188,7 +188,7 @@ class StressAdapter(Adapter):
         """`affine` by the fused kernels; C of the result is (N, 4, 12), the numbers of the matrices."""
         from mosa.modules.fused.operation import Settings, fused_operator
 
-        settings = Settings(operator.alpha, operator.l_max, operator.scale, PRECISIONS[self.precision])
+        settings = Settings(operator.alpha, operator.l_max, float(operator.scale), PRECISIONS[self.precision])
         G, b, numbers, pre, post = fused_operator(w, s, settings, weights_of(operator))
         b = rested(b[:-1], b[-1:], w, s) if self.rest_free else b[:-1]
         return G, b, Correction(G, pre, post, numbers.unflatten(-1, (4, 12)))

@@ -63,11 +63,11 @@ def test_outputs_and_all_gradients_are_those_of_the_modules(options, penalised):
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("penalised", [False, True])
-@pytest.mark.parametrize("precision, tolerance", [("accurate", ACCURATE), ("tf32", 1e-2)])
+@pytest.mark.parametrize("precision, tolerance", [("accurate", ACCURATE), ("tf32", 2e-2)])
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
 def test_on_cuda_in_both_precisions(options, precision, tolerance, penalised):
-    """20000 particles are more tiles than a card has multiprocessors. tf32 rounds to 2^-11 before each of up to 24 products of a
-    backward pass: 1e-2 at worst; the accurate mode must not be the same numbers."""
+    """20000 particles are more tiles than a card has multiprocessors. tf32 cuts factors to 2^-10 before each of the 20 or so
+    products in a row of a backward pass: 2e-2 at worst; the accurate mode must not be the same numbers."""
     error, worst = compared(options, 20_000, penalised, "cuda", precision)
     assert error <= tolerance, worst
     assert precision == "accurate" or error > 1e-5

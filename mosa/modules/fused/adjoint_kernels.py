@@ -55,7 +55,7 @@ def hidden_adjoint(
     return e1
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["N"])
 def theta_backward(
     l2, w, s2, post, gb, extra, W1, b1, W2, b2, W3, b3, h1, h2, g1, g2, gout, gl2, gw, gs2, N, M, scale, bound,
     BOUNDED: tl.constexpr, EXTRA: tl.constexpr, WEIGHTS: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
@@ -95,7 +95,7 @@ def normal_adjoint(gt, t, s1, g, r, M, plane: tl.constexpr, c1: tl.constexpr, c2
     return k * (1.0 + u00), k * u01, k * u02
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["N"])
 def psi2_backward(
     l1, t, s1, l2, gt, gl2, W1, b1, W2, b2, W3, b3, h1, h2, g1, g2, gout, gl1, gtn, gsn, N, M, scale, alpha,
     WEIGHTS: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
@@ -133,7 +133,7 @@ def psi2_backward(
     tl.store(gsn + 5 * M + r, xb + yc)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["N"])
 def psi1_backward(
     w, s1, t, gt, gtn, gl1, W1, b1, W2, b2, W3, b3, Wp, bp, h1, h2, g1, g2, x, gplanes, gout, gw, gs, N, M, scale, alpha,
     WEIGHTS: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
@@ -161,7 +161,7 @@ def psi1_backward(
     store_input_adjoint(gw, gs, scale * tl.dot(e1, matrix(W1, h, c, 12, H, 12), input_precision=P), r, M)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["N"])
 def phi_backward(
     w, s, pre, gpre, extra, gs1, gsn, gsx, gwx, gwt, W1, b1, W2, b2, W3, b3, h1, h2, g1, g2, x, gout, gw, gs, N, M, scale, bound,
     BOUNDED: tl.constexpr, EXTRA: tl.constexpr, WEIGHTS: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
@@ -213,7 +213,7 @@ def layer_gradient(
         tl.store(at + OUT * IN + out, bias, mask=out < OUT)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["start"])
 def weight_gradients(
     g1, x1, g2, h1, g3, h2, g4, x4, partial, start, size, M, IN1: tl.constexpr, OUT3: tl.constexpr, OUT4: tl.constexpr,
     H: tl.constexpr, TILE: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,

@@ -113,7 +113,7 @@ def store_operator(
     entry(G, r, N, sp, third, 0.0 * C[0])  # no plane holds both
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["N"])
 def assemble(t, s1, pre, G, s2, moved, N, M, OPERATOR: tl.constexpr, BLOCK: tl.constexpr):
     """s2 = (I + G) s1 and moved = (I + G) pre, each (6, M); OPERATOR: also G (N, 6, 6)."""
     r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -202,7 +202,7 @@ def store_six(out, r, M, a, b, c, d, e, f):
     tl.store(out + 5 * M + r, f)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["N"])
 def assemble_adjoint(
     t, s1, pre, gG, gb, gs2, extra, gt, gs1, gpre, N, M, EXTRA: tl.constexpr, BLOCK: tl.constexpr
 ):  # fmt: skip

@@ -22,7 +22,8 @@ def tanh(z):
 @triton.jit
 def silu(z):
     """(silu(z), its derivative)."""
-    g = 1.0 / (1.0 + tl.exp(-z))
+    e = tl.exp(-tl.abs(z))
+    g = tl.where(z < 0.0, e, 1.0) / (1.0 + e)
     return z * g, g * (1.0 + z * (1.0 - g))
 
 
@@ -90,7 +91,7 @@ def normal_traction(t, s1, r, M, plane: tl.constexpr, c1: tl.constexpr, c2: tl.c
     return (1.0 + l00) * (v0 + u00 * v0 + u01 * v1 + u02 * v2)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["N"])
 def phi_forward(
     w, s, W1, b1, W2, b2, W3, b3, pre, s1, N, M, scale, bound,
     BOUNDED: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
@@ -109,7 +110,7 @@ def phi_forward(
     store_by_column(s1, own + y, r, c, M, 6)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["N"])
 def psi1_forward(
     w, s1, W1, b1, W2, b2, W3, b3, Wp, bp, l1, t, N, M, scale, alpha,
     H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
@@ -142,7 +143,7 @@ def psi2_hidden(l1, t, s1, W1, b1, r, M, scale, H: tl.constexpr, P: tl.constexpr
     return x, nx, ny, nz, z
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["N"])
 def psi2_forward(
     l1, t, s1, W1, b1, W2, b2, W3, b3, l2, N, M, scale, alpha,
     H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
@@ -170,7 +171,7 @@ def theta_hidden(l2, w, s2, W1, b1, r, N, M, scale, H: tl.constexpr, P: tl.const
     return x, rest, z
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["N"])
 def theta_forward(
     l2, w, s2, moved, W1, b1, W2, b2, W3, b3, post, b, N, M, scale, bound,
     BOUNDED: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,

@@ -50,6 +50,11 @@ def _rows(n: int) -> int:
     return -(-(n + 1) // LANES) * LANES
 
 
+def _warps(hidden: int) -> int:
+    """A warp group for 64 rows of 64 columns."""
+    return 8 if hidden > 64 else 4
+
+
 def _programs(device: torch.device, tiles: int) -> int:
     """Programs of a backward kernel, each with its own sums of weight gradients: one a multiprocessor."""
     if device.type != "cuda":
@@ -64,7 +69,7 @@ def _evaluate(w: Tensor, s: Tensor, settings: Settings, weights: Sequence[Tensor
     buffers = _Buffers(*(w.new_empty(k, m) for k in (6, 6, hidden + 3, 48, hidden + 12, 6, 6)))
     phi, psi1, psi2 = weights[:6], weights[6:14], weights[14:20]
     bound, scale, alpha = settings.l_max or 0.0, settings.scale, settings.alpha
-    size = {"H": hidden, "BLOCK": settings.block, "P": settings.precision}
+    size = {"H": hidden, "BLOCK": settings.block, "P": settings.precision, "num_warps": _warps(hidden)}
     tiles = (m // settings.block,)
     b = buffers
     phi_forward[tiles](w, s, *phi, b.pre, b.s1, n, m, scale, bound, BOUNDED=settings.l_max is not None, **size)
@@ -89,7 +94,7 @@ class _FusedOperator(torch.autograd.Function):
             theta_forward[(post.shape[1] // settings.block,)](
                 buffers.l2, w, buffers.s2, buffers.moved, *weights[20:], post, b, n, post.shape[1], settings.scale,
                 settings.l_max or 0.0, BOUNDED=settings.l_max is not None, H=weights[0].shape[0], BLOCK=settings.block,
-                P=settings.precision,
+                P=settings.precision, num_warps=_warps(weights[0].shape[0]),
             )  # fmt: skip
         ctx.settings = settings
         ctx.save_for_backward(w, s, post, *weights)
@@ -127,7 +132,7 @@ def _backward(
     h1, h2, g1, g2 = (w.new_empty(hidden if wanted else 0, m) for _ in range(4))  # of one network after the other
     grid = (m // settings.block,)
     scale, bound, alpha = settings.scale, settings.l_max or 0.0, settings.alpha
-    size = {"H": hidden, "BLOCK": settings.block, "P": settings.precision}
+    size = {"H": hidden, "BLOCK": settings.block, "P": settings.precision, "num_warps": _warps(hidden)}
     flags = {"BOUNDED": settings.l_max is not None, "EXTRA": extra, "WEIGHTS": wanted}
     programs = _programs(w.device, m // settings.block)
     partial = w.new_empty(programs, sum(p.numel() for p in weights) if wanted else 0)
@@ -144,7 +149,7 @@ def _backward(
             weight_gradients[(programs, 5)](
                 g1, inputs, g2, h1, outputs, h2, g4, x4, partial, start, partial.shape[1], m, IN1=weights[first].shape[1],
                 OUT3=weights[first + 4].shape[0], OUT4=len(g4) if more else 0, H=hidden, TILE=tile, BLOCK=settings.block // 2,
-                P=settings.precision, num_warps=8 if tile > 64 else 4,
+                P=settings.precision, num_warps=_warps(hidden),
             )  # fmt: skip
 
     gl2, gw_theta, gs2, out = empty(hidden), empty(6), empty(6), empty(6)
