@@ -43,14 +43,17 @@ def hidden_adjoint(
 ):  # fmt: skip
     """(BLOCK, H) adjoint of z1 from g, that of the second activations; with WEIGHTS all four hidden arrays are stored."""
     h = tl.arange(0, H)
-    a1, d1 = silu(z1)
-    a2, d2 = silu(dense(a1, matrix(W2, h, h, H, H, H), tl.load(b2 + h), P))
-    e2 = g * d2
-    e1 = tl.dot(e2, matrix(W2, h, h, H, H, H), input_precision=P) * d1
+    a1, _ = silu(z1)
     if WEIGHTS:
         store_by_column(h1, a1, r, h, M, H)
+    a2, d2 = silu(dense(a1, matrix(W2, h, h, H, H, H), tl.load(b2 + h), P))
+    e2 = g * d2
+    if WEIGHTS:
         store_by_column(h2, a2, r, h, M, H)
         store_by_column(g2, e2, r, h, M, H)
+    _, d1 = silu(z1)
+    e1 = tl.dot(e2, matrix(W2, h, h, H, H, H), input_precision=P) * d1
+    if WEIGHTS:
         store_by_column(g1, e1, r, h, M, H)
     return e1
 
@@ -104,19 +107,20 @@ def psi2_backward(
     (12 + H, M). The scaled normals become rows H to H + 2 of l1."""
     r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     h, c = tl.arange(0, H), tl.arange(0, 16)
-    _, nx, ny, nz, z1 = psi2_hidden(l1, t, s1, W1, b1, r, M, scale, H, P)
     y = by_column(t + 36 * M, r, c, M, 12)
     e = by_column(gt + 36 * M, r, c, M, 12) * (alpha - y * y / alpha)
     yb = by_column(l2, r, h, M, H)
     eb = by_column(gl2, r, h, M, H) * (alpha - yb * yb / alpha)
     if WEIGHTS:
-        tl.store(l1 + H * M + r, nx)
-        tl.store(l1 + (H + 1) * M + r, ny)
-        tl.store(l1 + (H + 2) * M + r, nz)
         store_by_column(gout, e, r, c, M, 12)
         store_by_column(gout + 12 * M, eb, r, h, M, H)
     g = tl.dot(e, matrix(W3, c, h, H, 12, H), input_precision=P)
     g += tl.dot(eb, matrix(W3 + 12 * H, h, h, H, H, H), input_precision=P)
+    _, nx, ny, nz, z1 = psi2_hidden(l1, t, s1, W1, b1, r, M, scale, H, P)
+    if WEIGHTS:
+        tl.store(l1 + H * M + r, nx)
+        tl.store(l1 + (H + 1) * M + r, ny)
+        tl.store(l1 + (H + 2) * M + r, nz)
     e1 = hidden_adjoint(g, z1, W2, b2, h1, h2, g1, g2, r, M, WEIGHTS, H, P)
     store_by_column(gl1, tl.dot(e1, matrix(W1, h, h, H + 3, H, H), input_precision=P), r, h, M, H)
     kx = scale * tl.sum(e1 * tl.load(W1 + h * (H + 3) + H)[None, :], 1)
