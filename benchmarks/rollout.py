@@ -1,7 +1,8 @@
 """Time and memory of rollouts, forward and forward + backward, without and with each adapter.
 
     OMP_NUM_THREADS=1 python benchmarks/rollout.py [--device cpu|cuda] [--counts 10000 30000] [--substeps 40] [--repeats 5]
-                                                   [--variants none constant stride1 ...] [--set fused=true]
+                                                   [--variants none constant stride1 ...]
+                                                   [--set precision=tf32 fused=true]
     python benchmarks/rollout.py --check           a small CPU run against benchmarks/rollout_ratios.json; --store rewrites it
 
 A block of corotated material falls for one frame. Variants: `none`; `constant`, the default adapter (one operator for the whole
@@ -21,6 +22,8 @@ from __future__ import annotations
 import argparse
 import ctypes
 import gc
+import importlib.metadata
+import importlib.util
 import json
 import platform
 import statistics
@@ -238,7 +241,9 @@ def check(attempts: int = 3) -> tuple[dict[str, float], dict[str, float], list[s
 
 def versions() -> str:
     cuda = f", {torch.cuda.get_device_name()}, CUDA {torch.version.cuda}" if torch.cuda.is_available() else ", no CUDA device"
-    return f"{platform.processor() or platform.machine()}, torch {torch.__version__}, warp {wp.__version__}{cuda}"
+    found = importlib.util.find_spec("triton") is not None
+    triton = f", triton {importlib.metadata.version('triton')}" if found else ", no triton"
+    return f"{platform.processor() or platform.machine()}, torch {torch.__version__}, warp {wp.__version__}{triton}{cuda}"
 
 
 def main() -> None:
