@@ -1,4 +1,4 @@
-"""Shared fixtures: the reference data's place, one thread, CUDA gate."""
+"""Shared fixtures: the reference data's place, one thread, CUDA gate, Triton's interpreter."""
 
 import os
 from pathlib import Path
@@ -9,6 +9,8 @@ import pytest
 import torch
 
 torch.set_num_threads(1)
+if not torch.cuda.is_available():
+    os.environ.setdefault("TRITON_INTERPRET", "1")  # before Triton is imported: its kernels then run on CPU tensors
 
 
 def pytest_collection_modifyitems(items):

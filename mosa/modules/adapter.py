@@ -10,6 +10,8 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from mosa.errors import ConfigError
+from mosa.modules import microplane
+from mosa.modules.fused.selection import PRECISIONS, check_options, chosen, weights_of
 from mosa.modules.progressive import Correction, ProgressiveOperator, apply
 from mosa.physics.rollout import AdapterOperator, MaterialState
 
@@ -48,9 +50,7 @@ def pool(parts: Sequence[OperatorStatistics]) -> OperatorStatistics:
     """Over evaluations of equally many particles: the variance is then over particles and time."""
     means, within = torch.stack([p.mean for p in parts]), torch.stack([p.within for p in parts])
     mean = means.mean(0)
-    return OperatorStatistics(
-        torch.stack([p.mean_abs_C for p in parts]).mean(), mean, (within + (means - mean).square()).mean(0)
-    )
+    return OperatorStatistics(torch.stack([p.mean_abs_C for p in parts]).mean(), mean, (within + (means - mean).square()).mean(0))
 
 
 class Adapter(nn.Module):
@@ -90,7 +90,10 @@ class Adapter(nn.Module):
         """Of the last `forward`, with its graph. Errors: ConfigError before the first."""
         if self._last is None:
             raise ConfigError("adapter: statistics are those of the last evaluation, and there was none yet")
-        return statistics(*self._last)
+        C, pre, post = self._last
+        if C.shape[-1] == 12:  # the fused kernels leave the numbers that the matrices are made of
+            C = microplane.correction(C)
+        return statistics(C, pre, post)
 
 
 class StressAdapter(Adapter):
@@ -101,13 +104,16 @@ class StressAdapter(Adapter):
     plastic: a second set of networks corrects the strain in the yield function;
     major_symmetry: a projection after which a constant operator has an energy; state_dependence: full | constant;
     recompute: evaluate the networks again in the backward pass instead of storing 4 kB per particle and evaluation;
+    fused: auto | true | false: Triton kernels on CUDA, which always recompute; auto: where they can take these options;
+    precision: of their products, accurate (as float32) | tf32 (relative errors to 5e-3, of gradients to 2e-2; faster);
     no_C, no_pre, no_post, no_prior_stress: ablations. Errors: ConfigError naming the key for values out of range.
     """
 
     def __init__(
         self, *, alpha: float = 0.1, l_max: float | None = 0.1, input_scale: float = 10.0, hidden: int = 64,
         rest_free: bool = True, plastic: bool = False, major_symmetry: bool = False, state_dependence: str = "full",
-        recompute: bool = False, no_C: bool = False, no_pre: bool = False, no_post: bool = False, no_prior_stress: bool = False,
+        recompute: bool = False, fused: bool | str = "auto", precision: str = "accurate",
+        no_C: bool = False, no_pre: bool = False, no_post: bool = False, no_prior_stress: bool = False,
     ) -> None:  # fmt: skip
         super().__init__()
         if not 0 < alpha < 1:
@@ -117,13 +123,12 @@ class StressAdapter(Adapter):
             raise ConfigError(f"adapter.state_dependence: expected full or constant, found {state_dependence!r}")
         if no_prior_stress and no_pre:
             raise ConfigError("adapter: no_prior_stress needs L_pre (no_pre=false): the stress comes from it alone")
-        self.rest_free, self.recompute = rest_free, recompute
+        check_options(fused, precision)
+        self.rest_free, self.recompute, self.fused, self.precision = rest_free, recompute, fused, precision
         shape = {"alpha": alpha, "input_scale": input_scale, "hidden": hidden, "state_dependence": state_dependence}
         shape |= {"no_C": no_C, "no_pre": no_pre, "no_post": no_post}
         bound = None if no_prior_stress else l_max  # without the prior the residuals have to carry the whole stress
-        self.operator = ProgressiveOperator(
-            l_max=bound, major_symmetry=major_symmetry, no_prior_stress=no_prior_stress, **shape
-        )
+        self.operator = ProgressiveOperator(l_max=bound, major_symmetry=major_symmetry, no_prior_stress=no_prior_stress, **shape)
         # C0 is a stiffness: it has no meaning for the strain in the yield function
         self.plastic_operator = ProgressiveOperator(l_max=l_max, **shape) if plastic else None
 
@@ -173,9 +178,20 @@ class StressAdapter(Adapter):
         return AdapterOperator(G.to(outer), (self.E_ref * b).to(outer), plastic_G, plastic_h)
 
     def _evaluate(self, operator: ProgressiveOperator, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Correction]:
+        if chosen(self.fused, operator, w):
+            return self._evaluate_fused(operator, w, s)
         if self.recompute and torch.is_grad_enabled():
             return checkpoint(self.affine, operator, w, s, use_reentrant=False, preserve_rng_state=False)
         return self.affine(operator, w, s)
+
+    def _evaluate_fused(self, operator: ProgressiveOperator, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Correction]:
+        """`affine` by the fused kernels; C of the result is (N, 4, 12), the numbers of the matrices."""
+        from mosa.modules.fused.operation import Settings, fused_operator
+
+        settings = Settings(operator.alpha, operator.l_max, float(operator.scale), PRECISIONS[self.precision])
+        G, b, numbers, pre, post = fused_operator(w, s, settings, weights_of(operator))
+        b = rested(b[:-1], b[-1:], w, s) if self.rest_free else b[:-1]
+        return G, b, Correction(G, pre, post, numbers.unflatten(-1, (4, 12)))
 
 
 def rested(b: Tensor, rest: Tensor, w: Tensor, s: Tensor) -> Tensor:

@@ -1,0 +1,284 @@
+"""Time and memory of rollouts, forward and forward + backward, without and with each adapter.
+
+    OMP_NUM_THREADS=1 python benchmarks/rollout.py [--device cpu|cuda] [--counts 10000 30000] [--substeps 40] [--repeats 5]
+                                                   [--variants none constant stride1 ...]
+                                                   [--set precision=tf32 fused=true]
+    python benchmarks/rollout.py --check           a small CPU run against benchmarks/rollout_ratios.json; --store rewrites it
+
+A block of corotated material falls for one frame. Variants: `none`; `constant`, the default adapter (one operator for the whole
+body); `stride1`, `mosa`: the paper's networks asked at every substep, at the default stride. Forward is timed without a graph;
+forward + backward gives gradients with respect to modulus, velocity and all weights, the networks' activations recomputed
+(`--store-activations` keeps them). Milliseconds per substep: median (least to most) of the repeats, wall time between
+synchronisations on CUDA, CPU time on one thread elsewhere. Memory: most that torch and Warp held at once on CUDA, most that the
+process held beyond its start on a CPU. The first runs compile kernels and capture graphs; they are not counted.
+
+The check compares ratios of times in one run, which the machine's speed cancels out of, and fails when one is more than a quarter
+above the stored one. `none forward / yardstick` has scattered sums of torch below it, as many as P2G has. Best CPU times are used,
+of rounds that go through all variants, so that other work on the machine disturbs them little.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import gc
+import importlib.metadata
+import importlib.util
+import json
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import warp as wp
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from substep import body
+
+from mosa.modules.body import SimulationSettings
+from mosa.physics.rollout import Simulator
+from mosa.types import Ground, ParticleState
+
+HERE = Path(__file__).parent
+STORED = HERE / "rollout_ratios.json"
+ALLOWED = 1.25
+"""Factor by which a ratio may exceed the stored one."""
+DX, DT, DENSITY, MU, LAM = 1 / 32, 1e-4, 1000.0, 4e4, 6e4
+STRIDE = SimulationSettings.stride
+VARIANTS = {"none": (None, 1), "constant": ("operator", STRIDE), "stride1": ("mosa", 1), "mosa": ("mosa", STRIDE)}
+"""Name: (file of conf/adapter, substeps between evaluations)."""
+CHECK = {"particles": 2000, "substeps": 16, "rounds": 5}
+
+
+def adapter_of(name: str | None, device: str, settings: dict) -> torch.nn.Module | None:
+    """The adapter of conf/adapter, every output drawn a little off zero. settings: keys that replace those of the file."""
+    if name is None:
+        return None
+    config = OmegaConf.load(HERE.parent / "conf" / "adapter" / f"{name}.yaml")
+    config = config.get("adapter", config)
+    known = {key: value for key, value in settings.items() if name == "mosa" or key in config}
+    adapter = instantiate({**OmegaConf.to_container(config), **known})
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for p in adapter.parameters():
+            p.add_(0.02 * torch.randn(p.shape, generator=generator))
+    adapter.switch_on(2.6 * MU)
+    return adapter.to(device)
+
+
+@dataclass
+class Case:
+    """One rollout of one variant, ready to run."""
+
+    forward: Callable[[], None]
+    both: Callable[[], None]
+
+
+def case(variant: str, particles: int, substeps: int, device: str, settings: dict) -> Case:
+    name, stride = VARIANTS[variant]
+    adapter = adapter_of(name, device, settings)
+    state = ParticleState(*(t.to(device) for t in body(particles, DX, torch.float32)))
+    volume = torch.full((particles,), (DX / 2) ** 3, device=device)
+    sim = Simulator("corotated", dx=DX, substeps=substeps, frame_dt=substeps * DT, ground=Ground(2 * DX), device=device)
+    leaves = [torch.tensor(MU, device=device), torch.zeros(3, device=device)]
+    weights = [] if adapter is None else [p for p in adapter.parameters() if p.requires_grad]
+
+    def rollout(mu, velocity):
+        start = ParticleState(state.x, state.v + velocity, state.C_affine, state.F, state.F_tot)
+        return sim.rollout(start, {"mu": mu, "lam": LAM}, volume, DENSITY, 2, adapter=adapter, stride=stride)
+
+    def forward() -> None:
+        with torch.no_grad():
+            rollout(*leaves)
+
+    def both() -> None:
+        wanted = [leaf.clone().requires_grad_() for leaf in leaves]
+        torch.autograd.grad(rollout(*wanted).x[-1].square().sum(), wanted + weights)
+
+    return Case(forward, both)
+
+
+def clock(device: str) -> float:
+    """Seconds: wall time after all launched work on CUDA, else CPU time."""
+    if device == "cuda":
+        torch.cuda.synchronize()
+        return time.perf_counter()
+    return time.process_time()
+
+
+def timed(call: Callable[[], None], device: str) -> float:
+    began = clock(device)
+    call()
+    return clock(device) - began
+
+
+def resident(field: str) -> float:
+    """GiB of this process's memory: VmRSS now, VmHWM at most; nan where the system does not tell."""
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return float("nan")
+    return next((int(line.split()[1]) / 2**20 for line in lines if line.startswith(field)), float("nan"))
+
+
+class PeakMemory:
+    """GiB held at most inside a `with` block: by torch and Warp on CUDA, by the process beyond its start on a CPU."""
+
+    def __init__(self, device: str) -> None:
+        self.device, self.start, self.peak = device, resident("VmRSS"), float("nan")
+
+    def __enter__(self) -> PeakMemory:
+        gc.collect()
+        if self.device == "cuda":
+            torch.cuda.synchronize()
+            torch.cuda.reset_peak_memory_stats()
+            return self
+        try:
+            ctypes.CDLL(None).malloc_trim(0)  # what earlier cases freed goes back to the system
+            Path("/proc/self/clear_refs").write_text("5")  # sets VmHWM back to VmRSS
+        except (OSError, AttributeError):
+            self.start = float("nan")
+        return self
+
+    def __exit__(self, *_) -> None:
+        if self.device == "cuda":
+            torch.cuda.synchronize()
+            warp = wp.get_mempool_used_mem_high("cuda") if wp.is_mempool_supported("cuda") else 0
+            self.peak = (torch.cuda.max_memory_allocated() + warp) / 2**30
+        else:
+            self.peak = resident("VmHWM") - self.start
+
+
+def spread(seconds: list[float], substeps: int) -> str:
+    milli = [1e3 * s / substeps for s in seconds]
+    return f"{statistics.median(milli):.3f} ({min(milli):.3f} to {max(milli):.3f})"
+
+
+def table(options: argparse.Namespace, settings: dict) -> None:
+    unit = "ms" if options.device == "cuda" else "CPU-ms"
+    print(f"\n{unit} per substep, median (least to most) of {options.repeats} rollouts of {options.substeps} substeps")
+    print("| particles | adapter | forward | forward + backward | over none | peak GiB |\n|---|---|---|---|---|---|")
+    memory = PeakMemory(options.device)
+    for particles in options.counts:
+        bases: list[float] = []
+        for variant in options.variants:
+            run = case(variant, particles, options.substeps, options.device, settings)
+            figures = []
+            with memory:
+                for call in (run.forward, run.both):
+                    for _ in range(3 if options.device == "cuda" else 1):
+                        call()
+                    figures.append([timed(call, options.device) for _ in range(options.repeats)])
+            medians = [statistics.median(f) for f in figures]
+            bases = medians if variant == "none" else bases
+            over = ", ".join(f"{a / b:.2f}" for a, b in zip(medians, bases)) if bases else "-"
+            shown = " | ".join(spread(f, options.substeps) for f in figures)
+            print(f"| {particles} | {variant} | {shown} | {over} | {memory.peak:.2f} |", flush=True)
+
+
+def yardstick(particles: int, substeps: int) -> Callable[[], None]:
+    """27 scattered sums of four floats per particle and substep, in torch: the memory traffic of P2G by other means."""
+    index = torch.randint(0, 16 * particles, (27 * particles,), generator=torch.Generator().manual_seed(0))
+    values, grid = torch.ones(27 * particles, 4), torch.zeros(16 * particles, 4)
+
+    def run() -> None:
+        for _ in range(substeps):
+            grid.index_add_(0, index, values)
+
+    return run
+
+
+def ratios(best: dict[str, float]) -> dict[str, float]:
+    """Of best times, by name: `variant forward`, `variant both` and `yardstick`."""
+    result = {"none forward / yardstick": best["none forward"] / best["yardstick"]}
+    for variant in VARIANTS:
+        if variant != "none":
+            result[f"{variant} forward / none forward"] = best[f"{variant} forward"] / best["none forward"]
+        result[f"{variant} both / {variant} forward"] = best[f"{variant} both"] / best[f"{variant} forward"]
+    return result
+
+
+class Check:
+    """Best CPU times over rounds; more rounds only sharpen them."""
+
+    def __init__(self) -> None:
+        particles, substeps = CHECK["particles"], CHECK["substeps"]
+        self.calls = {"yardstick": yardstick(particles, substeps)}
+        for variant in VARIANTS:
+            run = case(variant, particles, substeps, "cpu", {"recompute": True})
+            self.calls |= {f"{variant} forward": run.forward, f"{variant} both": run.both}
+        for call in self.calls.values():
+            call()
+        self.best = dict.fromkeys(self.calls, float("inf"))
+
+    def measure(self, rounds: int) -> dict[str, float]:
+        """Ratios after `rounds` more rounds."""
+        for _ in range(rounds):
+            for name, call in self.calls.items():
+                self.best[name] = min(self.best[name], timed(call, "cpu"))
+        return ratios(self.best)
+
+
+def degraded(found: dict[str, float], stored: dict[str, float]) -> list[str]:
+    """Names of the stored ratios that are exceeded by more than a quarter, or that were not measured."""
+    return [name for name, value in stored.items() if not found.get(name, float("inf")) <= ALLOWED * value]
+
+
+def check(attempts: int = 3) -> tuple[dict[str, float], dict[str, float], list[str]]:
+    """(ratios found, stored, names of degraded ones). Rounds are added while one looks degraded, `attempts` times at most."""
+    stored = json.loads(STORED.read_text())["ratios"]
+    measurement = Check()
+    for _ in range(attempts):
+        found = measurement.measure(CHECK["rounds"])
+        bad = degraded(found, stored)
+        if not bad:
+            break
+    return found, stored, bad
+
+
+def versions() -> str:
+    cuda = f", {torch.cuda.get_device_name()}, CUDA {torch.version.cuda}" if torch.cuda.is_available() else ", no CUDA device"
+    found = importlib.util.find_spec("triton") is not None
+    triton = f", triton {importlib.metadata.version('triton')}" if found else ", no triton"
+    return f"{platform.processor() or platform.machine()}, torch {torch.__version__}, warp {wp.__version__}{triton}{cuda}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--counts", type=int, nargs="+", help="particles; 10k to 1M on CUDA, 10k on a CPU where not given")
+    parser.add_argument("--variants", nargs="+", choices=tuple(VARIANTS), default=list(VARIANTS))
+    parser.add_argument("--substeps", type=int, default=40)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--store-activations", action="store_true", help="no recomputation of the networks")
+    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="settings of the paper's adapter")
+    parser.add_argument("--check", action="store_true", help="small CPU run against the stored ratios")
+    parser.add_argument("--store", action="store_true", help="measure and store the ratios of --check")
+    options = parser.parse_args()
+    wp.config.quiet = True
+    torch.set_num_threads(1)
+    print(versions())
+    if options.store:
+        found = {name: round(value, 3) for name, value in Check().measure(3 * CHECK["rounds"]).items()}
+        STORED.write_text(json.dumps({"machine": versions(), **CHECK, "ratios": found}, indent=2) + "\n")
+        print(STORED.read_text())
+    elif options.check:
+        found, stored, bad = check()
+        print("| ratio of CPU times | stored | found |\n|---|---|---|")
+        for name, value in stored.items():
+            print(f"| {name} | {value:.2f} | {found.get(name, float('nan')):.2f}{' DEGRADED' if name in bad else ''} |")
+        if bad:
+            raise SystemExit(f"more than a factor {ALLOWED} above the stored ratios: {', '.join(bad)}")
+    else:
+        if options.device == "cpu":
+            options.counts = options.counts or [10_000]
+        options.counts = options.counts or [10_000, 30_000, 100_000, 1_000_000]
+        settings = OmegaConf.to_container(OmegaConf.from_dotlist(options.set))
+        table(options, {"recompute": not options.store_activations, **settings})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""The four networks of the stress adapter and their assembly as Triton kernels."""
