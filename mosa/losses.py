@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mosa.physics.factorisation import singular_value_decomposition
+from mosa.rotations import axial, skew
 
 TINY = 1e-8
 STRAIN_FLOOR = 1e-3
@@ -81,18 +82,6 @@ class _Polar(torch.autograd.Function):
 def size(A: Tensor) -> Tensor:
     """Frobenius norm (..., 1, 1) of (..., 3, 3)."""
     return A.norm(dim=(-2, -1), keepdim=True)
-
-
-def axial(A: Tensor) -> Tensor:
-    """Axial vector (..., 3) of A - A^T, (..., 3, 3)."""
-    return torch.stack([A[..., 2, 1] - A[..., 1, 2], A[..., 0, 2] - A[..., 2, 0], A[..., 1, 0] - A[..., 0, 1]], -1)
-
-
-def skew(w: Tensor) -> Tensor:
-    """[w]_x, (..., 3, 3) of (..., 3)."""
-    x, y, z = w.unbind(-1)
-    o = torch.zeros_like(x)
-    return torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).unflatten(-1, (3, 3))
 
 
 def polar_rotation(F: Tensor) -> Tensor:

@@ -20,6 +20,7 @@ from mosa.physics.boundary import Plane
 from mosa.physics.colliders import Collider, reach
 from mosa.physics.rollout import Simulator
 from mosa.physics.time_step import required_substeps
+from mosa.rotations import skew
 from mosa.types import Ground, ParticleState, Rollout
 
 VARIANTS = ("prior", "prior_eta", "adapted")
@@ -62,12 +63,6 @@ class SimulationSettings:
     contact_offset: bool = True
     adaptive: bool = False
     min_substeps: int = 1
-
-
-def skew(w: Tensor) -> Tensor:
-    """Matrix [w]_x (3, 3) with [w]_x r = w x r."""
-    zero = torch.zeros_like(w[0])
-    return torch.stack([zero, -w[2], w[1], w[2], zero, -w[0], -w[1], w[0], zero]).reshape(3, 3)
 
 
 class ContactOffset(nn.Module):

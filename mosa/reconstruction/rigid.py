@@ -16,6 +16,7 @@ from torch import Tensor
 from mosa.rendering.cameras import crop_boxes, crop_cameras, crop_images, project
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import rasterize
+from mosa.rotations import skew
 from mosa.types import Cameras, Splats
 
 HUBER = 0.15
@@ -104,13 +105,6 @@ class RigidBody:
 def rotation_exp(vectors: Tensor) -> Tensor:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad]."""
     return torch.linalg.matrix_exp(skew(vectors))
-
-
-def skew(v: Tensor) -> Tensor:
-    """Matrices [v]_x (..., 3, 3) with [v]_x r = v x r."""
-    x, y, z = v.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
 
 
 def left_jacobian(v: Tensor) -> Tensor:
