@@ -100,17 +100,23 @@ def flow_error(found: MotionCues, true: TrueMotion, result: Reconstruction, scen
     return {"flow_px_median": float(error.quantile(0.5)), "flow_px_p90": float(error.quantile(0.9))}
 
 
-def measure(shape: str, condition: str, fit: str, out: Path, particles: int, seed: int) -> list[dict]:
-    """Reconstruct (or take from the cache) and compare. One dictionary per form."""
+def reconstructed(shape: str, condition: str, fit: str, out: Path, particles: int, seed: int) -> tuple[Scene, Reconstruction, int]:
+    """The scene, its reconstruction (from the cache where it lies there) and the number of neighbours of its cues."""
     scene, settings = scene_of(shape, condition), settings_of(condition, fit)
-    started = time.perf_counter()
     spacing = spacing_for(scene, particles, settings)
     result = reconstruct(scene, settings=settings, spacing=spacing, cache_dir=out / "cache", seed=seed)
+    return scene, result, settings.neighbours
+
+
+def measure(shape: str, condition: str, fit: str, out: Path, particles: int, seed: int) -> list[dict]:
+    """Reconstruct and compare. One dictionary per form."""
+    started = time.perf_counter()
+    scene, result, neighbours = reconstructed(shape, condition, fit, out, particles, seed)
     seconds = time.perf_counter() - started
     true = true_motion(scene.truth, result.splats.means)
     # frames whose time is after first contact, as for rms_m (evaluation.md)
     first = int((scene.times <= drop_named(shape, "train").contact).sum())
-    around = neighbourhood(result.splats.means, neighbours=settings.neighbours)
+    around = neighbourhood(result.splats.means, neighbours=neighbours)
     positions, covariances = result.cues.positions, result.cues.covariances
     forms = {"neighbourhood": neighbourhood_cues(positions, covariances, around)}
     if fit != "carried":
@@ -121,7 +127,7 @@ def measure(shape: str, condition: str, fit: str, out: Path, particles: int, see
         floor = neighbourhood_cues(true.positions, covariances, around)
         F = around.deformation(true.positions)
         forms["true motion"] = replace(floor, covariances=F @ rest @ F.transpose(-1, -2))
-    common = {"shape": shape, "condition": condition, "fit": fit, "particles": len(true.inside), "spacing_m": spacing,
+    common = {"shape": shape, "condition": condition, "fit": fit, "particles": len(true.inside), "spacing_m": result.spacing,
               "frames": [first, scene.frames - 1], "seed": seed}  # fmt: skip
     lines = []
     for form, cues in forms.items():
