@@ -15,6 +15,7 @@ import matplotlib
 import numpy as np
 import torch
 from cues import CONDITIONS, reconstructed
+from PIL import Image
 from torch import Tensor
 
 from mosa.analysis.cue_error import rotation_error, true_motion
@@ -48,6 +49,13 @@ def outlines(F: Tensor, centres: Tensor, axes: np.ndarray, radius: float) -> np.
     return radius * np.einsum("npq,aq->nap", flat, direction) / length[..., None] + (centres.double().numpy() @ axes.T)[:, None]
 
 
+def save(figure: plt.Figure, file: Path) -> None:
+    """As a PNG of 128 colours, a third of the size."""
+    figure.savefig(file, dpi=105)
+    plt.close(figure)
+    Image.open(file).convert("RGB").quantize(128, dither=Image.Dither.NONE).save(file, optimize=True)
+
+
 def ellipsoids(shape: str, args: argparse.Namespace) -> Path:
     """A layer of particles through the middle at one frame: the truth, and both forms at 12 cameras."""
     t, panels = args.frame, []
@@ -55,6 +63,8 @@ def ellipsoids(shape: str, args: argparse.Namespace) -> Path:
         scene, result, neighbours = reconstructed(shape, "cameras_12", fit, args.out, args.particles, args.seed)
         rest, positions = result.splats.means, result.cues.positions
         true = true_motion(scene.truth, rest)
+        if t is None:
+            t = int((true.stretch - 1).abs().amax(-1).median(dim=1).values.argmax())
         if fit == "carried":
             F = neighbourhood(rest, neighbours=neighbours).deformation(positions[t])
             panels.append(("true", true.positions[t], true.deformation[t], true, rest))
@@ -62,7 +72,7 @@ def ellipsoids(shape: str, args: argparse.Namespace) -> Path:
         else:
             panels.append((FORMS[fit, "gaussian"], positions[t], deformation_of(result.cues, result.splats, t), true, rest))
     axes, radius = np.array([[1.0, 0, 0], [0, 1.0, 0]]), 0.42 * result.spacing
-    figure, plots = plt.subplots(1, len(panels), figsize=(10.5, 4.0), sharex=True, sharey=True, layout="constrained")
+    figure, plots = plt.subplots(1, len(panels), figsize=(10.5, 4.2), sharex=True, sharey=True, layout="constrained")
     for (title, positions, deformation, true, rest), plot in zip(panels, plots):
         layer = (rest[:, 2] - rest[:, 2].median()).abs() < 0.6 * result.spacing
         F, where = deformation[layer].double(), positions[layer]
@@ -79,7 +89,7 @@ def ellipsoids(shape: str, args: argparse.Namespace) -> Path:
         plot.plot(*np.stack([centre - line, centre + line]).transpose(2, 0, 1), color="white", lw=0.7)
         strain = float((S - 1).abs().amax(1).median())
         plot.set_title(
-            f"{title}\nrotation error {np.median(error):.1f} deg, largest |stretch - 1| {strain:.3f} (medians)", fontsize=7.5
+            f"{title}\nrotation error {np.median(error):.1f} deg\nlargest |stretch - 1| {strain:.3f} (medians)", fontsize=7.5
         )
         plot.set_aspect("equal")
         plot.tick_params(labelsize=7)
@@ -90,8 +100,7 @@ def ellipsoids(shape: str, args: argparse.Namespace) -> Path:
         f"{shape} (synthetic), frame {t}, middle layer; stretches drawn {args.exaggeration:g} times as large", fontsize=9
     )
     file = args.to / f"cues_ellipsoids_{shape}.png"
-    figure.savefig(file, dpi=105)
-    plt.close(figure)
+    save(figure, file)
     return file
 
 
@@ -113,23 +122,24 @@ def bars(shapes: list[str], out: Path, to: Path, particles: int, seed: int) -> P
                 plot.vlines(x, median, high, color="#222222", lw=1.2)
             silence = [line[f"{name}_median"] for line in lines if line["form"] == "motionless"]
             for value in silence:
-                plot.axhline(value, color="#888888", ls=":", lw=1, label="no cue at all (median)")
+                plot.axhline(value, color="#888888", ls=":", lw=1, label="no cue (median)")
             plot.axhline(aim, color="#009e73", ls="--", lw=1, label="aim at 12 cameras")
             plot.set_yscale("log")
             plot.set_xticks(range(len(CONDITIONS)), [c.replace("_", "\n") for c in CONDITIONS], fontsize=7)
             plot.set_title(f"{shape}: {title}", fontsize=9)
             plot.tick_params(axis="y", labelsize=7)
-    plots[0, 0].legend(fontsize=6.5, loc="upper left", ncols=2)
+            plot.set_ylim(*((0.3, 60) if name == "rotation_deg" else (0.002, 0.3)))
+    handles, labels = plots[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, fontsize=7, loc="outside lower center", ncols=5)
     file = to / "cues_errors.png"
-    figure.savefig(file, dpi=105)
-    plt.close(figure)
+    save(figure, file)
     return file
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shapes", nargs="+", default=["rabbit", "chick1"])
-    parser.add_argument("--frame", type=int, default=10)
+    parser.add_argument("--frame", type=int, default=None, help="default: that of the largest stretches")
     parser.add_argument("--exaggeration", type=float, default=4.0)
     parser.add_argument("--particles", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
