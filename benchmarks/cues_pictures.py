@@ -57,51 +57,51 @@ def save(figure: plt.Figure, file: Path) -> None:
 
 
 def ellipsoids(shape: str, args: argparse.Namespace) -> Path:
-    """A layer of particles through the middle at one frame: the truth, and both forms at 12 cameras."""
-    t, panels = args.frame, []
+    """A layer of particles through the middle: the truth, and both forms at 12 cameras; a row per frame."""
+    rows: dict[int, list] = {}
     for fit in ("carried", "free"):
         scene, result, neighbours = reconstructed(shape, "cameras_12", fit, args.out, args.particles, args.seed)
         rest, positions = result.splats.means, result.cues.positions
         true = true_motion(scene.truth, rest)
-        if t is None:
-            t = int((true.stretch - 1).abs().amax(-1).median(dim=1).values.argmax())
-        if fit == "carried":
-            F = neighbourhood(rest, neighbours=neighbours).deformation(positions[t])
-            panels.append(("true", true.positions[t], true.deformation[t], true, rest))
-            panels.append((FORMS[fit, "neighbourhood"], positions[t], F, true, rest))
-        else:
-            panels.append((FORMS[fit, "gaussian"], positions[t], deformation_of(result.cues, result.splats, t), true, rest))
-    axes, radius = np.array([[1.0, 0, 0], [0, 1.0, 0]]), 0.42 * result.spacing
-    figure, plots = plt.subplots(1, len(panels), figsize=(10.5, 4.2), sharex=True, sharey=True, layout="constrained")
-    for (title, positions, deformation, true, rest), plot in zip(panels, plots):
+        squashed = int((true.stretch - 1).abs().amax(-1).median(dim=1).values.argmax())
         layer = (rest[:, 2] - rest[:, 2].median()).abs() < 0.6 * result.spacing
-        F, where = deformation[layer].double(), positions[layer]
-        R, _ = polar(F)
-        U, S, Vh = torch.linalg.svd(F)
-        shown = (U * (1 + args.exaggeration * (S - 1)).clamp(0.2, 2.5)[:, None]) @ Vh
-        error = rotation_error(R, true.rotation[t][layer]).numpy()
-        drawn = PolyCollection(
-            outlines(shown, where, axes, radius), array=error, cmap="viridis", clim=(0, 10), ec="#333333", lw=0.3
-        )
-        plot.add_collection(drawn)
-        # where the rest x axis points to: shows the rotation
-        line, centre = radius * R[:, :2, 0].numpy(), where[:, :2].numpy()
-        plot.plot(*np.stack([centre - line, centre + line]).transpose(2, 0, 1), color="white", lw=0.7)
-        strain = float((S - 1).abs().amax(1).median())
-        plot.set_title(
-            f"{title}\nrotation error {np.median(error):.1f} deg\nlargest |stretch - 1| {strain:.3f} (medians)", fontsize=7.5
-        )
-        plot.set_aspect("equal")
-        plot.tick_params(labelsize=7)
-        plot.autoscale_view()
-    plots[0].set_ylabel("height [m]", fontsize=8)
-    figure.colorbar(drawn, ax=plots, shrink=0.7).set_label("rotation error [degrees]", fontsize=8)
+        for t in args.frames or (squashed, scene.frames - 1):
+            if fit == "carried":
+                F = neighbourhood(rest, neighbours=neighbours).deformation(positions[t])
+                drawn = [("true", true.positions[t], true.deformation[t]), (FORMS[fit, "neighbourhood"], positions[t], F)]
+            else:
+                drawn = [(FORMS[fit, "gaussian"], positions[t], deformation_of(result.cues, result.splats, t))]
+            rows.setdefault(t, []).extend((title, x[layer], F[layer].double(), true.rotation[t][layer]) for title, x, F in drawn)
+    figure, plots = plt.subplots(len(rows), 3, figsize=(10, 3.3 * len(rows)), sharey="row", squeeze=False, layout="constrained")
+    for plot, (t, panel) in zip(plots.flat, ((t, panel) for t, panels in rows.items() for panel in panels)):
+        drawn = draw_layer(plot, t, *panel, radius=0.42 * result.spacing, exaggeration=args.exaggeration)
+    figure.colorbar(drawn, ax=plots, shrink=0.6).set_label("rotation error [degrees]", fontsize=8)
     figure.suptitle(
-        f"{shape} (synthetic), frame {t}, middle layer; stretches drawn {args.exaggeration:g} times as large", fontsize=9
+        f"{shape} (synthetic), middle layer; heights in m, stretches drawn {args.exaggeration:g} times as large", fontsize=9
     )
     file = args.to / f"cues_ellipsoids_{shape}.png"
     save(figure, file)
     return file
+
+
+def draw_layer(plot, t: int, title: str, where: Tensor, F: Tensor, true: Tensor, *, radius: float, exaggeration: float):
+    """Ellipsoids with F (N, 3, 3) at `where` (N, 3) [m], seen along z, coloured by the angle [degrees] from the true rotation."""
+    R, _ = polar(F)
+    U, S, Vh = torch.linalg.svd(F)
+    shown = (U * (1 + exaggeration * (S - 1)).clamp(0.2, 2.5)[:, None]) @ Vh
+    error = rotation_error(R, true).numpy()
+    shapes = outlines(shown, where, np.eye(3)[:2], radius)
+    drawn = plot.add_collection(PolyCollection(shapes, array=error, cmap="viridis", clim=(0, 10), ec="#333333", lw=0.3))
+    # where the rest x axis points to: shows the rotation
+    line, centre = radius * R[:, :2, 0].numpy(), where[:, :2].numpy()
+    plot.plot(*np.stack([centre - line, centre + line]).transpose(2, 0, 1), color="white", lw=0.7)
+    strain = float((S - 1).abs().amax(1).median())
+    medians = f"rotation error {np.median(error):.1f} deg, largest |stretch - 1| {strain:.3f}"
+    plot.set_title(f"{title}, frame {t}\nmedians: {medians}", fontsize=7)
+    plot.set_aspect("equal")
+    plot.tick_params(labelsize=7)
+    plot.autoscale_view()
+    return drawn
 
 
 def bars(shapes: list[str], out: Path, to: Path, particles: int, seed: int) -> Path:
@@ -139,8 +139,8 @@ def bars(shapes: list[str], out: Path, to: Path, particles: int, seed: int) -> P
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shapes", nargs="+", default=["rabbit", "chick1"])
-    parser.add_argument("--frame", type=int, default=None, help="default: that of the largest stretches")
-    parser.add_argument("--exaggeration", type=float, default=4.0)
+    parser.add_argument("--frames", type=int, nargs="+", help="default: that of the largest stretches, and the last")
+    parser.add_argument("--exaggeration", type=float, default=2.0)
     parser.add_argument("--particles", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("outputs/cues"))
