@@ -160,7 +160,7 @@ def table(lines: list[dict], neighbours: bool) -> str:
             continue
         cells = [line["shape"], CONDITIONS[line["condition"]], line["fit"], line["form"]]
         if line["form"] in ("motionless", "true motion"):
-            cells[1:3] = [f"{line['particles']} particles", "-"]
+            cells[1:3] = ["-", "-"]
         for name, (_, pattern, unit) in COLUMNS.items():
             pair = [line.get(f"{name}_{part}") for part in ("median", "p90")]
             cells.append("-" if pair[0] is None else " / ".join(pattern.format(x * unit) for x in pair))
