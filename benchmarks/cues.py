@@ -6,7 +6,8 @@
 A line of the table is a shape, a condition, a fit and a form. Fits: `carried`, the default (Gaussians follow the
 deformation); `free`, the same with Gaussians of free scale and rotation, as the paper's cue needs; `network`, the paper's
 motion-basis network (600 iterations instead of its 30,000). Forms: `neighbourhood`, `gaussian` (method.md, section 7).
-`motionless` and `true motion` frame them: the cue that says nothing, and the neighbourhood form of the true positions.
+Three forms frame them: `motionless` says nothing, `constant` gives every particle the rabbit's mean stretches, `true motion`
+is the neighbourhood form of the true positions.
 
 Every finished line lies as JSON under --out and is not measured again; stages of a reconstruction are cached beside it, so that
 a stopped run goes on. Progress on stderr, the table on stdout. --neighbours also lists the neighbourhood form of the carried fit
@@ -25,7 +26,7 @@ from pathlib import Path
 import torch
 import yaml
 
-from mosa.analysis.cue_error import TrueMotion, cue_errors, motionless, strain_direction_error, true_motion
+from mosa.analysis.cue_error import USUAL_STRETCH, TrueMotion, cue_errors, motionless, strain_direction_error, true_motion
 from mosa.data.builtin import load_builtin
 from mosa.data.builtin.objects import drop_named
 from mosa.modules.observer import observe
@@ -123,6 +124,7 @@ def measure(shape: str, condition: str, fit: str, out: Path, particles: int, see
         forms["gaussian"] = result.cues
     if fit == "carried" and condition == "cameras_12":
         forms["motionless"] = replace(motionless(true), covariances=covariances[:1].expand_as(covariances))
+        forms["constant"] = replace(forms["motionless"], stretch=torch.tensor(USUAL_STRETCH).expand_as(true.stretch))
         rest = covariance_from(result.splats.scales, result.splats.rotations)
         floor = neighbourhood_cues(true.positions, covariances, around)
         F = around.deformation(true.positions)
@@ -159,7 +161,7 @@ def table(lines: list[dict], neighbours: bool) -> str:
         if ("," in line["form"]) and not neighbours:
             continue
         cells = [line["shape"], CONDITIONS[line["condition"]], line["fit"], line["form"]]
-        if line["form"] in ("motionless", "true motion"):
+        if line["form"] in ("motionless", "constant", "true motion"):
             cells[1:3] = ["-", "-"]
         for name, (_, pattern, unit) in COLUMNS.items():
             pair = [line.get(f"{name}_{part}") for part in ("median", "p90")]
@@ -171,14 +173,16 @@ def table(lines: list[dict], neighbours: bool) -> str:
 
 
 def floor_table(lines: list[dict]) -> str:
-    """Markdown: error of the direction of Lambda - 1 against the floor below which a cue has no weight in L_s."""
+    """Markdown: direction of Lambda - 1 where the cue is above a floor: median / 90th percentile; median of `constant` (share)."""
     head = ["shape", "condition", "fit", "form", *(f"floor {floor:g}" for floor in FLOORS)]
     rows = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for line in lines:
         if line["form"] not in ("neighbourhood", "gaussian"):
             continue
         cells = [line["shape"], CONDITIONS[line["condition"]], line["fit"], line["form"]]
-        cells += [f"{x['median_deg']:.0f} / {x['p90_deg']:.0f} ({x['share']:.0%})" if x["share"] else "-" for x in line["floors"]]
+        for x in line["floors"]:
+            found = x["share"] and f"{x['median_deg']:.0f} / {x['p90_deg']:.0f}; {x['constant_median_deg']:.0f} ({x['share']:.0%})"
+            cells.append(found or "-")
         rows.append("| " + " | ".join(cells) + " |")
     return "\n".join(rows)
 

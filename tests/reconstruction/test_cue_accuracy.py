@@ -103,7 +103,8 @@ def seen(squashed):
 
 
 def test_neighbourhood_form_against_truth(squashed, seen):
-    """Measured: 0.8 (90th percentile 2.3) degrees, 0.019, and a quarter of the stretch signal (0.107) left; no cue at all is 16.8 degrees off."""
+    """Measured: 0.8 (90th percentile 2.3) degrees, stretch 0.019, and a quarter of the stretch signal (0.107) left; saying nothing
+    is 16.8 degrees off."""
     errors, true = seen
     found, silent = errors["neighbourhood"], cue_errors(motionless(true), true, squashed.times)
     assert silent["rotation_deg_median"] > 10
