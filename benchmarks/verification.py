@@ -34,6 +34,7 @@ import bar as bars
 import closed_systems
 import elastic_bodies
 import incline
+import invariance
 import lagrangian
 import stresses
 import unit_figures as units
@@ -208,6 +209,13 @@ def friction(_):
     return [["16", "angle from which a block slips, friction 0.2, 0.5, 0.8", "1 degree", f"{max(rows):.3f} degrees"]]
 
 
+def frames(_):
+    found = [invariance.differences(law)[1] for law in LAWS]
+    return [["17", f"scene {what}, 200 substeps, contact, full adapter, worst of {len(LAWS)} laws", "1e-10 dx",
+             f"{max(f[name][0] for f in found):.1e} dx"]
+            for name, what in (("turned", "turned by 90 degrees"), ("moved", "moved by whole cells"))]  # fmt: skip
+
+
 def gradient(_):
     horizons, axes, rows = [1, 5, 20, 50, 200, 500, 1500], panels(2), []
     for ax, contact in zip(axes, (False, True)):
@@ -302,7 +310,7 @@ def bar(data, cells: int = 30):
     return rows
 
 
-PARTS = {f.__name__: f for f in (conservation, stress, unit_checks, elastic, friction, gradient, vibration, probes, bar)}
+PARTS = {f.__name__: f for f in (conservation, stress, unit_checks, elastic, friction, frames, gradient, vibration, probes, bar)}
 
 
 def number(row: list[str]) -> tuple[int, str]:
