@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from mosa.errors import DataError
+from mosa.rendering.covariance import quaternion_to_matrix
 from mosa.types import MotionCues, Splats
 
 CONDITION_LIMIT = 1e4
@@ -90,23 +91,6 @@ def polar(deformation: Tensor) -> tuple[Tensor, Tensor]:
     return rotation.to(deformation.dtype), (S * sign).to(deformation.dtype)
 
 
-def quaternion_rotation(quaternions: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4) wxyz, normalised here."""
-    w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)
-    rows = [
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    ]
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
-
-
 def neighbourhood_cues(positions: Tensor, covariances: Tensor, around: Neighbourhood) -> MotionCues:
     """Cues from displacements alone. positions: (T, N, 3) [m], frame 0 at rest; covariances: (T, N, 3, 3) [m^2]."""
     rotation, stretch = polar(around.deformation(positions))
@@ -123,8 +107,8 @@ def gaussian_cues(positions: Tensor, covariances: Tensor, splats: Splats, scales
 
     scales: (T, N, 3) [m] after activation; rotations: (T, N, 4) wxyz. stretch = S_t / S_0 per axis, sorted; weight 1.
     """
-    rest = quaternion_rotation(splats.rotations)
-    rotation = quaternion_rotation(rotations) @ rest.transpose(-1, -2)
+    rest = quaternion_to_matrix(splats.rotations)
+    rotation = quaternion_to_matrix(rotations) @ rest.transpose(-1, -2)
     stretch = (scales / splats.scales).sort(-1, descending=True).values
     weight = torch.ones(positions.shape[:2], dtype=positions.dtype, device=positions.device)
     return MotionCues(positions.contiguous(), rotation.contiguous(), stretch, weight, covariances.contiguous())

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from mosa.reconstruction.cues import Neighbourhood, quaternion_rotation
+from mosa.reconstruction.cues import Neighbourhood
 from mosa.reconstruction.modes import Modes
-from mosa.rendering.covariance import quaternion_multiply
+from mosa.rendering.covariance import covariance_from, quaternion_multiply, quaternion_to_matrix
 from mosa.types import Splats
 
 
@@ -25,12 +25,6 @@ class MotionSample:
     deformation: Tensor | None
     scales: Tensor | None = None
     rotations: Tensor | None = None
-
-
-def shape_covariances(scales: Tensor, rotations: Tensor) -> Tensor:
-    """(..., 3, 3) [m^2] of standard deviations (..., 3) [m] along the axes of quaternions (..., 4)."""
-    axes = quaternion_rotation(rotations) * scales[..., None, :]
-    return axes @ axes.transpose(-1, -2)
 
 
 class ModalMotion(nn.Module):
@@ -74,7 +68,7 @@ class ModalMotion(nn.Module):
         shift, deformation = self.displacement(frames, modes)
         positions = splats.means + shift
         if self.shape_amplitude is None:
-            axes = deformation @ (quaternion_rotation(splats.rotations) * splats.scales[:, None, :])
+            axes = deformation @ (quaternion_to_matrix(splats.rotations) * splats.scales[:, None, :])
             return MotionSample(positions, axes @ axes.transpose(-1, -2), deformation)
         moving = (frames > 0).to(self.turn)[:, None, None]
         shape = modes.values @ (moving * self.shape_amplitude[frames] * self.turn[:, None])
@@ -84,7 +78,7 @@ class ModalMotion(nn.Module):
             torch.cat([torch.ones_like(half[..., :1]), half], -1), splats.rotations.expand(len(frames), -1, -1)
         )
         rotations = nn.functional.normalize(rotations, dim=-1)
-        return MotionSample(positions, shape_covariances(scales, rotations), deformation, scales, rotations)
+        return MotionSample(positions, covariance_from(scales, rotations), deformation, scales, rotations)
 
 
 def _encoded(x: Tensor, frequencies: int) -> Tensor:
@@ -150,4 +144,4 @@ class MotionBasisNetwork(nn.Module):
         rotations = quaternion_multiply(nn.functional.normalize(change, dim=-1), splats.rotations.expand(len(frames), -1, -1))
         scales = splats.scales * raw[..., 7:].exp()
         deformation = around.deformation(positions) if around is not None else None
-        return MotionSample(positions, shape_covariances(scales, rotations), deformation, scales, rotations)
+        return MotionSample(positions, covariance_from(scales, rotations), deformation, scales, rotations)

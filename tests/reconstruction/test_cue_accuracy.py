@@ -11,8 +11,9 @@ import torch
 
 from mosa.analysis.cue_error import cue_errors, motionless, rotation_error, strain_direction_error, true_motion
 from mosa.errors import DataError
-from mosa.reconstruction.cues import neighbourhood, neighbourhood_cues, polar, quaternion_rotation
+from mosa.reconstruction.cues import neighbourhood, neighbourhood_cues, polar
 from mosa.reconstruction.pipeline import build_settings, reconstruct, spacing_for
+from mosa.rendering.covariance import quaternion_to_matrix
 from mosa.types import MotionCues, Truth
 
 
@@ -36,8 +37,8 @@ def inner_points(scene, count: int = 300) -> torch.Tensor:
 def test_rotation_error_is_the_angle_between(degrees):
     half = np.deg2rad(degrees) / 2
     axis = torch.tensor([0.6, 0.0, 0.8])
-    turn = quaternion_rotation(torch.cat([torch.tensor([np.cos(half)]), np.sin(half) * axis]).float())
-    start = quaternion_rotation(torch.tensor([0.5, 0.1, -0.7, 0.4]))
+    turn = quaternion_to_matrix(torch.cat([torch.tensor([np.cos(half)]), np.sin(half) * axis]).float())
+    start = quaternion_to_matrix(torch.tensor([0.5, 0.1, -0.7, 0.4]))
     assert float(rotation_error(turn @ start, start)) == pytest.approx(degrees, abs=2e-5, rel=1e-3)
 
 
@@ -68,7 +69,7 @@ def test_truth_of_the_squashed_body_against_its_closed_form(squashed):
 
 def test_errors_are_those_that_were_put_in(squashed):
     true = true_motion(squashed.truth, inner_points(squashed, 100))
-    turn = quaternion_rotation(torch.tensor([np.cos(np.deg2rad(2.5)), np.sin(np.deg2rad(2.5)), 0, 0]).float())
+    turn = quaternion_to_matrix(torch.tensor([np.cos(np.deg2rad(2.5)), np.sin(np.deg2rad(2.5)), 0, 0]).float())
     ones = torch.ones_like(true.stretch[..., 0])
     cues = MotionCues(true.positions + 0.003, true.rotation @ turn, true.stretch + 0.01, ones, torch.zeros_like(true.rotation))
     errors = cue_errors(cues, true, squashed.times)

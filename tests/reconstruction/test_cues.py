@@ -11,9 +11,9 @@ from mosa.reconstruction.cues import (
     neighbourhood,
     neighbourhood_cues,
     polar,
-    quaternion_rotation,
 )
 from mosa.reconstruction.modes import deformation_modes
+from mosa.rendering.covariance import quaternion_to_matrix
 from mosa.types import Splats
 
 
@@ -77,7 +77,7 @@ def test_polar_keeps_rotations_proper():
 
 def test_neighbourhood_cues_of_a_turned_and_stretched_body():
     rest = lattice()
-    turn = quaternion_rotation(torch.tensor([0.9, 0.1, -0.3, 0.2], dtype=torch.float64))
+    turn = quaternion_to_matrix(torch.tensor([0.9, 0.1, -0.3, 0.2], dtype=torch.float64))
     F = turn @ torch.diag(torch.tensor([0.8, 1.3, 1.0], dtype=torch.float64))
     positions = torch.stack([rest, rest @ F.T])
     cues = neighbourhood_cues(positions, torch.zeros(2, len(rest), 3, 3, dtype=torch.float64), neighbourhood(rest))
@@ -94,7 +94,7 @@ def test_gaussian_cues_are_relative_to_the_first_frame():
     scales = torch.stack([splats.scales, splats.scales * torch.tensor([0.5, 2.0, 1.0])])
     cues = gaussian_cues(torch.zeros(2, n, 3), torch.zeros(2, n, 3, 3), splats, scales, torch.stack([start, end]))
     assert torch.allclose(cues.rotation[0], torch.eye(3).expand(n, 3, 3), atol=1e-6)
-    assert torch.allclose(cues.rotation[1] @ quaternion_rotation(start), quaternion_rotation(end), atol=1e-6)
+    assert torch.allclose(cues.rotation[1] @ quaternion_to_matrix(start), quaternion_to_matrix(end), atol=1e-6)
     assert torch.allclose(cues.stretch[1], torch.tensor([2.0, 1.0, 0.5]).expand(n, 3))
 
 

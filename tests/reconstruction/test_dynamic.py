@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError
-from mosa.reconstruction.cues import neighbourhood, quaternion_rotation
+from mosa.reconstruction.cues import neighbourhood
 from mosa.reconstruction.dynamic import DynamicSettings, Scaffold, elastic_energy, fit_motion
 from mosa.reconstruction.modes import deformation_modes
-from mosa.reconstruction.motion import ModalMotion, MotionBasisNetwork, shape_covariances
+from mosa.reconstruction.motion import ModalMotion, MotionBasisNetwork
 from mosa.reconstruction.observed import object_windows
 from mosa.reconstruction.uniform_adam import UniformAdam
-from mosa.rendering.covariance import quaternion_multiply
+from mosa.rendering.covariance import covariance_from, quaternion_multiply, quaternion_to_matrix
 from mosa.types import Splats
 
 
@@ -34,7 +34,7 @@ def scaffold() -> Scaffold:
 
 
 def test_elastic_energy_is_blind_to_rotation_and_has_its_small_strain_limit():
-    turn = quaternion_rotation(torch.tensor([0.3, 0.5, -0.2, 0.7], dtype=torch.float64))
+    turn = quaternion_to_matrix(torch.tensor([0.3, 0.5, -0.2, 0.7], dtype=torch.float64))
     strain = 1e-5 * torch.tensor([[1.0, 0.3, 0.0], [0.3, -0.5, 0.2], [0.0, 0.2, 0.7]], dtype=torch.float64)
     assert float(elastic_energy(turn, 0.3)) < 1e-25
     deformed = turn @ (torch.eye(3, dtype=torch.float64) + strain)
@@ -53,8 +53,8 @@ def test_uniform_adam_keeps_proportions_and_leaves_frames_without_gradient():
 def test_quaternion_product_composes_rotations():
     generator = torch.Generator().manual_seed(0)
     a, b = torch.nn.functional.normalize(torch.randn(2, 5, 4, generator=generator, dtype=torch.float64), dim=-1)
-    composed = quaternion_rotation(a) @ quaternion_rotation(b)
-    assert torch.allclose(quaternion_rotation(quaternion_multiply(a, b)), composed, atol=1e-12)
+    composed = quaternion_to_matrix(a) @ quaternion_to_matrix(b)
+    assert torch.allclose(quaternion_to_matrix(quaternion_multiply(a, b)), composed, atol=1e-12)
 
 
 def test_modal_motion_is_at_rest_in_frame_0_and_carries_shapes_along(scaffold):
@@ -81,9 +81,9 @@ def test_free_shapes_start_at_rest_and_get_gradients(model, scaffold):
     assert torch.allclose(sample.positions[0], scaffold.splats.means, atol=1e-6)
     assert torch.allclose(sample.scales[0], scaffold.splats.scales, atol=1e-7)
     assert torch.allclose(
-        quaternion_rotation(sample.rotations[0]), torch.eye(3).expand(len(scaffold.splats.means), 3, 3), atol=1e-5
+        quaternion_to_matrix(sample.rotations[0]), torch.eye(3).expand(len(scaffold.splats.means), 3, 3), atol=1e-5
     )
-    assert torch.allclose(sample.covariances, shape_covariances(sample.scales, sample.rotations))
+    assert torch.allclose(sample.covariances, covariance_from(sample.scales, sample.rotations))
     target = 2 * sample.covariances.detach()[1] + 1e-4
     ((sample.covariances[1] - target) ** 2).sum().backward()
     touched = motion.shape_amplitude if model == "modes" else motion.basis[-1].weight
