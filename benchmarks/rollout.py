@@ -48,8 +48,8 @@ ALLOWED = 1.25
 """Factor by which a ratio may exceed the stored one."""
 DX, DT, DENSITY, MU, LAM = 1 / 32, 1e-4, 1000.0, 4e4, 6e4
 STRIDE = SimulationSettings.stride
-VARIANTS = {"none": (None, 1), "constant": ("operator", STRIDE), "stride1": ("mosa", 1), "mosa": ("mosa", STRIDE)}
-"""Name: (file of conf/adapter, substeps between evaluations)."""
+VARIANTS = {"none": (None, 1), "constant": ("operator", None), "stride1": ("mosa", 1), "mosa": ("mosa", STRIDE)}
+"""Name: (file of conf/adapter, substeps between evaluations, None for one evaluation in all)."""
 CHECK = {"particles": 2000, "substeps": 16, "rounds": 5}
 
 

@@ -165,9 +165,10 @@ def fit_estimate(module: LitMosa) -> str:
     with torch.no_grad():
         module.terms(stages[0], [0, min(1, len(module.observations.cameras) - 1)], frames)
     step = BACKWARD * (time.perf_counter() - began)
-    seconds = sum(s.iterations * step * (ADAPTER_COST if s.name == "joint" and body.adapter is not None else 1) for s in stages)
+    networks = body.adapter is not None and not body.adapter.steady
+    seconds = sum(s.iterations * step * (ADAPTER_COST if s.name == "joint" and networks else 1) for s in stages)
     evaluations = (frames - 1) * body.last_substeps / body.settings.stride
-    memory = evaluations * len(body.rest) * ADAPTER_BYTES if body.adapter is not None else 0
+    memory = evaluations * len(body.rest) * ADAPTER_BYTES if networks else 0
     return (f"fit: {len(body.rest)} particles, {frames} frames of {body.last_substeps} substeps, at most "
             f"{sum(s.iterations for s in stages)} steps, about {seconds / 60:.0f} minutes and {0.8 + memory / 1e9:.1f} GB")
 

@@ -62,6 +62,11 @@ class Adapter(nn.Module):
         self.register_buffer("poisson", torch.tensor(float("nan")))
         self._last: tuple[Tensor, Tensor, Tensor] | None = None
 
+    @property
+    def steady(self) -> bool:
+        """Whether the operator is the same in every state, so that one evaluation serves a whole rollout."""
+        return False
+
     def __getstate__(self) -> dict:
         return {**self.__dict__, "_last": None}  # it holds a graph, which can be neither copied nor pickled
 
@@ -131,6 +136,11 @@ class StressAdapter(Adapter):
         self.operator = ProgressiveOperator(l_max=bound, major_symmetry=major_symmetry, no_prior_stress=no_prior_stress, **shape)
         # C0 is a stiffness: it has no meaning for the strain in the yield function
         self.plastic_operator = ProgressiveOperator(l_max=l_max, **shape) if plastic else None
+
+    @property
+    def steady(self) -> bool:
+        part = self.operator  # the plastic one has the same switches
+        return (part.constant or part.no_C) and part.no_pre and part.no_post and not part.no_prior_stress
 
     def affine(self, operator: ProgressiveOperator, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Correction]:
         """(A - I (N, 6, 6), b (N, 6), parts) of d(w, s) = (A - I) s + b, the rest term included."""

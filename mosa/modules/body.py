@@ -245,7 +245,7 @@ class Body(nn.Module):
                 return result
         rollout = simulator.rollout(
             state, {k: p.to(dtype) for k, p in parameters.items()}, self.volume.to(dtype), self.density, frames,
-            adapter=operator, stride=self.settings.stride, progress=progress,
+            adapter=operator, stride=None if adapter is not None and adapter.steady else self.settings.stride, progress=progress,
             motions=[c.motion.shifted(lift) for c in world.colliders],  # the offset is the ground's: they keep their place
             **timing,
         )

@@ -161,7 +161,7 @@ class Simulator:
         density: float,
         frames: int,
         adapter: Callable[[MaterialState], AdapterOperator] | None = None,
-        stride: int = 1,
+        stride: int | None = 1,
         progress: Callable[[int], None] | None = None,
         started: bool = False,
         motions: Sequence[Motion | Trajectory] | None = None,
@@ -174,7 +174,8 @@ class Simulator:
 
         state: particles at frame 0, its F and F_tot not yet advanced by C_affine, unless `started` (the `final` of an earlier
         rollout). parameters: physical values the law names, per particle (N,) or scalar; volume: (N,) [m^3]; density [kg/m^3].
-        adapter: asked every `stride` substeps from the start of each frame. progress: called with the number of each frame.
+        adapter: asked every `stride` substeps from the start of each frame; None: once, at the start of the rollout (an operator
+        that does not depend on the state). progress: called with the number of each frame.
         motions: of the colliders, instead of their own; start_time [s]: time of frame 0 in these motions.
         control: choose the substeps of each frame from the state at its start (see `adaptive`) instead of taking `substeps`;
         counts: of the frames - 1 intervals, instead of choosing: a replay, in which differences hold the substeps fixed.
@@ -182,7 +183,7 @@ class Simulator:
         frame_dt/counts[-1] of an earlier rollout that this one goes on from, None: the first substep's dt, as with a fixed step.
         Frame 0 of the result holds the state as given. Errors: SimulationDiverged naming substep and particle; ConfigError.
         """
-        if frames < 1 or stride < 1:
+        if frames < 1 or (stride is not None and stride < 1):
             raise ConfigError(f"frames and stride: expected at least 1, found {frames} and {stride}")
         n = len(state.x)
         self._check(state, volume)
@@ -219,6 +220,9 @@ class Simulator:
                 F = first_advance(numerics, F, C, packed, operator["plastic_G"], operator["plastic_h"])
             else:
                 F = F_tot = first_advance(numerics, F, C, packed)
+        if adapter is not None and stride is None:
+            held.update(self._ask(adapter, F, C, packed))
+            adapter = None  # answered: nothing cuts the segments
         current = (state.x, state.v, C, F, F_tot)
         poses = () if variable else self._poses(motions, frames, start_time)
         reactions = []
@@ -230,10 +234,10 @@ class Simulator:
             if variable:
                 steps = Steps(dt if lag is None else 0.5 * (lag + dt), dt)
                 along = self._poses_of_frame(motions, frames, taken, start_time, given is not None)
-                lengths = _segments(count, stride if adapter is not None else SEGMENT)  # sizes that many counts share
+                lengths = _segments(count, SEGMENT if adapter is None else stride)  # sizes that many counts share
             else:
                 steps, along = None, tuple(part[first : first + count] for part in poses)
-                lengths = _segments(count, stride if adapter is not None else None)
+                lengths = _segments(count, None if adapter is None else stride)
             current, forces = self._frame(solver, adapter, packed, current, held, lengths, first, along, steps)
             lag = dt
             if forces is not None:

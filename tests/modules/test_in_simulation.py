@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from drawn_adapters import randomise
+from drawn_adapters import drawn_adapter, randomise
 
 from mosa.modules.adapter import StressAdapter
 from mosa.physics.rollout import Simulator
@@ -84,3 +84,35 @@ def test_gradient_in_the_weights_over_200_substeps_is_that_of_differences():
     difference = (8 * (at(h) - at(-h)) - (at(2 * h) - at(-2 * h))) / (12 * h)
     assert abs(slope) > 1e-4
     assert slope == pytest.approx(difference, rel=1e-6)
+
+
+CONSTANT = {"state_dependence": "constant", "no_pre": True, "no_post": True}
+
+
+@pytest.mark.parametrize("options, steady", [
+    (CONSTANT, True), (CONSTANT | {"major_symmetry": True}, True), ({}, False), (CONSTANT | {"no_pre": False}, False),
+    ({"no_C": True, "no_pre": True, "no_post": True}, True), ({"state_dependence": "constant"}, False),
+])  # fmt: skip
+def test_an_adapter_is_steady_where_its_operator_does_not_change_with_the_state(options, steady):
+    adapter = drawn_adapter(**options)
+    state, other = simulator(torch.float64), body(torch.float64)
+    near, far = (state.material_state(F, other.C_affine, PARAMETERS) for F in (other.F, other.F @ other.F))
+    first, second = adapter(near), adapter(far)
+    same = torch.equal(first.G, second.G) and torch.equal(first.h, second.h)
+    assert same == steady and adapter.steady == steady
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_one_evaluation_of_a_steady_adapter_is_as_good_as_many(dtype):
+    """Motion bit for bit, gradient to rounding: the order in which the segments' shares are summed differs."""
+    results = []
+    for stride in (1, 5, None):
+        adapter = drawn_adapter(seed=3, dtype=dtype, **CONSTANT, major_symmetry=True)
+        asked = []
+        rollout = roll(lambda state: asked.append(1) or adapter(state), dtype, 3, stride=stride)
+        (rollout.x[-1] * torch.linspace(-1, 1, 3, dtype=dtype)).sum().backward()
+        results.append((len(asked), rollout.x.detach(), adapter.operator.free.grad))
+    assert [r[0] for r in results] == [50, 10, 1]
+    assert all(torch.equal(r[1], results[0][1]) for r in results)
+    scale = results[0][2].abs().max()
+    assert scale > 0 and all((r[2] - results[0][2]).abs().max() <= 100 * torch.finfo(dtype).eps * scale for r in results)
