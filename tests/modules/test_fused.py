@@ -15,6 +15,8 @@ if DEVICE == "cpu" and tuple(map(int, triton.__version__.split(".")[:2])) < (3, 
     pytest.skip("the interpreter of Triton before 3.7 has no loops under NumPy 2.4", allow_module_level=True)
 ACCURATE = 1e-5
 """Relative to the norm of the result: the modules in float64 are what is compared with."""
+TF32 = 2e-2
+"""Factors are rounded to 2^-11 before each of the 20 or so products in a row of a backward pass; 2e-2 is that all errors add up."""
 OPTIONS = {
     "paper's form": {},
     "literal": {"l_max": None, "rest_free": False},
@@ -61,13 +63,19 @@ def test_outputs_and_all_gradients_are_those_of_the_modules(options, penalised):
     assert error <= ACCURATE, worst
 
 
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
+def test_the_fast_mode_rounds_factors_to_ten_bits(options):
+    """Its rounding is in the kernels, so the interpreter, whose products are exact, shows the same errors as a card."""
+    error, worst = compared(options, 150, False, DEVICE, "tf32")
+    assert 1e-4 < error <= TF32, worst
+
+
 @pytest.mark.gpu
 @pytest.mark.parametrize("penalised", [False, True])
-@pytest.mark.parametrize("precision, tolerance", [("accurate", ACCURATE), ("tf32", 2e-2)])
+@pytest.mark.parametrize("precision, tolerance", [("accurate", ACCURATE), ("tf32", TF32)])
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
 def test_on_cuda_in_both_precisions(options, precision, tolerance, penalised):
-    """20000 particles are more tiles than a card has multiprocessors. tf32 cuts factors to 2^-10 before each of the 20 or so
-    products in a row of a backward pass: 2e-2 at worst; the accurate mode must not be the same numbers."""
+    """20000 particles are more tiles than a card has multiprocessors. The accurate mode must not be the same numbers."""
     error, worst = compared(options, 20_000, penalised, "cuda", precision)
     assert error <= tolerance, worst
     assert precision == "accurate" or error > 1e-5

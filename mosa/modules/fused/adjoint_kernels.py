@@ -15,6 +15,7 @@ from mosa.modules.fused.network_kernels import (
     matrix,
     network_input,
     normal,
+    product,
     psi2_hidden,
     silu,
     store_by_column,
@@ -52,7 +53,7 @@ def hidden_adjoint(
         store_by_column(h2, a2, r, h, M, H)
         store_by_column(g2, e2, r, h, M, H)
     _, d1 = silu(z1)
-    e1 = tl.dot(e2, matrix(W2, h, h, H, H, H), input_precision=P) * d1
+    e1 = product(e2, matrix(W2, h, h, H, H, H), P) * d1
     if WEIGHTS:
         store_by_column(g1, e1, r, h, M, H)
     return e1
@@ -77,10 +78,10 @@ def theta_backward(
     if WEIGHTS:
         store_by_column(l2 + H * M, rest, r, c, M, 12)
         store_by_column(gout, g, r, c, M, 6)
-    g = tl.dot(g, matrix(W3, c, h, H, 6, H), input_precision=P)
+    g = product(g, matrix(W3, c, h, H, 6, H), P)
     e1 = hidden_adjoint(g, z1, W2, b2, h1, h2, g1, g2, r, M, WEIGHTS, H, P)
-    store_by_column(gl2, tl.dot(e1, matrix(W1, h, h, H + 12, H, H), input_precision=P), r, h, M, H)
-    gx = scale * tl.dot(e1, matrix(W1 + H, h, c, H + 12, H, 12), input_precision=P)
+    store_by_column(gl2, product(e1, matrix(W1, h, h, H + 12, H, H), P), r, h, M, H)
+    gx = scale * product(e1, matrix(W1 + H, h, c, H + 12, H, 12), P)
     store_input_adjoint(gw, gs2, gx, r, M)
 
 
@@ -114,15 +115,15 @@ def psi2_backward(
     if WEIGHTS:
         store_by_column(gout, e, r, c, M, 12)
         store_by_column(gout + 12 * M, eb, r, h, M, H)
-    g = tl.dot(e, matrix(W3, c, h, H, 12, H), input_precision=P)
-    g += tl.dot(eb, matrix(W3 + 12 * H, h, h, H, H, H), input_precision=P)
+    g = product(e, matrix(W3, c, h, H, 12, H), P)
+    g += product(eb, matrix(W3 + 12 * H, h, h, H, H, H), P)
     _, nx, ny, nz, z1 = psi2_hidden(l1, t, s1, W1, b1, r, M, scale, H, P)
     if WEIGHTS:
         tl.store(l1 + H * M + r, nx)
         tl.store(l1 + (H + 1) * M + r, ny)
         tl.store(l1 + (H + 2) * M + r, nz)
     e1 = hidden_adjoint(g, z1, W2, b2, h1, h2, g1, g2, r, M, WEIGHTS, H, P)
-    store_by_column(gl1, tl.dot(e1, matrix(W1, h, h, H + 3, H, H), input_precision=P), r, h, M, H)
+    store_by_column(gl1, product(e1, matrix(W1, h, h, H + 3, H, H), P), r, h, M, H)
     kx = scale * tl.sum(e1 * tl.load(W1 + h * (H + 3) + H)[None, :], 1)
     ky = scale * tl.sum(e1 * tl.load(W1 + h * (H + 3) + H + 1)[None, :], 1)
     kz = scale * tl.sum(e1 * tl.load(W1 + h * (H + 3) + H + 2)[None, :], 1)
@@ -153,16 +154,16 @@ def psi1_backward(
     e = by_column(gt, r, planes, M, 36)
     e += tl.load(gtn + source[None, :] * M + r[:, None], mask=through_normals[None, :], other=0.0)
     e *= alpha - y * y / alpha
-    g = by_column(gl1, r, h, M, H) + tl.dot(e, matrix(Wp, planes, h, H, 36, H), input_precision=P)
+    g = by_column(gl1, r, h, M, H) + product(e, matrix(Wp, planes, h, H, 36, H), P)
     inputs = network_input(w, s1, r, N, M, scale, False)
     if WEIGHTS:
         store_by_column(gplanes, e, r, planes, M, 36)
         store_by_column(gout, g, r, h, M, H)
         store_by_column(x, inputs, r, c, M, 12)
-    g = tl.dot(g, matrix(W3, h, h, H, H, H), input_precision=P)
+    g = product(g, matrix(W3, h, h, H, H, H), P)
     z1 = dense(inputs, matrix(W1, h, c, 12, H, 12), tl.load(b1 + h), P)
     e1 = hidden_adjoint(g, z1, W2, b2, h1, h2, g1, g2, r, M, WEIGHTS, H, P)
-    store_input_adjoint(gw, gs, scale * tl.dot(e1, matrix(W1, h, c, 12, H, 12), input_precision=P), r, M)
+    store_input_adjoint(gw, gs, scale * product(e1, matrix(W1, h, c, 12, H, 12), P), r, M)
 
 
 @triton.jit(do_not_specialize=["N"])
@@ -184,10 +185,10 @@ def phi_backward(
     if WEIGHTS:
         store_by_column(gout, g, r, c, M, 6)
         store_by_column(x, inputs, r, c, M, 12)
-    g = tl.dot(g, matrix(W3, c, h, H, 6, H), input_precision=P)
+    g = product(g, matrix(W3, c, h, H, 6, H), P)
     z1 = dense(inputs, matrix(W1, h, c, 12, H, 12), tl.load(b1 + h), P)
     e1 = hidden_adjoint(g, z1, W2, b2, h1, h2, g1, g2, r, M, WEIGHTS, H, P)
-    gx = scale * tl.dot(e1, matrix(W1, h, c, 12, H, 12), input_precision=P)
+    gx = scale * product(e1, matrix(W1, h, c, 12, H, 12), P)
     row, column = r[:, None], c[None, :]
     direct = by_column(gwx, r, c, M, 6) + by_column(gwt, r, c, M, 6)
     tl.store(gw + row * 6 + column, gx + direct, mask=(row < N) & (column < 6))
@@ -209,7 +210,7 @@ def layer_gradient(
     for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
         r = tile * BLOCK + k
         e = tl.load(g + out[:, None] * M + r[None, :], mask=out[:, None] < OUT, other=0.0)
-        weight += tl.dot(e, by_column(x, r, into, M, IN), input_precision=P)
+        weight += product(e, by_column(x, r, into, M, IN), P)
         bias += tl.sum(e, 1)
     inside = (out[:, None] < OUT) & (into[None, :] < IN)
     tl.store(at + out[:, None] * IN + into[None, :], weight, mask=inside)
