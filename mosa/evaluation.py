@@ -160,7 +160,7 @@ def identification(body: Body, scene: Scene) -> dict[str, float]:
     figures = {}
     for prefix, variant in (("id_prior", "prior"), ("id", "adapted")):
         material, contact, heterogeneity, _ = body.parts(variant)
-        mean = float(body.factor(heterogeneity).mean())
+        mean = float(body.factor(heterogeneity).detach().mean())
         for name, value in material.physical().items():
             scale = mean if name == material.stiffness else 1.0
             figures[f"{prefix}/{name}"] = float(value) * scale
