@@ -16,9 +16,9 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import itertools
 import json
 import sys
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,6 +29,7 @@ import torch
 from cues_pictures import outlines, save
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
+from PIL import Image
 from torch import Tensor
 
 from mosa.analysis.figures import label, to_uint8
@@ -115,6 +116,11 @@ def overlap(alpha: Tensor, mattes: Tensor) -> list[float]:
     return ((a & b).sum((1, 2)) / (a | b).sum((1, 2))).tolist()
 
 
+def area_ratio(alpha: Tensor, mattes: Tensor) -> float:
+    """Area of (T, H, W) over that of (T, H, W), both cut at 0.5; above 1: too thick."""
+    return float((alpha > 0.5).sum() / (mattes > 0.5).sum())
+
+
 def held_out_figures(seen: Seen, seed: int) -> dict:
     """Images and silhouettes of the held-out camera."""
     scene, camera, splats = seen.scene, [seen.camera], static_gaussians(seen.scene, seen.settings, seed)
@@ -131,7 +137,9 @@ def held_out_figures(seen: Seen, seed: int) -> dict:
         "per_frame": [image_metrics(images, scene, camera, [t]) for t in frames],
         "training_cameras": training_figures(seen),
         "iou": overlap(seen.views.mattes[0], scene.mattes[camera[0]]),
+        "area_ratio": area_ratio(seen.views.mattes[0], scene.mattes[camera[0]]),
         "iou_balls": overlap(seen.silhouette, scene.mattes[camera[0]]),
+        "area_ratio_balls": area_ratio(seen.silhouette, scene.mattes[camera[0]]),
     }
 
 
@@ -173,12 +181,13 @@ def flight_figures(seen: Seen, cfg: DictConfig, published: dict) -> dict:
     fit, residual, *_ = np.polyfit(times, centre, 2, full=True)
     true = np.array([published[f"{axis}0"] for axis in ("vx", "vy", "vz")])
     up = scene.up.double().numpy()
+    fallen = 0.5 * scene.gravity.double().numpy() * times[:, None] ** 2
     return {
         "free_frames": free,
         "gravity_m_s2": float(-2 * fit[0] @ up),
         "true_gravity_m_s2": float(-scene.gravity.double().numpy() @ up),
         "velocity_m_s": fit[1].tolist(),
-        "velocity_given_gravity_m_s": np.polyfit(times, centre - 0.5 * scene.gravity.double().numpy() * times[:, None] ** 2, 1)[0].tolist(),
+        "velocity_given_gravity_m_s": np.polyfit(times, centre - fallen, 1)[0].tolist(),
         "start_velocity_m_s": start.velocity.tolist(),
         "published_velocity_m_s": true.tolist(),
         "fit_rms_m": float(np.sqrt(residual.sum() / free)),
@@ -189,7 +198,7 @@ def real_flow(seen: Seen) -> Tensor:
     """Optical flow (T - 1, H, W, 2) [px] of the held-out camera's own images (DIS, Kroeger et al. 2016): an estimate, no truth."""
     gray = [cv2.cvtColor(to_uint8(image), cv2.COLOR_RGB2GRAY) for image in seen.scene.images[seen.camera]]
     estimate = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    return torch.from_numpy(np.stack([estimate.calc(a, b, None) for a, b in zip(gray[:-1], gray[1:])]))
+    return torch.from_numpy(np.stack([estimate.calc(a, b, None) for a, b in itertools.pairwise(gray)]))
 
 
 def flow_figures(seen: Seen) -> dict:
@@ -197,18 +206,17 @@ def flow_figures(seen: Seen) -> dict:
     inside = (seen.scene.mattes[seen.camera, :-1] > 0.5) & (seen.views.mattes[0, :-1] > 0.5)
     found, real = seen.views.flow[0][inside], real_flow(seen)[inside]
     error, length = (found - real).norm(dim=-1).double(), real.norm(dim=-1).double()
-    return {"median_px": float(error.median()), "p90_px": float(error.quantile(0.9)), "optical_flow_median_px": float(length.median())}
+    result = {"median_px": error.median(), "p90_px": error.quantile(0.9), "optical_flow_median_px": length.median()}
+    return {name: float(value) for name, value in result.items()}
 
 
 def measure(overrides: list[str], out: Path) -> dict:
     cfg = configuration(overrides, out)
-    began = time.perf_counter()
     seen = see(cfg)
-    seconds = time.perf_counter() - began
     published = json.loads((under(cfg.scene.root, cfg.scene.path) / "derived" / "visual_hull_track.json").read_text())
     return {
         "overrides": overrides, "width_px": seen.scene.cameras.width, "particles": len(seen.result.volume),
-        "spacing_m": seen.result.spacing, "seed": cfg.seed, "seconds": seconds, "held_out": held_out_figures(seen, cfg.seed),
+        "spacing_m": seen.result.spacing, "seed": cfg.seed, "held_out": held_out_figures(seen, cfg.seed),
         "volume": volume_figures(seen, published), "flight": flight_figures(seen, cfg, published), "flow": flow_figures(seen),
     }  # fmt: skip
 
@@ -228,44 +236,76 @@ def verdict(met: bool) -> str:
     return "met" if met else "missed"
 
 
+def image_row(line: dict) -> dict[str, str]:
+    held = line["held_out"]
+    training = held["training_cameras"]
+    pair = "{psnr_full:.2f} / {psnr_crop:.2f}".format_map
+    return {
+        "width [px]": str(line["width_px"]),
+        "particles": str(line["particles"]),
+        "static, frame 0: psnr_full / psnr_crop": pair(held["static"]),
+        "particles, frame 0: psnr_full / psnr_crop": pair(held["particles_frame_0"]),
+        "all frames: psnr_full / psnr_crop": pair(held["dynamic"]),
+        "ssim_crop": f"{held['dynamic']['ssim_crop']:.4f}",
+        "training cameras: psnr_crop, ssim_crop": f"{training['psnr_crop']:.2f}, {training['ssim_crop']:.4f}",
+        "flow - optical flow [px]": f"{line['flow']['median_px']:.2f} / {line['flow']['p90_px']:.2f}",
+    }
+
+
+def silhouette_row(line: dict) -> dict[str, str]:
+    held = line["held_out"]
+    mean = float(np.mean(held["iou"]))
+    below = [str(t) for t, value in enumerate(held["iou"]) if value < ASKED["iou"]]
+    return {
+        f"IoU, mean; asked {ASKED['iou']:g}": f"{mean:.4f}, {verdict(mean >= ASKED['iou'])}",
+        "smallest": f"{min(held['iou']):.4f}",
+        "frames below": ", ".join(below) or "none",
+        "training cameras, mean": f"{held['training_cameras']['iou']:.4f}",
+        "area, rendered / matte": f"{held['area_ratio']:.3f}",
+        "bare balls: IoU, area": f"{np.mean(held['iou_balls']):.4f}, {held['area_ratio_balls']:.3f}",
+    }
+
+
+def volume_row(line: dict) -> dict[str, str]:
+    volume = {name: 1e3 * value for name, value in line["volume"].items()}
+    below = 1 - volume["particles"] / volume["published_hull"]
+    return {
+        "particles [l]": f"{volume['particles']:.2f}",
+        "published hull [l]": f"{volume['published_hull']:.2f}",
+        f"below it; asked 0 to {ASKED['volume']:.0%}": f"{below:.1%}, {verdict(0 <= below <= ASKED['volume'])}",
+        "own hull before shaving, 10 / 11 cameras [l]": f"{volume['hull_training_cameras']:.2f} / {volume['hull_all_cameras']:.2f}",
+    }
+
+
+def flight_row(line: dict) -> dict[str, str]:
+    flight = line["flight"]
+    off = flight["gravity_m_s2"] / flight["true_gravity_m_s2"] - 1
+    wrong = float(np.linalg.norm(np.subtract(flight["velocity_m_s"], flight["published_velocity_m_s"])))
+    right = verdict(abs(off) <= ASKED["gravity"])
+    return {
+        "free frames": f"0 to {flight['free_frames'] - 1}",
+        f"g [m/s^2]; asked {ASKED['gravity']:.0%}": f"{flight['gravity_m_s2']:.3f} ({off:+.2%}), {right}",
+        "v0 [m/s]": vector(flight["velocity_m_s"]),
+        f"its error [m/s]; asked {ASKED['velocity_m_s']:g}": f"{wrong:.4f}, {verdict(wrong <= ASKED['velocity_m_s'])}",
+        "v0, g given [m/s]": vector(flight["velocity_given_gravity_m_s"]),
+        "v0 that learning starts from [m/s]": vector(flight["start_velocity_m_s"]),
+        "RMS of the fit [mm]": f"{1e3 * flight['fit_rms_m']:.2f}",
+    }
+
+
 def tables(lines: list[dict]) -> str:
-    """Markdown: images, then volume and flight of all lines, then the frames of each."""
-    images, shapes, frames = [], [], []
+    """Markdown: images, silhouettes, volume, flight, and the frames of each line."""
+    blocks = []
+    for cells in (image_row, silhouette_row, volume_row, flight_row):
+        rows = [{"line": name_of(line)} | cells(line) for line in lines]
+        blocks.append(markdown(list(rows[0]), [list(row.values()) for row in rows]))
+    frames = []
     for line in lines:
-        held, volume, flight = line["held_out"], line["volume"], line["flight"]
-        static, dynamic, training = held["static"], held["dynamic"], held["training_cameras"]
-        iou = float(np.mean(held["iou"]))
-        images.append([
-            name_of(line), str(line["width_px"]), str(line["particles"]), f"{static['psnr_full']:.2f}", f"{static['psnr_crop']:.2f}",
-            f"{held['particles_frame_0']['psnr_crop']:.2f}", f"{dynamic['psnr_full']:.2f}",
-            f"{dynamic['psnr_crop']:.2f} ({training['psnr_crop']:.2f})", f"{dynamic['ssim_crop']:.4f} ({training['ssim_crop']:.4f})",
-            f"{iou:.4f} / {min(held['iou']):.4f} ({training['iou']:.4f}) {verdict(iou >= ASKED['iou'])}",
-            f"{np.mean(held['iou_balls']):.4f}", f"{line['flow']['median_px']:.2f} / {line['flow']['p90_px']:.2f}",
-            f"{line['seconds']:.0f}",
-        ])  # fmt: skip
-        below = 1 - volume["particles"] / volume["published_hull"]
-        off = flight["gravity_m_s2"] / flight["true_gravity_m_s2"] - 1
-        wrong = float(np.linalg.norm(np.subtract(flight["velocity_m_s"], flight["published_velocity_m_s"])))
-        shapes.append([
-            name_of(line), f"{1e3 * volume['particles']:.2f}",
-            f"{100 * below:.1f} % {verdict(0 <= below <= ASKED['volume'])}",
-            f"{1e3 * volume['hull_training_cameras']:.2f} / {1e3 * volume['hull_all_cameras']:.2f}",
-            f"0 to {flight['free_frames'] - 1}", f"{flight['gravity_m_s2']:.3f} ({100 * off:+.2f} %) {verdict(abs(off) <= ASKED['gravity'])}",
-            vector(flight["velocity_m_s"]), f"{wrong:.4f} {verdict(wrong <= ASKED['velocity_m_s'])}",
-            vector(flight["velocity_given_gravity_m_s"]), vector(flight["start_velocity_m_s"]), f"{1e3 * flight['fit_rms_m']:.2f}",
-        ])  # fmt: skip
+        held = line["held_out"]
         for key, pattern in (("psnr_crop", "{:.2f}"), ("ssim_crop", "{:.4f}")):
             frames.append([name_of(line), key, *(pattern.format(f[key]) for f in held["per_frame"])])
         frames.append([name_of(line), "IoU", *(f"{x:.4f}" for x in held["iou"])])
-    head = ["line", "width [px]", "particles", "static, frame 0: psnr_full", "psnr_crop", "particles, frame 0: psnr_crop", "all frames: psnr_full",
-            "psnr_crop (training cameras)", "ssim_crop (training cameras)", "IoU mean / smallest (training cameras), asked 0.97",
-            "IoU of bare balls", "flow - optical flow [px]", "time [s]"]  # fmt: skip
-    shape_head = ["line", "particles' volume [l]", "below the published hull, asked 0 to 5 %", "own hull of 10 / 11 cameras [l]",
-                  "free frames", "g [m/s^2], asked 1 %", "v0 [m/s]", "its error [m/s], asked 0.01", "v0 with g given",
-                  "v0 learning starts from", "fit RMS [mm]"]  # fmt: skip
-    longest = max((len(line["held_out"]["iou"]) for line in lines), default=0)
-    return "\n\n".join([markdown(head, images), markdown(shape_head, shapes),
-                        markdown(["line", "figure", *map(str, range(longest))], frames)])  # fmt: skip
+    return "\n\n".join([*blocks, markdown(["line", "frame", *map(str, range(len(frames[0]) - 2))], frames)])
 
 
 def vector(values: list[float]) -> str:
@@ -285,7 +325,7 @@ def write(rows: dict[str, Tensor], file: Path, enlarge: int, corner: np.ndarray 
             row = row.copy()
             row[: len(corner), -len(corner) :] = corner
         parts.append(label(row, name))
-    cv2.imwrite(str(file), cv2.cvtColor(np.concatenate(parts), cv2.COLOR_RGB2BGR), [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    Image.fromarray(np.concatenate(parts)).quantize(192, dither=Image.Dither.NONE).save(file, optimize=True)
     return file
 
 
@@ -311,12 +351,13 @@ def pictures(seen: Seen, to: Path) -> list[Path]:
     shown = np.unique(np.linspace(0, scene.frames - 1, 7).round().astype(int)).tolist()
     enlarge = max(1, round(1000 / (width * len(shown))))
     difference = (1 - 3 * (rendered - real).abs()).clamp(0, 1)
+    errors = silhouette_errors(seen.views.mattes[0], scene.mattes[camera])
     numbers = ", ".join(map(str, shown))
     strip = {
         f"real, camera {HELD} (held out), frames {numbers}": cut(real, shown),
         "rendered particles": cut(rendered, shown),
         "difference, three times": cut(difference, shown),
-        "red: matte not covered; blue: rendered outside of it": cut(silhouette_errors(seen.views.mattes[0], scene.mattes[camera]), shown),
+        "red: matte not covered; blue: rendered outside of it": cut(errors, shown),
     }
     files = [write(strip, to / "seeing_bird_strip.png", enlarge)]
     steps = [t for t in shown if t < scene.frames - 1]
@@ -333,7 +374,7 @@ def pictures(seen: Seen, to: Path) -> list[Path]:
 
 
 def ellipsoids(seen: Seen, file: Path, exaggeration: float = 2.0) -> Path:
-    """Rest balls of a layer of particles, deformed by the cue: frame of the largest stretches and the last; from the front, from above."""
+    """Rest balls of a layer of particles, deformed by the cue: frame of the largest stretches and the last, from two sides."""
     result = seen.result
     rest, positions = result.splats.means, result.cues.positions
     F = neighbourhood(rest, neighbours=seen.settings.neighbours).deformation(positions)
@@ -349,7 +390,8 @@ def ellipsoids(seen: Seen, file: Path, exaggeration: float = 2.0) -> Path:
             axes = np.eye(3)[list(seen_axes)]
             strain, radius = (S - 1).abs().amax(1), 0.42 * result.spacing
             shapes = outlines(drawn, positions[t, layer], axes, radius)
-            mapped = plot.add_collection(PolyCollection(shapes, array=strain.numpy(), cmap="viridis", clim=(0, 0.2), ec="#333333", lw=0.3))
+            balls_drawn = PolyCollection(shapes, array=strain.numpy(), cmap="viridis", clim=(0, 0.2), ec="#333333", lw=0.3)
+            mapped = plot.add_collection(balls_drawn)
             # where the rest x axis points to: shows the rotation
             line, centre = radius * R[:, :, 0].numpy() @ axes.T, positions[t, layer].numpy() @ axes.T
             plot.plot(*np.stack([centre - line, centre + line]).transpose(2, 0, 1), color="white", lw=0.7)
