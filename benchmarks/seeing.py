@@ -18,6 +18,7 @@ import argparse
 import hashlib
 import itertools
 import json
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,6 +58,8 @@ from matplotlib.collections import PolyCollection
 CONF = Path(__file__).parents[1] / "conf"
 HELD = "5"
 """The camera that is held out. val and test of the scene's own split repeat camera 0, which is a training camera there."""
+DARK = 0.35
+"""Largest channel of a pixel that is no bird: its own pixels are brighter in all cameras and frames before contact."""
 ASKED = {"iou": 0.97, "volume": 0.05, "gravity": 0.01, "velocity_m_s": 0.01}
 
 
@@ -145,15 +148,27 @@ def held_out_figures(seen: Seen, seed: int) -> dict:
 
 def training_figures(seen: Seen) -> dict:
     """The same means over the cameras that were trained on: what is missing there is not a matter of the held-out view."""
-    scene, result = seen.scene, seen.result
-    images, ious = [], []
-    for camera in scene.training_cameras:
-        with torch.no_grad():
-            views = observe(result.cues.positions, result.cues.covariances, result.splats.opacities, result.splats.colors,
-                            scene.cameras.select([camera]), scene.background)  # fmt: skip
-        images.append(views.images[0].clamp(0, 1))
-        ious += overlap(views.mattes[0], scene.mattes[camera])
-    return image_metrics(torch.stack(images), scene, scene.training_cameras, scene.training_frames) | {"iou": float(np.mean(ious))}
+    scene, cameras = seen.scene, seen.scene.training_cameras
+    views = [view_of(seen, camera) for camera in cameras]
+    ious = [overlap(v.mattes[0], scene.mattes[camera]) for v, camera in zip(views, cameras)]
+    images = torch.cat([v.images for v in views]).clamp(0, 1)
+    return image_metrics(images, scene, cameras, scene.training_frames) | {"iou": float(np.mean(ious))}
+
+
+def view_of(seen: Seen, camera: int) -> Views:
+    cues, splats, view = seen.result.cues, seen.result.splats, seen.scene.cameras.select([camera])
+    with torch.no_grad():
+        return observe(cues.positions, cues.covariances, splats.opacities, splats.colors, view, seen.scene.background)
+
+
+def shadow_figures(seen: Seen) -> dict:
+    """Per camera and frame: share of the matte that is darker than the object ever is in free flight, and IoU. Mattes of footage
+    take in a piece of the shadow under the object where it touches the ground."""
+    scene = seen.scene
+    dark = (scene.images.amax(-1) < DARK) & (scene.mattes > 0.5)
+    share = dark.sum((2, 3)) / (scene.mattes > 0.5).sum((2, 3))
+    ious = [overlap(view_of(seen, camera).mattes[0], scene.mattes[camera]) for camera in range(len(scene.cameras))]
+    return {"cameras": list(scene.cameras.names), "dark": share.tolist(), "iou": ious}
 
 
 def volume_figures(seen: Seen, published: dict) -> dict:
@@ -218,6 +233,7 @@ def measure(overrides: list[str], out: Path) -> dict:
         "overrides": overrides, "width_px": seen.scene.cameras.width, "particles": len(seen.result.volume),
         "spacing_m": seen.result.spacing, "seed": cfg.seed, "held_out": held_out_figures(seen, cfg.seed),
         "volume": volume_figures(seen, published), "flight": flight_figures(seen, cfg, published), "flow": flow_figures(seen),
+        "shadow": shadow_figures(seen),
     }  # fmt: skip
 
 
@@ -305,7 +321,19 @@ def tables(lines: list[dict]) -> str:
         for key, pattern in (("psnr_crop", "{:.2f}"), ("ssim_crop", "{:.4f}")):
             frames.append([name_of(line), key, *(pattern.format(f[key]) for f in held["per_frame"])])
         frames.append([name_of(line), "IoU", *(f"{x:.4f}" for x in held["iou"])])
+    blocks.append(shadow_table(lines))
     return "\n\n".join([*blocks, markdown(["line", "frame", *map(str, range(len(frames[0]) - 2))], frames)])
+
+
+def shadow_table(lines: list[dict]) -> str:
+    """The frame with the most dark pixels in its mattes: dark share / IoU of every camera."""
+    rows = []
+    for line in lines:
+        dark, iou = np.array(line["shadow"]["dark"]), np.array(line["shadow"]["iou"])
+        t = int(dark.mean(0).argmax())
+        before = dark[:, : line["flight"]["free_frames"]].max()
+        rows.append([name_of(line), str(t), f"{before:.1%}", *(f"{d:.1%} / {i:.3f}" for d, i in zip(dark[:, t], iou[:, t]))])
+    return markdown(["line", "frame", "most in free flight", *(f"camera {c}" for c in lines[0]["shadow"]["cameras"])], rows)
 
 
 def vector(values: list[float]) -> str:
@@ -315,17 +343,19 @@ def vector(values: list[float]) -> str:
 # --- pictures ---------------------------------------------------------------------------------------------------------
 
 
-def write(rows: dict[str, Tensor], file: Path, enlarge: int, corner: np.ndarray | None = None) -> Path:
-    """One captioned row per entry (T, h, w, 3), as a PNG; `corner` is put into the upper right of the first."""
+def write(rows: dict[str, Tensor], file: Path, enlarge: int, legend: np.ndarray | None = None) -> Path:
+    """One captioned row per entry (T, h, w, 3), as a PNG; `legend` is put in the upper right, beside them."""
     parts = []
-    for i, (name, images) in enumerate(rows.items()):
+    for name, images in rows.items():
         row = np.concatenate([to_uint8(image) for image in images], 1)
         row = cv2.resize(row, None, fx=enlarge, fy=enlarge, interpolation=cv2.INTER_CUBIC) if enlarge > 1 else row
-        if corner is not None and i == 0:
-            row = row.copy()
-            row[: len(corner), -len(corner) :] = corner
         parts.append(label(row, name))
-    Image.fromarray(np.concatenate(parts)).quantize(192, dither=Image.Dither.NONE).save(file, optimize=True)
+    picture = np.concatenate(parts)
+    if legend is not None:
+        column = np.full((len(picture), legend.shape[1], 3), 255, np.uint8)
+        column[: len(legend)] = legend
+        picture = np.concatenate([picture, column], 1)
+    Image.fromarray(picture).quantize(256, dither=Image.Dither.NONE).save(file, optimize=True)
     return file
 
 
@@ -349,7 +379,7 @@ def pictures(seen: Seen, to: Path) -> list[Path]:
 
     real, rendered = scene.images[camera], seen.views.images[0].clamp(0, 1)
     shown = np.unique(np.linspace(0, scene.frames - 1, 7).round().astype(int)).tolist()
-    enlarge = max(1, round(1000 / (width * len(shown))))
+    enlarge = max(1, math.ceil(1000 / (width * len(shown))))
     difference = (1 - 3 * (rendered - real).abs()).clamp(0, 1)
     errors = silhouette_errors(seen.views.mattes[0], scene.mattes[camera])
     numbers = ", ".join(map(str, shown))
@@ -363,13 +393,13 @@ def pictures(seen: Seen, to: Path) -> list[Path]:
     steps = [t for t in shown if t < scene.frames - 1]
     found, optical = seen.views.flow[0], real_flow(seen)
     optical = torch.where((scene.mattes[camera, :-1] > 0.5)[..., None], optical, 0.0)
-    largest = float(found.norm(dim=-1).max())
+    largest = float(found.norm(dim=-1)[scene.mattes[camera, :-1] > 0.5].quantile(0.99))
     rows = {
         f"Gaussian flow to the next frame, camera {HELD} (held out), frames {', '.join(map(str, steps))}; "
-        f"full colour: {largest:.0f} px": cut(flow_colors(found, largest), steps),
+        f"full colour: {largest:.0f} px or more": cut(flow_colors(found, largest), steps),
         "optical flow of the real images (DIS), inside the matte": cut(flow_colors(optical, largest), steps),
     }
-    files.append(write(rows, to / "seeing_bird_flow.png", enlarge, to_uint8(color_wheel(64))))
+    files.append(write(rows, to / "seeing_bird_flow.png", enlarge, to_uint8(color_wheel(96))))
     return [*files, ellipsoids(seen, to / "seeing_bird_ellipsoids.png")]
 
 
