@@ -355,7 +355,9 @@ def write(rows: dict[str, Tensor], file: Path, enlarge: int, legend: np.ndarray 
         column = np.full((len(picture), legend.shape[1], 3), 255, np.uint8)
         column[: len(legend)] = legend
         picture = np.concatenate([picture, column], 1)
-    Image.fromarray(picture).quantize(256, dither=Image.Dither.NONE).save(file, optimize=True)
+    # a colour wheel needs all its colours; photographs do with 256, at a third of the size
+    image = Image.fromarray(picture)
+    (image if legend is not None else image.quantize(256, dither=Image.Dither.NONE)).save(file, optimize=True)
     return file
 
 
