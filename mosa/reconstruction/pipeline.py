@@ -28,7 +28,7 @@ from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import expected_depth, rasterize
 from mosa.types import Reconstruction, Scene, Splats
 
-CACHE_VERSION = 1
+CACHE_VERSION = 2
 """Raised when a stage computes something else from the same settings."""
 
 
@@ -50,7 +50,7 @@ class ReconstructionSettings:
     margin: int = 6
     splats: str | None = None
     static: FitSettings = field(default_factory=FitSettings)
-    appearance: FitSettings = field(default_factory=FitSettings)
+    appearance: FitSettings = field(default_factory=lambda: FitSettings(keep=1.0))
     dynamic: DynamicSettings = field(default_factory=DynamicSettings)
 
     def __post_init__(self) -> None:

@@ -24,8 +24,9 @@ SSIM_SIGMA = 1.5
 @dataclass(frozen=True)
 class FitSettings:
     """iterations; views: images per step; lr_*: Adam steps, of positions in units of the mean scale, of the others per
-    unconstrained number; ssim: weight of 1 - SSIM against L1; matte: weight of the alpha term; largest: bound of a scale in
-    units of its start; relocate_every: steps between moves of vanished Gaussians to where opaque ones are (0: never)."""
+    unconstrained number; ssim: weight of 1 - SSIM against L1; matte: weight of the alpha term; keep: what a Gaussian's first colour
+    counts for, in pixels of an image; largest: bound of a scale in units of its start; relocate_every: steps between moves of
+    vanished Gaussians to where opaque ones are (0: never)."""
 
     iterations: int = 400
     views: int = 2
@@ -35,6 +36,7 @@ class FitSettings:
     lr_colors: float = 0.02
     ssim: float = 0.2
     matte: float = 1.0
+    keep: float = 0.0
     largest: float = 2.0
     relocate_every: int = 100
 
@@ -103,7 +105,8 @@ def projected_colors(points: Tensor, normals: Tensor, windows: Windows) -> Tenso
     cosine = (F.normalize(centre[:, None] - points, dim=-1) * normals).sum(-1).clamp(min=0)
     weight = (cosine + 0.02) ** 4
     total = (weight[..., None] * sampled).sum(0)
-    return (total[:, :3] / total[:, 3:].clamp(min=1e-4)).clamp(0.02, 0.98)
+    # the floor lies below the weight of points that every view sees from behind (0.02^4): they get a colour too
+    return (total[:, :3] / total[:, 3:].clamp(min=1e-9)).clamp(0.02, 0.98)
 
 
 def initial_splats(volume: Volume, windows: Windows, *, count: int, seed: int) -> Splats:
@@ -201,6 +204,11 @@ def fit_splats(
             background,
         )
         loss = image_loss(image, alpha, batch, ssim_weight=settings.ssim, matte_weight=settings.matte)
+        if settings.keep > 0:
+            # Adam moves a Gaussian of a hundredth of a pixel as fast as one of ten: hardly seen ones drift to any colour, which
+            # shows when the object turns
+            change = torch.sigmoid(parameters["color"]) - splats.colors
+            loss = loss + settings.keep * change.square().mean(1).sum() / alpha.numel()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
