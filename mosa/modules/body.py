@@ -74,6 +74,8 @@ class ContactOffset(nn.Module):
 
     START = 0.3
     """Cells the fit starts from; seen on balls, the bird and the rabbit: 0.2 to 0.5. From 0 the fit ends in another valley."""
+    LIMITS = (0.15, 0.55)
+    """What a grid can do; beyond, the number would absorb what the law gets wrong, and so end in that other valley."""
 
     def __init__(self, dx: float, enabled: bool = True) -> None:
         super().__init__()
@@ -82,6 +84,12 @@ class ContactOffset(nn.Module):
 
     def forward(self) -> Tensor:
         return self.dx * self.cells
+
+    @torch.no_grad()
+    def project(self) -> None:
+        """Back within `LIMITS`, after an optimiser's step."""
+        if self.enabled:
+            self.cells.clamp_(*self.LIMITS)
 
 
 class Body(nn.Module):

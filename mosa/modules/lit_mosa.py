@@ -121,6 +121,7 @@ class LitMosa(L.LightningModule):
         self.manual_backward(loss)
         norms = self.gradient_norms(optimizer, stage, iteration)
         optimizer.step()
+        self.body.contact.project()
         self.losses.append(float(loss.detach()))
         self.steps_done += 1
         self.report(stage, iteration, frames, terms, loss, norms, views, rollout)

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 import torch
 
+from mosa.modules.body import ContactOffset
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -66,6 +68,15 @@ def test_the_twin_simulates_from_a_new_start(run, cache, tmp_path):
     assert result.returncode == 0, result.stderr[-3000:]
     assert len(list((tmp_path / "ply").glob("*.ply"))) == 4
     assert (tmp_path / "simulation.mp4").stat().st_size > 1000
+
+
+def test_the_contact_offset_stays_where_a_grid_can_put_it(cache, tmp_path):
+    """Steps of two cells: without the limits it would end far outside."""
+    result = call("train.py", tmp_path, cache, "fit.prior.lr_contact=2", "adapter=none", "heterogeneity.enabled=false",
+                  "evaluation.video=false")
+    assert result.returncode == 0, result.stderr[-3000:]
+    figures = json.loads((tmp_path / "metrics.json").read_text())
+    assert min(abs(figures["id/contact_offset_m"] / figures["dx_m"] - limit) for limit in ContactOffset.LIMITS) < 1e-5
 
 
 def test_a_killed_run_resumes_bit_for_bit(run, cache, tmp_path):
