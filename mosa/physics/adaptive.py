@@ -74,16 +74,16 @@ def current_modulus(law: Law, F: Tensor, C_affine: Tensor, parameters: Tensor) -
 class StepChooser:
     """Decides the substeps of the frames of one rollout.
 
-    parameters: physical values by name; packed: (N, SLOTS); density [kg/m^3]; frame_dt [s]; collider_speed [m/s]: bound of the
-    speed of any collider's surface.
+    parameters: physical values by name; packed: (N, SLOTS); density: number or (N,) [kg/m^3]; frame_dt [s]; collider_speed [m/s]:
+    bound of the speed of any collider's surface.
     """
 
     def __init__(
-        self, control: StepControl, numerics: Numerics, parameters: dict[str, Tensor], packed: Tensor, density: float,
-        frame_dt: float, collider_speed: float = 0.0,
+        self, control: StepControl, numerics: Numerics, parameters: dict[str, Tensor], packed: Tensor,
+        density: float | Tensor, frame_dt: float, collider_speed: float = 0.0,
     ) -> None:  # fmt: skip
         self.control, self.numerics, self.packed = control, numerics, packed.detach()
-        self.density, self.frame_dt = float(density), float(frame_dt)
+        self.density, self.frame_dt = density, float(frame_dt)
         n, law = len(packed), numerics.law
         values = {k: torch.as_tensor(v).detach().to(packed) for k, v in parameters.items()}
         self.rest_modulus = law.wave_modulus(values).expand(n)
@@ -112,9 +112,10 @@ class StepChooser:
         rate = speed / (control.courant * dx) + viscosity / (VISCOUS_NUMBER * self.density * dx * dx)
         stiffest, fastest = int(rate.argmax()), float(v.norm(dim=1).max()) + self.added_speed
         c, mu = float(speed[stiffest]), float(viscosity[stiffest])
+        density = float(self.density[stiffest] if isinstance(self.density, Tensor) else self.density)
         if not math.isfinite(c):
             raise SimulationDiverged(f"frame {frame}: the stress of particle {stiffest} is not finite at its start")
-        needed = max(1, math.ceil(self.frame_dt * step_rate(c, mu, self.density, dx, fastest, control.courant)))
+        needed = max(1, math.ceil(self.frame_dt * step_rate(c, mu, density, dx, fastest, control.courant)))
         if needed > control.maximum:
             raise ConfigError(
                 f"simulation.max_substeps: expected at least {needed} for frame {frame}, found {control.maximum}: particle "

@@ -43,12 +43,13 @@ def grid_window(x: Tensor, v: Tensor, dx: float, travel_time: float, margin: int
 
 
 class SegmentSolver:
-    """Runs the segments of one rollout. volume: (N,) [m^3]; density [kg/m^3]; cutoff: node mass [kg].
+    """Runs the segments of one rollout. volume: (N,) [m^3]; density: number or (N,) [kg/m^3]; cutoff: node
+    mass [kg].
 
     workspaces: buffers by shape, shared by the rollouts of one simulator (scratch only, nothing in them outlives a segment).
     """
 
-    def __init__(self, numerics: Numerics, volume: Tensor, density: float, cutoff: float, workspaces: dict) -> None:
+    def __init__(self, numerics: Numerics, volume: Tensor, density: float | Tensor, cutoff: float, workspaces: dict) -> None:
         self.numerics, self.volume, self.cutoff = numerics, volume, cutoff
         self.mass = density * volume
         self._workspaces = workspaces

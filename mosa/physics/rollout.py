@@ -158,7 +158,7 @@ class Simulator:
         state: ParticleState,
         parameters: dict[str, Tensor],
         volume: Tensor,
-        density: float,
+        density: float | Tensor,
         frames: int,
         adapter: Callable[[MaterialState], AdapterOperator] | None = None,
         stride: int | None = 1,
@@ -173,7 +173,8 @@ class Simulator:
         """`frames` frames, the start being frame 0 (so frames - 1 intervals are simulated).
 
         state: particles at frame 0, its F and F_tot not yet advanced by C_affine, unless `started` (the `final` of an earlier
-        rollout). parameters: physical values the law names, per particle (N,) or scalar; volume: (N,) [m^3]; density [kg/m^3].
+        rollout). parameters: physical values the law names, per particle (N,) or scalar; volume: (N,) [m^3]; density
+        [kg/m^3]: number or (N,).
         adapter: asked every `stride` substeps from the start of each frame; None: once, at the start of the rollout (an operator
         that does not depend on the state). progress: called with the number of each frame.
         motions: of the colliders, instead of their own; start_time [s]: time of frame 0 in these motions.
@@ -187,6 +188,7 @@ class Simulator:
             raise ConfigError(f"frames and stride: expected at least 1, found {frames} and {stride}")
         n = len(state.x)
         self._check(state, volume)
+        density = self._density(density, volume)
         C = state.C_affine if started or self.init_affine == "spin" else torch.zeros_like(state.C_affine)
         F, F_tot = state.F, state.F_tot if self.law.plastic else state.F
         rotation = _polar(F) if self.law.reference is not None else None
@@ -194,7 +196,7 @@ class Simulator:
         volume = volume.detach().contiguous()
         cutoff = self.mass_cutoff
         if cutoff is None:
-            cutoff = 0.0 if self.dtype == torch.float64 else 1e-12 * density * float(volume.mean())
+            cutoff = 0.0 if self.dtype == torch.float64 else 1e-12 * float((density * volume).mean())
         solver = SegmentSolver(self.numerics, volume, density, cutoff, self._workspaces)
         held = {"parameters": packed, "G": None, "h": None, "plastic_G": None, "plastic_h": None}
         recorded = {"x": [state.x], "v": [state.v], "F": [F], "F_tot": [F_tot]}
@@ -324,6 +326,20 @@ class Simulator:
                 )
         if not bool((volume > 0).all()):
             raise ConfigError("volume: expected positive numbers [m^3] for all particles")
+
+    def _density(self, density: float | Tensor, volume: Tensor) -> float | Tensor:
+        """A number stays one: arithmetic, and so every bit, is that of a body of one material."""
+        if not isinstance(density, Tensor) or density.ndim == 0:
+            density = float(density)
+            if not (math.isfinite(density) and density > 0):
+                raise ConfigError(f"density: expected a positive number [kg/m^3], found {density}")
+            return density
+        if density.shape != volume.shape:
+            raise ConfigError(f"density: expected a number or shape {tuple(volume.shape)}, found {tuple(density.shape)}")
+        density = density.detach().to(volume)
+        if not bool((torch.isfinite(density) & (density > 0)).all()):
+            raise ConfigError("density: expected positive numbers [kg/m^3] for all particles")
+        return density
 
 
 def _segments(substeps: int, stride: int | None) -> list[int]:

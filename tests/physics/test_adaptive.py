@@ -235,6 +235,21 @@ def test_velocity_and_viscosity_bound_the_count(make_block):
     assert counts == (8, 8)
 
 
+def test_the_lightest_of_equally_stiff_particles_sets_the_count(make_block):
+    state = make_block(velocity=(0.0, 0.0, 0.0))
+    state = replace(state, v=0 * state.v, C_affine=0 * state.C_affine, F=torch.eye(3).double().expand_as(state.F).contiguous())
+    sim = simulator("neo_hookean", dx=0.04, ground=None, gravity=(0.0, 0.0, 0.0))
+    light = torch.full((len(state.x),), DENSITY, dtype=torch.float64)
+    light[3] /= 100
+
+    def first(density):
+        with torch.no_grad():
+            control = StepControl(multiple=1, maximum=5000)
+            return sim.rollout(state, {"mu": 4e4, "lam": 5e4}, volume_of(state), density, 2, control=control).counts[0]
+
+    assert first(light) == pytest.approx(10 * first(DENSITY), abs=10) and first(DENSITY) >= 8
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_going_on_from_an_earlier_rollout_is_the_same_rollout(dtype, make_block):
     """Two laws in one grid, a moving plate: the same counts again, and across a continuation."""

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from mosa.errors import ConfigError
 from mosa.physics import reference
 from mosa.physics.boundary import Plane
 from mosa.physics.rollout import AdapterOperator, Simulator
@@ -69,3 +70,38 @@ def test_twin(law, adapted, make_block):
         assert (found - expected).abs().max() < 1e-9 * expected.abs().max(), name
         # cohesion acts at the tip of the cone and through tr(eps) - 3c
         assert float(expected.abs().max()) > 0, name
+
+
+def test_densities_per_particle(make_block):
+    """Halves of 300 and 3000 kg/m^3: the twin's motion, and the motion that a number gives where all densities are that number."""
+    state = make_block(velocity=(0.5, -1.0, 0.2))
+    n, steps = len(state.x), 4
+    volume = torch.full((n,), 0.02**3, dtype=torch.float64)
+    parameters = {"mu": torch.tensor(MU, dtype=torch.float64), "lam": torch.tensor(LAM, dtype=torch.float64)}
+    halves = torch.where(state.x[:, 0] > state.x[:, 0].median(), 300.0, 3000.0).double()
+    sim = Simulator("neo_hookean", dx=DX, substeps=steps, frame_dt=steps * DT, planes=PLANES, dtype=torch.float64)
+
+    def final(density):
+        return sim.rollout(state, parameters, volume, density, 2, started=True).final
+
+    twin = state
+    for _ in range(steps):
+        twin = reference.substep("neo_hookean", twin, parameters, volume, halves, dx=DX, dt=DT, gravity=(0.0, -9.8, 0.0),
+                                 planes=PLANES)  # fmt: skip
+    for name in ("x", "v", "C_affine", "F"):
+        value, expected = getattr(final(halves), name), getattr(twin, name)
+        assert (value - expected).abs().max() < 1e-12 * steps * max(1.0, float(expected.abs().max())), name
+    assert torch.equal(final(torch.full((n,), DENSITY, dtype=torch.float64)).x, final(DENSITY).x)
+    assert (final(halves).v - final(DENSITY).v).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("density, message", [
+    (0.0, "positive number"), (torch.ones(3), "expected a number or shape"), (torch.tensor(float("nan")), "positive number"),
+    (None, "for all particles"),
+])  # fmt: skip
+def test_a_density_that_cannot_be(density, message, make_block):
+    state = make_block()
+    volume = torch.full((len(state.x),), 0.02**3, dtype=torch.float64)
+    sim = Simulator("neo_hookean", dx=DX, substeps=4, frame_dt=4 * DT, dtype=torch.float64)
+    with pytest.raises(ConfigError, match=message):
+        sim.rollout(state, {"mu": MU, "lam": LAM}, volume, -volume if density is None else density, 2)
