@@ -22,8 +22,8 @@ IMAGE_METRICS = ("psnr_crop", "ssim_crop", "psnr_full", "ssim_full")
 
 @dataclass(frozen=True)
 class Sequence:
-    """A sequence to evaluate on. prefix: `train` or `test/<name>`; start: where the body starts; contact: first frame after
-    first contact."""
+    """A sequence to evaluate on. prefix: `train`, `train/<name>` or `test/<name>`; start: where the body starts; contact: first
+    frame after first contact."""
 
     prefix: str
     scene: Scene
@@ -122,7 +122,7 @@ def evaluate(body: Body, sequences: list[Sequence], world: World, *, samples: in
 def sequence_metrics(body, sequence: Sequence, rollout: Rollout, model: str, samples: int, assignment: int) -> dict[str, float]:
     """The figures of one rollout: training views and frames, held-out frames, held-out cameras."""
     scene, x = sequence.scene, rollout.x.cpu()
-    training = sequence.prefix == "train"
+    training = sequence.prefix.startswith("train")
     frames = scene.training_frames if training else list(range(scene.frames))
     cameras = scene.training_cameras if training else list(range(len(scene.cameras)))
     figures: Mapping[str, float] = {
@@ -130,12 +130,12 @@ def sequence_metrics(body, sequence: Sequence, rollout: Rollout, model: str, sam
         **image_metrics(render(body, rollout, scene, cameras), scene, cameras, frames),
     }
     result = {f"{model}{sequence.prefix}/{k}": v for k, v in figures.items()}
-    if training and scene.holdout_frames:
+    if sequence.prefix == "train" and scene.holdout_frames:
         held = list(scene.holdout_frames)
         figures = {**motion_metrics(x, body, sequence, held, samples, assignment),
                    **image_metrics(render(body, rollout, scene, cameras), scene, cameras, held)}
         result |= {f"{model}frames/{k}": v for k, v in figures.items()}
-    if training and scene.holdout_cameras:
+    if sequence.prefix == "train" and scene.holdout_cameras:
         held = list(scene.holdout_cameras)
         images = render(body, rollout, scene, held)
         result |= {f"{model}camera/{k}": v for k, v in image_metrics(images, scene, held, frames).items()}
@@ -163,9 +163,9 @@ def identification(body: Body, scene: Scene) -> dict[str, float]:
         mean = float(body.factor(heterogeneity).detach().mean())
         for name, value in material.physical().items():
             scale = mean if name == material.stiffness else 1.0
-            figures[f"{prefix}/{name}"] = float(value) * scale
+            figures[f"{prefix}/{name}"] = float(value.detach()) * scale
             if name in scene.known_parameters:
                 true = scene.known_parameters[name]
                 figures[f"{prefix}/{name}_relative_error"] = abs(figures[f"{prefix}/{name}"] - true) / abs(true)
-        figures[f"{prefix}/contact_offset_m"] = float(contact())
+        figures[f"{prefix}/contact_offset_m"] = float(contact().detach())
     return figures

@@ -7,6 +7,7 @@ import os
 import resource
 import time
 import warnings
+from collections.abc import Collection
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from mosa.data.datamodule import MultiViewDataModule, training_observations
 from mosa.errors import ConfigError
 from mosa.evaluation import Sequence, evaluate, identification, render
 from mosa.modules.body import Body, Start
-from mosa.modules.lit_mosa import LitMosa
+from mosa.modules.lit_mosa import LitMosa, Take
 from mosa.reconstruction.starts import first_contact, sequence_start, splats_of
 from mosa.rendering.cameras import crop_boxes, crop_images
 from mosa.rendering.covariance import covariance_from
@@ -70,24 +71,36 @@ def cache_folder(cfg: DictConfig) -> Path:
 
 
 def scenes(cfg: DictConfig) -> tuple[Scene, list[Scene]]:
-    """The training sequence and the held-out ones of the same object."""
+    """The training sequence and the others of the same object. Errors: ConfigError where scene.also_train names none of these."""
     from mosa.data.scene import held_out_sequences, load_scene
 
     keys = plain(cfg.scene)
-    return load_scene(**keys), held_out_sequences(**keys)
+    wanted = keys.pop("also_train", None) or []
+    scene, others = load_scene(**keys), held_out_sequences(**keys)
+    known = [s.sequence for s in others]
+    if unknown := [name for name in wanted if name not in known]:
+        found = f"has {', '.join(known)}" if known else "has none"
+        raise ConfigError(f"scene.also_train: expected other sequences of the scene, found {unknown[0]!r}; it {found}")
+    return scene, others
 
 
-def starts(body: Body, reconstruction: Reconstruction, training: Scene, held_out: list[Scene]) -> dict[str, Start]:
-    """Initial states of all sequences, from images alone: pose of frame 0, velocity of the frames before contact."""
+def starts(
+    body: Body, reconstruction: Reconstruction, training: Scene, others: list[Scene], taught: Collection[str] = ()
+) -> dict[str, Start]:
+    """Initial states by prefix, from images alone: pose of frame 0, velocity of the frames before contact.
+
+    Prefixes: train, then train/<name> for the sequences named in `taught`, test/<name> for the rest, in the order of `others`.
+    """
     found = {"train": sequence_start(body, reconstruction.splats, training, register=False)}
-    for scene in held_out:
-        found[f"test/{scene.sequence}"] = sequence_start(body, reconstruction.splats, scene, register=True)
+    for scene in others:
+        prefix = f"{'train' if scene.sequence in taught else 'test'}/{scene.sequence}"
+        found[prefix] = sequence_start(body, reconstruction.splats, scene, register=True)
     return found
 
 
-def sequences(body: Body, training: Scene, held_out: list[Scene], found: dict[str, Start]) -> list[Sequence]:
-    prefixes = ["train", *(f"test/{s.sequence}" for s in held_out)]
-    return [Sequence(p, s, found[p], first_contact(body, found[p], s)) for p, s in zip(prefixes, [training, *held_out])]
+def sequences(body: Body, training: Scene, others: list[Scene], found: dict[str, Start]) -> list[Sequence]:
+    """found: start by prefix, in the order of the sequences (`starts`)."""
+    return [Sequence(p, s, start, first_contact(body, start, s)) for (p, start), s in zip(found.items(), [training, *others])]
 
 
 def train(cfg: DictConfig) -> float | None:
@@ -99,6 +112,7 @@ def train(cfg: DictConfig) -> float | None:
     use_backend(cfg.rendering.backend)
     with clock.measure("data"):
         scene, held_out = scenes(cfg)
+    taught = list(cfg.scene.get("also_train") or [])
     if scene.synthetic:
         print(f"scene {scene.name}: synthetic, made by this program; not a capture")
     with clock.measure("reconstruction"):
@@ -106,12 +120,13 @@ def train(cfg: DictConfig) -> float | None:
     config = run_config(plain(cfg), scene, dx)
     body = body_of(reconstruction, config).to(device)
     with clock.measure("starts"):
-        found = starts(body, reconstruction, scene, held_out)
+        found = starts(body, reconstruction, scene, held_out, taught)
     config["starts"] = {k: {n: getattr(s, n).tolist() for n in ("rotation", "center", "velocity", "angular_velocity")}
                         for k, s in found.items()}
     world = build_world(config["world"])
     with clock.measure("fit"):
-        module, data = assemble_fit(cfg, scene, reconstruction, body, found["train"], config, device)
+        more = [(s, found[f"train/{s.sequence}"]) for s in held_out if s.sequence in taught]
+        module, data = assemble_fit(cfg, scene, reconstruction, body, found["train"], config, device, more)
         print(fit_estimate(module))
         fit(cfg, module, data, folder, device)
     with clock.measure("evaluation"):
@@ -134,23 +149,39 @@ def body_of(reconstruction: Reconstruction, config: dict) -> Body:
                                "covariances": covariance_from(splats.scales, splats.rotations)})
 
 
-def assemble_fit(cfg, scene, reconstruction, body, start, config, device) -> tuple[LitMosa, MultiViewDataModule]:
-    """What Lightning fits: the module with its targets and stages, and the schedule of views."""
-    frames = len(scene.training_frames)
-    observations = training_observations(scene, reconstruction, margin=cfg.rendering.margin, device=device)
-    cues = reconstruction.cues
-    names = ("positions", "rotation", "stretch", "weight", "covariances")
+def assemble_fit(
+    cfg, scene, reconstruction, body, start, config, device, more: list[tuple[Scene, Start]] = ()
+) -> tuple[LitMosa, MultiViewDataModule]:
+    """What Lightning fits: the module with its targets and stages, and the schedule of views. more: further sequences to learn
+    from; their motion is reconstructed with the body of the first."""
+    seen = [(scene, start, reconstruction)]
+    seen += [(s, begun, follow_scene(cfg, s, scene, reconstruction, body, begun, device)) for s, begun in more]
+    takes = [take_of(cfg, *each, body, device) for each in seen]
     settings = plain(cfg.fit)
     stages = build_stages(settings, heterogeneity=body.heterogeneity is not None, adapter=body.adapter is not None)
     module = LitMosa(
-        body, start=start, world=build_world(config["world"]), observations=observations,
-        cues=MotionCues(*(getattr(cues, n)[:frames].to(device) for n in names)), background=scene.background.to(device),
-        frame_dt=config["frame_dt"], first_contact=first_contact(body, start, scene), stages=stages,
-        weights=plain(cfg.losses), clip=settings["clip"], config=config,
+        body, takes=takes, world=build_world(config["world"]), background=scene.background.to(device),
+        frame_dt=config["frame_dt"], stages=stages, weights=plain(cfg.losses), clip=settings["clip"], config=config,
     )
-    data = MultiViewDataModule(observations, views_per_step=settings["views"], steps=sum(s.iterations for s in stages),
-                               seed=cfg.seed)
+    data = MultiViewDataModule(takes[0].observations, views_per_step=settings["views"],
+                               steps=sum(s.iterations for s in stages), seed=cfg.seed)
     return module, data
+
+
+def follow_scene(cfg, scene, first, reconstruction, body, start, device) -> Reconstruction:
+    """Reconstruction of another sequence of the body that `reconstruction` found in the scene `first`."""
+    from mosa.reconstruction.pipeline import build_settings, follow
+
+    return follow(scene, first, reconstruction, rotation=start.rotation, center=start.center, rest_center=body.center,
+                  settings=build_settings(**plain(cfg.reconstruction)), cache_dir=cache_folder(cfg), seed=cfg.seed, device=device)
+
+
+def take_of(cfg, scene: Scene, start: Start, reconstruction: Reconstruction, body: Body, device) -> Take:
+    """What the fit reads of one sequence, on `device`."""
+    frames, cues = len(scene.training_frames), reconstruction.cues
+    names = ("positions", "rotation", "stretch", "weight", "covariances")
+    return Take(start, training_observations(scene, reconstruction, margin=cfg.rendering.margin, device=device),
+                MotionCues(*(getattr(cues, n)[:frames].to(device) for n in names)), first_contact(body, start, scene))
 
 
 BACKWARD = 3.5  # cost of a step with gradients over one without, measured on the rabbit
@@ -160,11 +191,12 @@ ADAPTER_COST, ADAPTER_BYTES = 1.8, 4.8e3  # of a step with networks over one wit
 def fit_estimate(module: LitMosa) -> str:
     """One line on how long the fit will take and what its networks will keep in memory, from one timed step without gradients."""
     body, stages = module.body, module.stages
-    frames = len(module.cues.positions)
+    first = module.takes[0]
+    frames = len(first.cues.positions)
     began = time.perf_counter()
     with torch.no_grad():
-        module.terms(stages[0], [0, min(1, len(module.observations.cameras) - 1)], frames)
-    step = BACKWARD * (time.perf_counter() - began)
+        module.terms(stages[0], [0, min(1, len(first.observations.cameras) - 1)], frames)
+    step = BACKWARD * (time.perf_counter() - began) * len(module.takes)
     networks = body.adapter is not None and not body.adapter.steady
     seconds = sum(s.iterations * step * (ADAPTER_COST if s.name == "joint" and networks else 1) for s in stages)
     evaluations = (frames - 1) * body.last_substeps / body.settings.stride

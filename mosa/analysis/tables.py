@@ -11,7 +11,7 @@ UNITS = {"rms_m": ("rms [mm]", 1e3, 2),
 
 
 def results_table(figures: Mapping[str, float], metrics=("rms_m", "cd_m", "psnr_crop", "ssim_crop")) -> str:
-    """Markdown table of floor, prior, prior + eta and adapted on the training and each held-out sequence."""
+    """Markdown table of floor, prior, prior + eta and adapted on each training and each held-out sequence."""
     sequences = [s for s in _sequences(figures)]
     rows = []
     for metric in metrics:
@@ -26,7 +26,8 @@ def results_table(figures: Mapping[str, float], metrics=("rms_m", "cd_m", "psnr_
 def _sequences(figures: Mapping[str, float]) -> list[str]:
     names = {key.rsplit("/", 1)[0] for key in figures if key.endswith("/psnr_crop")}
     plain = {n for n in names if n.split("/")[0] in ("train", "frames", "camera") and n.count("/") == 0}
-    return sorted(plain, key=("train", "frames", "camera").index) + sorted(n for n in names if n.startswith("test"))
+    others = [sorted(n for n in names if n.startswith(start)) for start in ("train/", "test")]
+    return sorted(plain, key=("train", "frames", "camera").index) + others[0] + others[1]
 
 
 def parameter_table(figures: Mapping[str, float]) -> str:

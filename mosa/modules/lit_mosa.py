@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import lightning as L
 import torch
@@ -24,24 +25,31 @@ MISFIT = 0.01
 TERMS = ("image", "mask", "flow", "rotation", "stretch", "heterogeneity", "position", "operator", "operator_variance")
 
 
-class LitMosa(L.LightningModule):
-    """Fits a body to one training sequence in stages.
+@dataclass(frozen=True)
+class Take:
+    """A sequence to learn from. start: where the body starts; observations: targets (datamodule.py); cues: the reconstruction's,
+    of the training frames; first_contact: index of the first frame after it."""
 
-    observations: targets (datamodule.py); cues: reconstruction cues of the training frames; weights: per loss term (method.md,
-    section 8); config: plain containers from which `eval.py` rebuilds the run.
+    start: Start
+    observations: Observations
+    cues: MotionCues
+    first_contact: int
+
+
+class LitMosa(L.LightningModule):
+    """Fits a body to one or more sequences in stages: the loss is the mean over them.
+
+    weights: per loss term (method.md, section 8); config: plain containers from which `eval.py` rebuilds the run.
     """
 
     def __init__(
         self,
         body: Body,
         *,
-        start: Start,
+        takes: Sequence[Take],
         world: World,
-        observations: Observations,
-        cues: MotionCues,
         background: Tensor,
         frame_dt: float,
-        first_contact: int,
         stages: Sequence[Stage],
         weights: Mapping[str, float],
         clip: float = 1.0,
@@ -52,9 +60,8 @@ class LitMosa(L.LightningModule):
         if unknown:
             raise ConfigError(f"losses: unknown terms {unknown}; known are {', '.join(TERMS)}")
         self.automatic_optimization = False
-        self.body, self.world, self.start = body, world, start
-        self.observations, self.cues, self.background = observations, cues, background
-        self.frame_dt, self.first_contact, self.stages = frame_dt, first_contact, list(stages)
+        self.body, self.world, self.takes, self.background = body, world, list(takes), background
+        self.frame_dt, self.stages = frame_dt, list(stages)
         self.weights, self.clip, self.config = dict(weights), clip, config or {}
         self.stage_index, self.losses, self.steps_done = 0, [], 0
         self.misfit = MISFIT  # of the model the joint stage starts from, measured when it begins
@@ -69,7 +76,7 @@ class LitMosa(L.LightningModule):
     def on_save_checkpoint(self, checkpoint: dict) -> None:
         checkpoint["mosa"] = {"config": self.config, "stage": self.stage_index, "losses": list(self.losses),
                               "steps_done": self.steps_done, "particles": len(self.body.rest), "misfit": self.misfit}
-        checkpoint["mosa"]["start"] = {k: getattr(self.start, k).tolist() for k in
+        checkpoint["mosa"]["start"] = {k: getattr(self.takes[0].start, k).tolist() for k in
                                        ("rotation", "center", "velocity", "angular_velocity")}
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
@@ -105,32 +112,41 @@ class LitMosa(L.LightningModule):
         iteration = len(self.losses)
         if iteration == 0:
             self.begin(stage)
-        total = len(self.cues.positions)
-        frames = stage.active_frames(iteration, min(self.first_contact + 3, total), total)
         optimizer = self.optimizers()
         optimizer = optimizer[self.stage_index] if isinstance(optimizer, list) else optimizer
         for group in optimizer.param_groups:
             group["lr"] = group["rate"] * stage.decay(iteration)
         optimizer.zero_grad()
-        terms, rollout = self.terms(stage, views, frames)
-        loss = sum(self.weights.get(name, 0.0) * value for name, value in terms.items())
-        if not torch.isfinite(loss):
-            bad = [name for name, value in terms.items() if not torch.isfinite(value)]
-            raise SimulationDiverged(f"stage {stage.name}, iteration {iteration}: loss terms {bad} are not finite; "
-                                     "lower fit.*.lr or simulation.courant")
-        self.manual_backward(loss)
+        total, mean = 0.0, {}
+        for take in self.takes:  # one graph at a time: memory is that of one sequence
+            length = len(take.cues.positions)
+            frames = stage.active_frames(iteration, min(take.first_contact + 3, length), length)
+            terms, rollout = self.terms(stage, views, frames, take)
+            loss = sum(self.weights.get(name, 0.0) * value for name, value in terms.items()) / len(self.takes)
+            if not torch.isfinite(loss):
+                bad = [name for name, value in terms.items() if not torch.isfinite(value)]
+                raise SimulationDiverged(f"stage {stage.name}, iteration {iteration}: loss terms {bad} are not finite; "
+                                         "lower fit.*.lr or simulation.courant")
+            self.manual_backward(loss)
+            total = total + loss.detach()
+            for name, value in terms.items():
+                mean[name] = mean.get(name, 0.0) + value.detach() / len(self.takes)
+        loss, terms = total, mean
         norms = self.gradient_norms(optimizer, stage, iteration)
         optimizer.step()
         self.body.contact.project()
-        self.losses.append(float(loss.detach()))
+        self.losses.append(float(loss))
         self.steps_done += 1
         self.report(stage, iteration, frames, terms, loss, norms, views, rollout)
         if stage.ended(self.losses):
             self.finish(stage)
 
-    def terms(self, stage: Stage, views: list[int], frames: int) -> tuple[dict[str, Tensor], Rollout]:
-        """Every loss term that has a weight (raw), and the rollout they were computed on."""
-        body, weights, cues = self.body, self.weights, self.cues
+    def terms(
+        self, stage: Stage, views: list[int], frames: int, take: Take | None = None
+    ) -> tuple[dict[str, Tensor], Rollout]:
+        """Every loss term that has a weight (raw), and the rollout of `take` (the first where None) they were computed on."""
+        take = self.takes[0] if take is None else take
+        body, weights, cues = self.body, self.weights, take.cues
         adapted = stage.name == "joint" and body.adapter is not None
         collected: list = []
         penalised = weights.get("operator", 0.0) != 0 or weights.get("operator_variance", 0.0) != 0
@@ -139,14 +155,14 @@ class LitMosa(L.LightningModule):
                 collected.append(adapter.statistics())
 
         rollout = body.simulate(
-            self.start, self.world, frames, self.frame_dt, with_adapter=adapted, with_heterogeneity=stage.name != "prior",
+            take.start, self.world, frames, self.frame_dt, with_adapter=adapted, with_heterogeneity=stage.name != "prior",
             collect=collect if adapted else None,
         )
         def on(name: str) -> bool:
             return weights.get(name, 0.0) != 0
 
         terms: dict[str, Tensor] = {}
-        targets = self.observations.select(views, frames)
+        targets = take.observations.select([v % len(take.observations.cameras) for v in views], frames)
         if on("image") or on("mask") or on("flow"):
             seen = observe(rollout.x, deformed_covariances(rollout.F_tot, body.covariances), body.opacities, body.colors,
                            targets.cameras, self.background, flow=on("flow"))
@@ -158,7 +174,7 @@ class LitMosa(L.LightningModule):
                 terms["flow"] = losses.flow_loss(seen.flow, targets.flow, targets.image_width)
         if on("rotation"):
             terms["rotation"] = losses.rotation_loss(rollout.F_tot, cues.rotation[:frames], cues.weight[:frames],
-                                                     self.start.rotation)
+                                                     take.start.rotation)
         if on("stretch"):
             terms["stretch"] = losses.stretch_loss(rollout.F_tot, cues.stretch[:frames], cues.weight[:frames])
         if on("position"):
@@ -205,8 +221,11 @@ class LitMosa(L.LightningModule):
     @torch.no_grad()
     def measure_misfit(self) -> float:
         """Mean distance of the particles from the reconstruction's, over the object's size, without adapter."""
-        rollout = self.body.simulate(self.start, self.world, len(self.cues.positions), self.frame_dt, with_adapter=False)
-        return float(losses.position_loss(rollout.x, self.cues.positions, self.body.size))
+        misfits = []
+        for take in self.takes:
+            rollout = self.body.simulate(take.start, self.world, len(take.cues.positions), self.frame_dt, with_adapter=False)
+            misfits.append(float(losses.position_loss(rollout.x, take.cues.positions, self.body.size)))
+        return sum(misfits) / len(misfits)
 
     def finish(self, stage: Stage) -> None:
         """Keep the stage's result as a backbone and go on to the next; stop the trainer after the last."""
@@ -238,12 +257,12 @@ class LitMosa(L.LightningModule):
 
     @torch.no_grad()
     def strip(self, view: int = 0) -> Tensor:
-        """(3, 2 h, T w) strip of one view: real above, rendered below, every frame from left to right."""
-        frames = len(self.cues.positions)
-        body = self.body
+        """(3, 2 h, T w) strip of one view of the first sequence: real above, rendered below, every frame from left to right."""
+        take, body = self.takes[0], self.body
+        frames = len(take.cues.positions)
         adapted = body.adapter is not None and body.adapter.is_on  # it is switched on when its stage begins
-        rollout = body.simulate(self.start, self.world, frames, self.frame_dt, with_adapter=adapted)
-        targets = self.observations.select([view], frames)
+        rollout = body.simulate(take.start, self.world, frames, self.frame_dt, with_adapter=adapted)
+        targets = take.observations.select([view], frames)
         seen = observe(rollout.x, deformed_covariances(rollout.F_tot, body.covariances), body.opacities, body.colors,
                        targets.cameras, self.background)
         rows = [torch.cat(list(images[0]), 1) for images in (targets.images, seen.images)]

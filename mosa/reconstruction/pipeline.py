@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +25,9 @@ from mosa.reconstruction.hull import Volume, hull_bounds, hull_centroid, shave_r
 from mosa.reconstruction.modes import deformation_modes
 from mosa.reconstruction.observed import Windows, object_windows
 from mosa.reconstruction.static import FitSettings, fit_splats, inherited_colors, initial_splats
-from mosa.rendering.covariance import covariance_from
+from mosa.rendering.covariance import covariance_from, matrix_to_quaternion, quaternion_multiply
 from mosa.rendering.rasterizer import expected_depth, rasterize
-from mosa.types import Reconstruction, Scene, Splats
+from mosa.types import MotionCues, Reconstruction, Scene, Splats
 
 CACHE_VERSION = 2
 """Raised when a stage computes something else from the same settings."""
@@ -233,6 +234,7 @@ def reconstruct(
     def bar(name: str, total: int) -> tqdm:
         return tqdm(total=total, desc=f"reconstruction: {name}", disable=not progress, leave=False)
 
+    @functools.cache  # more than one stage reads it, also where there is no cache folder
     def static_stage() -> dict[str, Tensor]:
         if settings.splats is not None:
             cache.strip("static", still, _render_still(_on(imported, device), still, background))
@@ -261,12 +263,74 @@ def reconstruct(
         return _motion(scene, _on(splats, device), static, windows, background, settings, seed, bar, cache)
 
     motion = cache.stage("motion", motion_stage)
-    around = neighbourhood(splats.means, neighbours=settings.neighbours)
+    static = Splats(**cache.stage("static", static_stage))
+    return Reconstruction(splats, spacing, volume, cues_of(motion, splats, settings), static)
+
+
+def cues_of(motion: dict[str, Tensor], splats: Splats, settings: ReconstructionSettings) -> MotionCues:
+    """Cues of a reconstructed motion, relative to `splats`, where it starts."""
     if settings.cue == "gaussian":
-        cues = gaussian_cues(motion["positions"], motion["covariances"], splats, motion["scales"], motion["rotations"])
-    else:
-        cues = neighbourhood_cues(motion["positions"], motion["covariances"], around)
-    return Reconstruction(splats, spacing, volume, cues)
+        return gaussian_cues(motion["positions"], motion["covariances"], splats, motion["scales"], motion["rotations"])
+    around = neighbourhood(splats.means, neighbours=settings.neighbours)
+    return neighbourhood_cues(motion["positions"], motion["covariances"], around)
+
+
+def posed(splats: Splats, rotation: Tensor, center: Tensor, rest_center: Tensor) -> Splats:
+    """Splats turned by `rotation` (3, 3) about `rest_center` (3,), which comes to lie at `center` (3,) [m]."""
+    Q = rotation.to(splats.means)
+    means = (splats.means - rest_center.to(splats.means)) @ Q.T + center.to(splats.means)
+    return replace(splats, means=means, rotations=quaternion_multiply(matrix_to_quaternion(Q), splats.rotations))
+
+
+def follow(
+    scene: Scene,
+    first: Scene,
+    reconstruction: Reconstruction,
+    *,
+    rotation: Tensor,
+    center: Tensor,
+    rest_center: Tensor,
+    settings: ReconstructionSettings,
+    cache_dir: str | Path | None,
+    seed: int = 0,
+    device: torch.device | str = "cpu",
+    progress: bool = True,
+) -> Reconstruction:
+    """The motion of a known body in another sequence: the particles that `reconstruction` found in the scene `first`, from the
+    pose (rotation (3, 3) about rest_center, center (3,) [m]) that frame 0 of `scene` shows.
+
+    Same body, other cues: positions are in the world, rotation and stretch relative to that pose, as those of the first
+    sequence are to its frame 0. Cached under the key of both scenes and the pose. Errors: DataError (empty mattes).
+    """
+    views, frames = scene.training_cameras, scene.training_frames
+    _first_frame(scene)
+    pose = (rotation, center, rest_center)
+    key = {
+        "version": CACHE_VERSION,
+        "scene": f"{scene.name}-{scene.sequence}",
+        "data": scene.fingerprint,
+        "body": [first.fingerprint, first.training_cameras, first.training_frames, reconstruction.spacing],
+        "pose": [[round(v, 6) for v in part.flatten().tolist()] for part in pose],
+        "views": views,
+        "frames": frames,
+        "seed": seed,
+        "settings": asdict(settings),
+        "box": scene.box.tolist(),
+    }
+    cache = _Cache(Path(cache_dir) if cache_dir is not None else None, key)
+    windows = object_windows(scene, views, frames, margin=settings.margin).to(device)
+    splats = posed(_on(reconstruction.splats, "cpu"), *(p.cpu() for p in pose))
+    static = splats if reconstruction.static is None else posed(_on(reconstruction.static, "cpu"), *(p.cpu() for p in pose))
+
+    def bar(name: str, total: int) -> tqdm:
+        return tqdm(total=total, desc=f"reconstruction of {scene.sequence}: {name}", disable=not progress, leave=False)
+
+    def motion_stage() -> dict[str, Tensor]:
+        return _motion(scene, _on(splats, device), _on(static, device), windows, scene.background.to(device), settings, seed, bar,
+                       cache)
+
+    motion = cache.stage("motion", motion_stage)
+    return Reconstruction(splats, reconstruction.spacing, reconstruction.volume, cues_of(motion, splats, settings), static)
 
 
 def _volume_tensors(volume: Volume) -> dict[str, Any]:

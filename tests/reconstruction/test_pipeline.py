@@ -13,7 +13,7 @@ import yaml
 
 from mosa.errors import ConfigError
 from mosa.reconstruction import pipeline
-from mosa.reconstruction.pipeline import build_settings, reconstruct, spacing_for
+from mosa.reconstruction.pipeline import build_settings, follow, reconstruct, spacing_for
 
 CONF = Path(__file__).parents[2] / "conf" / "reconstruction"
 SETTINGS = build_settings(
@@ -159,3 +159,32 @@ def test_wrong_spacing_is_an_error(squashed):
         reconstruct(squashed, settings=SETTINGS, spacing=0.0, cache_dir=None)
     with pytest.raises(ConfigError, match="at least 8, found 2"):
         spacing_for(squashed, 2)
+
+
+def turned_scene(scene, Q, shift):
+    """The same footage in a world turned by Q and shifted: another sequence of the body, in another pose."""
+    back = torch.eye(4)
+    back[:3, :3], back[:3, 3] = Q.T, -Q.T @ shift
+    corners = torch.cartesian_prod(*scene.box.T.unbind()) @ Q.T + shift
+    return replace(
+        scene, sequence="turned", truth=None, cameras=replace(scene.cameras, w2c=scene.cameras.w2c @ back),
+        box=torch.stack([corners.amin(0), corners.amax(0)]), fingerprint=scene.fingerprint + "-turned",
+    )  # fmt: skip
+
+
+def test_a_known_body_is_followed_through_another_sequence(squashed, found, tmp_path):
+    """Its cues are those of the first sequence in the turned world: rotations relative to the pose at frame 0."""
+    Q = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.9, 0.3], [0.9, 0.0, -0.5], [-0.3, 0.5, 0.0]]))
+    shift, middle = torch.tensor([0.03, 0.05, -0.02]), found.splats.means.mean(0)
+    other = turned_scene(squashed, Q, shift)
+    pose = {"rotation": Q, "center": Q @ middle + shift, "rest_center": middle}
+    result = follow(other, squashed, found, **pose, settings=SETTINGS, cache_dir=tmp_path, progress=False)
+    true = true_positions(squashed, found.splats.means) @ Q.T + shift
+    error = (result.cues.positions - true).norm(dim=-1)[1:]
+    assert error.square().mean().sqrt() < 0.002
+    assert torch.equal(result.volume, found.volume) and torch.equal(result.splats.colors, found.splats.colors)
+    known = (result.cues.weight > 0) & (found.cues.weight > 0)
+    change = (result.cues.rotation - Q @ found.cues.rotation @ Q.T)[known].flatten(1).norm(dim=1)
+    assert torch.rad2deg(change / 2**0.5).median() < 2.0 and known.float().mean() > 0.9
+    stored = follow(other, squashed, found, **pose, settings=SETTINGS, cache_dir=tmp_path, progress=False)
+    assert torch.equal(stored.cues.positions, result.cues.positions) and len(list(tmp_path.rglob("motion.pt"))) == 1

@@ -1,0 +1,81 @@
+"""Learning from more than one sequence of a body."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+
+from mosa.config import run_config
+from mosa.pipeline import assemble_fit, body_of, plain, reconstruct_scene, scenes, starts
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+def assembled(cache, taught):
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        cfg = compose("train", overrides=["debug=default", f"scene.cache={cache}", f"scene.also_train={taught}"])
+    scene, others = scenes(cfg)
+    reconstruction, dx = reconstruct_scene(cfg, scene, "cpu")
+    config = run_config(plain(cfg), scene, dx)
+    body = body_of(reconstruction, config)
+    others = [s for s in others if s.sequence in taught]
+    found = starts(body, reconstruction, scene, others, taught)
+    more = [(s, found[f"train/{s.sequence}"]) for s in others]
+    return assemble_fit(cfg, scene, reconstruction, body, found["train"], config, "cpu", more)[0]
+
+
+def test_a_step_descends_the_mean_over_the_sequences(cache):
+    module = assembled(cache, ["test_60"])
+    assert len(module.takes) == 2
+    parameters = list(module.body.material.parameters())
+    stage, views = module.stages[0], [0, 1]
+
+    def gradient(take):
+        frames = stage.active_frames(0, min(take.first_contact + 3, len(take.cues.positions)), len(take.cues.positions))
+        terms, _ = module.terms(stage, views, frames, take)
+        loss = sum(module.weights[k] * v for k, v in terms.items())
+        slope = torch.stack(torch.autograd.grad(loss, parameters))
+        return float(loss.detach()), slope
+
+    (first, g1), (second, g2) = (gradient(take) for take in module.takes)
+    still = torch.optim.SGD([{"params": parameters, "rate": 0.0, "name": "material"}], lr=0.0)
+    module.optimizers, module.manual_backward = (lambda: still), (lambda loss: loss.backward())
+    module.log_dict = lambda *_, **__: None
+    module.training_step(views, 0)
+    assert module.losses[0] == pytest.approx((first + second) / 2, rel=1e-6) and first != second
+    found = torch.stack([p.grad for p in parameters])
+    assert (found - (g1 + g2) / 2).abs().max() <= 1e-5 * found.abs().max()
+
+
+def run(cache, folder, script, *overrides):
+    return subprocess.run([sys.executable, script, f"hydra.run.dir={folder}", *overrides], cwd=ROOT, capture_output=True, text=True,
+                          timeout=400)
+
+
+def test_what_is_learned_from_is_not_held_out(cache, tmp_path):
+    result = run(cache, tmp_path / "run", "train.py", "debug=default", f"scene.cache={cache}", "scene.also_train=[test_60]",
+                 "evaluation.video=false")
+    assert result.returncode == 0, result.stderr[-3000:]
+    figures = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert "train/test_60/rms_m" in figures and "test/test_60/rms_m" not in figures
+    assert figures["test/rms_m"] == figures["test/test_40/rms_m"]
+    again = run(cache, tmp_path / "eval", "eval.py", f"ckpt_path={tmp_path}/run/checkpoints/last.ckpt")
+    assert again.returncode == 0, again.stderr[-3000:]
+    second = json.loads((tmp_path / "eval" / "metrics.json").read_text())
+    for key in ("train/test_60/rms_m", "test/test_40/rms_m", "prior/train/rms_m"):
+        assert second[key] == pytest.approx(figures[key], rel=1e-6), key
+
+
+def test_a_sequence_that_is_not_there(cache, tmp_path):
+    result = run(cache, tmp_path, "train.py", "debug=default", f"scene.cache={cache}", "scene.also_train=[test_90]")
+    assert result.returncode == 2 and "scene.also_train" in result.stderr and "test_60, test_40" in result.stderr, result.stderr
+    assert "Traceback" not in result.stderr
