@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import inspect
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Any
 
 import torch
-from hydra.utils import instantiate
+from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
@@ -64,15 +65,34 @@ def build_body(config: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Body
     if cfg["heterogeneity"]["enabled"]:
         keys = {k: v for k, v in cfg["heterogeneity"].items() if k != "enabled"}
         low, high = tensors["rest"].amin(0), tensors["rest"].amax(0)
-        heterogeneity = HeterogeneityField(low=low, high=high, **keys)
-    adapter = instantiate(cfg["adapter"]) if cfg["adapter"].get("_target_") else None
+        heterogeneity = known_keys("heterogeneity", HeterogeneityField, keys | {"low": low, "high": high})
+    adapter = build_adapter(cfg["adapter"])
     return Body(**tensors, density=config["density"], material=material, heterogeneity=heterogeneity, adapter=adapter,
                 settings=settings, law_options=options)
 
 
+def known_keys(where: str, build: Callable, keys: Mapping[str, Any], *positional: Any) -> Any:
+    """build(*positional, **keys). Errors: ConfigError for a key that it does not take."""
+    known = inspect.signature(build).parameters
+    if unknown := [k for k in keys if k not in known]:
+        raise ConfigError(f"{where}.{unknown[0]}: unknown key; expected one of {', '.join(list(known)[len(positional):])}")
+    return build(*positional, **keys)
+
+
+def build_adapter(config: Mapping[str, Any]) -> torch.nn.Module | None:
+    """The adapter that `_target_` names, None where there is none. Errors: ConfigError naming the key."""
+    if not config.get("_target_"):
+        return None
+    try:
+        build = get_class(config["_target_"])
+    except Exception as error:
+        raise ConfigError(f"adapter._target_: expected a class, found {config['_target_']!r} ({error})") from error
+    return known_keys("adapter", build, {k: v for k, v in config.items() if k != "_target_"})
+
+
 def build_stages(fit: Mapping[str, Any], *, heterogeneity: bool, adapter: bool) -> list[Stage]:
     """The stages of a run, without those that have nothing to optimise or no iterations."""
-    stages = [Stage(name, **fit[name]) for name in ("prior", "prior_eta", "joint")]
+    stages = [known_keys(f"fit.{name}", Stage, fit[name], name) for name in ("prior", "prior_eta", "joint")]
     wanted = {"prior": True, "prior_eta": heterogeneity, "joint": adapter or heterogeneity}
     stages = [s for s in stages if wanted[s.name] and s.iterations > 0]
     if not stages or stages[0].name != "prior":

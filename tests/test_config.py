@@ -5,7 +5,12 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
+
+from mosa.config import build_adapter, build_stages
+from mosa.errors import ConfigError
+from mosa.modules.body import SimulationSettings
 
 ROOT = Path(__file__).parents[1]
 
@@ -30,6 +35,37 @@ def test_every_scene_with_every_prior_composes(scene):
 def test_every_option_of_a_group_composes(name):
     for option in group(name):
         assert composed(f"{name}={option}")
+
+
+@pytest.mark.parametrize("override", ["debug=defualt", "scene=rabit", "prior=jelly", "ablation=no_foo", "trainer=tpu"])
+def test_a_mistyped_option_is_refused(override):
+    with pytest.raises(MissingConfigException, match=override.split("=")[1]):
+        composed(override)
+
+
+@pytest.mark.parametrize("adapter, message", [
+    ({"_target_": "mosa.modules.adapter.StressAdapter", "alpha": 2}, "adapter.alpha"),
+    ({"_target_": "mosa.modules.direct.DirectAdapter", "no_C": True}, "no_C"),
+    ({"_target_": "mosa.modules.adapter.StressAdapter", "alfa": 0.1}, "adapter.alfa: unknown key; expected one of alpha"),
+    ({"_target_": "mosa.modules.adapter.Stress"}, "adapter._target_"),
+])  # fmt: skip
+def test_a_mistake_in_the_adapter_names_its_key(adapter, message):
+    with pytest.raises(ConfigError, match=message):
+        build_adapter(adapter)
+
+
+@pytest.mark.parametrize("key, value", [("precision", 16), ("stride", 0), ("max_substeps", 2.5), ("courant", 0), ("dx", -1.0)])
+def test_a_mistake_in_the_simulation_names_its_key(key, value):
+    with pytest.raises(ConfigError, match=f"simulation.{key}"):
+        SimulationSettings(**{"dx": 0.1, key: value})
+
+
+def test_a_mistake_in_a_stage_names_its_key():
+    fit = {name: {"iterations": 2, "lr": 0.1} for name in ("prior", "prior_eta", "joint")}
+    with pytest.raises(ConfigError, match="fit.joint.lrr: unknown key; expected one of iterations, lr,"):
+        build_stages(fit | {"joint": {"iterations": 2, "lrr": 1}}, heterogeneity=True, adapter=True)
+    with pytest.raises(ConfigError, match="fit.joint.start"):
+        build_stages(fit | {"joint": {"iterations": 2, "lr": 1, "start": "foo"}}, heterogeneity=True, adapter=True)
 
 
 def flat(config, prefix="") -> dict:

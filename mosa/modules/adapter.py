@@ -1,4 +1,4 @@
-"""Progressive stress adaptation (method.md, section 4): bounded networks that correct a prior stress in the material frame."""
+"""Progressive stress adaptation, the paper's central module: bounded networks correct a prior stress in the material frame."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class StressAdapter(Adapter):
     major_symmetry: a projection after which a constant operator has an energy; state_dependence: full | constant;
     recompute: evaluate the networks again in the backward pass instead of storing 4 kB per particle and evaluation;
     fused: auto | true | false: Triton kernels on CUDA, which always recompute; auto: where they can take these options;
-    precision: of their products, accurate (as float32) | tf32 (relative errors to 5e-3, of gradients to 2e-2; faster);
+    precision: of their products, accurate (as float32) | tf32 (relative errors to 2e-3, of gradients to 1e-2; faster);
     no_C, no_pre, no_post, no_prior_stress: ablations. Errors: ConfigError naming the key for values out of range.
     """
 

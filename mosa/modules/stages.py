@@ -1,4 +1,4 @@
-"""The staged schedule of method.md, section 9: what is optimised when, and when a stage ends."""
+"""The staged schedule: what is optimised when, and when a stage ends."""
 
 from __future__ import annotations
 
@@ -33,6 +33,8 @@ class Stage:
             raise ConfigError(f"fit: expected a stage among {', '.join(STAGES)}, found {self.name!r}")
         if self.iterations < 0:
             raise ConfigError(f"fit.{self.name}.iterations: expected a number >= 0, found {self.iterations}")
+        if self.start not in (None, "prior", "prior_eta"):
+            raise ConfigError(f"fit.{self.name}.start: expected prior or prior_eta, found {self.start!r}")
 
     def decay(self, iteration: int) -> float:
         """Factor of the learning rates: constant for the first half, then a cosine down to a tenth."""
