@@ -62,9 +62,9 @@ def test_a_mistake_in_the_simulation_names_its_key(key, value):
 
 def test_a_mistake_in_a_stage_names_its_key():
     fit = {name: {"iterations": 2, "lr": 0.1} for name in ("prior", "prior_eta", "joint")}
-    with pytest.raises(ConfigError, match="fit.joint.lrr: unknown key; expected one of iterations, lr,"):
+    with pytest.raises(ConfigError, match=r"fit\.joint\.lrr: unknown key; expected one of iterations, lr,"):
         build_stages(fit | {"joint": {"iterations": 2, "lrr": 1}}, heterogeneity=True, adapter=True)
-    with pytest.raises(ConfigError, match="fit.joint.start"):
+    with pytest.raises(ConfigError, match=r"fit\.joint\.start"):
         build_stages(fit | {"joint": {"iterations": 2, "lr": 1, "start": "foo"}}, heterogeneity=True, adapter=True)
 
 
