@@ -5,7 +5,7 @@
 
 A line of the table is a shape, a condition, a fit and a form. Fits: `carried`, the default (Gaussians follow the
 deformation); `free`, the same with Gaussians of free scale and rotation, as the paper's cue needs; `network`, the paper's
-motion-basis network (600 iterations instead of its 30,000). Forms: `neighbourhood`, `gaussian` (method.md, section 7).
+motion-basis network (600 iterations instead of its 30,000). Forms: `neighbourhood`, `gaussian` (docs/cues.md).
 Three forms frame them: `motionless` says nothing, `constant` gives every particle the rabbit's mean stretches, `true motion`
 is the neighbourhood form of the true positions.
 
@@ -115,7 +115,7 @@ def measure(shape: str, condition: str, fit: str, out: Path, particles: int, see
     scene, result, neighbours = reconstructed(shape, condition, fit, out, particles, seed)
     seconds = time.perf_counter() - started
     true = true_motion(scene.truth, result.splats.means)
-    # frames whose time is after first contact, as for rms_m (evaluation.md)
+    # frames whose time is after first contact, as for rms_m (docs/figures.md)
     first = int((scene.times <= drop_named(shape, "train").contact).sum())
     around = neighbourhood(result.splats.means, neighbours=neighbours)
     positions, covariances = result.cues.positions, result.cues.covariances

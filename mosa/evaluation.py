@@ -1,4 +1,4 @@
-"""Figures of a fitted body: every model variant on every sequence, as evaluation.md defines them."""
+"""Figures of a fitted body: every model variant on every sequence, as docs/figures.md defines them."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def motion_metrics(x: Tensor, body: Body, sequence: Sequence, frames: list[int],
 @torch.no_grad()
 def evaluate(body: Body, sequences: list[Sequence], world: World, *, samples: int = 8192, assignment: int = 2048,
              variants=VARIANTS) -> tuple[dict[str, float], dict[str, dict[str, Rollout]]]:
-    """All figures, flat, named as in evaluation.md, and the rollouts: result[sequence prefix][variant]."""
+    """All figures, flat, named as in docs/figures.md, and the rollouts: result[sequence prefix][variant]."""
     figures: dict[str, float] = {}
     kept: dict[str, dict[str, Rollout]] = {}
     bar = tqdm(total=len(sequences) * len(variants), desc="evaluate", unit="rollout", dynamic_ncols=True)

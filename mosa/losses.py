@@ -1,4 +1,4 @@
-"""The loss terms of method.md, section 8, each a pure function; weights and switches live in the configuration."""
+"""The loss terms of the paper (eq. 11 to 15) and one more, each a pure function; weights and switches live in the configuration."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def shared_where_equal(seed: Tensor, values: Tensor, tolerance: float) -> Tensor
 
 
 def stretches(F: Tensor) -> Tensor:
-    """Descending singular values (..., 3) of F (..., 3, 3), the smallest with the sign of det F (method.md, section 1).
+    """Descending singular values (..., 3) of F (..., 3, 3), the smallest with the sign of det F.
 
     Where values coincide the gradient is that of their sum, shared among them.
     """

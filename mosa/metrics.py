@@ -1,4 +1,4 @@
-"""Figures of evaluation.md: distances between motions and shapes [m], image similarity, and the floors to read them against."""
+"""Figures of docs/figures.md: distances between motions and shapes [m], image similarity, and the floors to read them against."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Loss terms of method.md, section 8: values by hand, gradients against central differences, what happens at rest."""
+"""Loss terms: values by hand, gradients against central differences, what happens at rest."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Figures of evaluation.md: each definition by hand or against an independent computation, and the floors."""
+"""Figures of docs/figures.md: each definition by hand or against an independent computation, and the floors."""
 
 import itertools
 import math
@@ -119,7 +119,7 @@ def test_resampling_fills_the_shape_evenly():
 
 
 def test_floors_are_those_of_two_random_samplings():
-    """evaluation.md: 1.5e-4 m^2 for 3,000 points in a 0.2 m cube."""
+    """docs/figures.md: 1.5e-4 m^2 for 3,000 points in a 0.2 m cube."""
     lattice = 0.01 * (torch.cartesian_prod(*[torch.arange(20.0, dtype=torch.float64)] * 3) + 0.5)
     floors = metrics.sampling_floors(lattice, 3000, 3000, assignment=400)
     a, b = 0.2 * drawn(3000, 3, seed=1), 0.2 * drawn(3000, 3, seed=2)

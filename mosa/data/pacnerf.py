@@ -1,4 +1,4 @@
-"""PAC-NeRF's layout: all_data.json with one object per image, data/{a,m,r}_<camera>_<frame>.png (data_formats.md)."""
+"""PAC-NeRF's layout: all_data.json with one object per image, data/{a,m,r}_<camera>_<frame>.png (docs/data.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From the keys of conf/scene to a validated Scene, whatever the format (data_formats.md, keys of a scene)."""
+"""From the keys of conf/scene to a validated Scene, whatever the format (docs/data.md)."""
 
 from __future__ import annotations
 

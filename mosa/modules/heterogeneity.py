@@ -1,4 +1,4 @@
-"""Spatial variation of the stiffness: P(X) = P_global (1 + amplitude tanh eta(X)) (method.md, section 5)."""
+"""Spatial variation of the stiffness: P(X) = P_global (1 + amplitude tanh eta(X)) (paper, section 3.1)."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ class Take:
 class LitMosa(L.LightningModule):
     """Fits a body to one or more sequences in stages: the loss is the mean over them.
 
-    weights: per loss term (method.md, section 8); config: plain containers from which `eval.py` rebuilds the run.
+    weights: per loss term (`TERMS`; mosa/losses.py); config: plain containers from which `eval.py` rebuilds the run.
     """
 
     def __init__(

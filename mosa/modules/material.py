@@ -1,4 +1,4 @@
-"""Global parameters of a prior law in unconstrained form (method.md, section 5)."""
+"""Global parameters of a prior law in unconstrained form: `FORMS` says each one's range."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """The redistribution operator: four LU-parametrised 3x3 corrections assembled into one 6x6 operator on Voigt stress.
 
-Steps 2 to 4 of method.md, section 4; the paper's appendix on microplanes. vech order: xx, yy, zz, yz, zx, xy.
+Paper, eq. 5 to 7 and its appendix on the microplane parametrisation; steps 2 to 4 of `progressive`.
+vech order: xx, yy, zz, yz, zx, xy.
 """
 
 from __future__ import annotations

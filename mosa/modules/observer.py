@@ -39,7 +39,7 @@ def observe(
 ) -> Views:
     """Render T states from V cameras. means: (T, N, 3); covariances: (T, N, 3, 3); opacities: (N,); colors: (N, 3).
 
-    With `flow`, six more channels carry the Gaussian flow from each frame to the next (rendering.md); the last frame has none.
+    With `flow`, six more channels carry the Gaussian flow from each frame to the next (`rendering.flow`); the last frame has none.
     """
     frames, views = means.shape[0], len(cameras)
     batch = repeat_cameras(cameras, frames)
@@ -60,5 +60,5 @@ def observe(
 
 
 def deformed_covariances(F_tot: Tensor, covariances: Tensor) -> Tensor:
-    """A_t = F_tot A_0 F_tot^T (method.md, section 7): (T, N, 3, 3) from (T, N, 3, 3) and (N, 3, 3)."""
+    """A_t = F_tot A_0 F_tot^T (paper, eq. 10): (T, N, 3, 3) from (T, N, 3, 3) and (N, 3, 3)."""
     return F_tot @ covariances @ F_tot.transpose(-1, -2)

@@ -1,4 +1,8 @@
-"""Steps 1 to 5 of the progressive stress adaptation (method.md, section 4): the four networks on one symmetric tensor."""
+"""Steps 1 to 5 of the progressive stress adaptation (paper, section 3.1): the four networks on one symmetric tensor.
+
+1: L_pre (eq. 4). 2: C_x, C_y, C_z (eq. 7). 3: what they make of the stress on each plane, shears averaged (eq. 5).
+4: C_xyz on the normal components (eq. 7). 5: L_post (eq. 8).
+"""
 
 from __future__ import annotations
 

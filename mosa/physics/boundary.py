@@ -1,4 +1,4 @@
-"""Planes that a body meets, acting on the velocities of grid nodes, and their adjoint (method.md, section 6).
+"""Planes that a body meets, acting on the velocities of grid nodes, and their adjoint.
 
 A node at or below a plane (tolerance 1e-6 m) gets: `sticky` zero velocity; `slip` no normal part; `separate` no inward normal
 part, and the tangential part shrinks by Coulomb friction, |u_t| <- max(0, |u_t| - friction |u_n|).

@@ -1,4 +1,4 @@
-"""Hyperelastic laws: Kirchhoff stress tau(F) [Pa] (method.md, section 2); their energies are in `energies`.
+"""Hyperelastic laws: Kirchhoff stress tau(F) [Pa] (the paper's appendix on constitutive models); their energies are in `energies`.
 
 Every law is a Warp function of F built on `kinematics`, so that its adjoint is exact; R is the polar rotation where it is used.
 tau = (dPsi/dF) F^T and tau(I) = 0. Parameters: mu, lam, the Lamé parameters [Pa].

@@ -1,4 +1,4 @@
-"""Energies per rest volume [J/m^3] of the laws that have one: tau = (dPsi/dF) F^T (method.md, section 2).
+"""Energies per rest volume [J/m^3] of the laws that have one: tau = (dPsi/dF) F^T (the paper's appendix on constitutive models).
 
 Torch functions of F (..., 3, 3) with parameters broadcastable to (...), so one number per particle; meant for float64, in tests
 and in reports of how much a body stores. Where a law yields it is the energy stored by its elastic F. Parameters of the law that

@@ -1,6 +1,6 @@
 """Gradients of F that keep its determinant: the return of laws in b_bar = J^(-2/3) F F^T, with its exact differential.
 
-Companion of `kinematics`, same conventions: factors come in without gradient, closed differentials go out (method.md, section 3).
+Companion of `kinematics`, same conventions: factors come in without gradient, closed differentials go out.
 """
 
 # ruff: noqa: UP018, RUF046

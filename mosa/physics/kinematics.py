@@ -2,7 +2,7 @@
 
 A generic SVD must not be differentiated: it divides by S_i^2 - S_j^2 and blows up at rest, where all singular values are 1.
 Each primitive here therefore comes in two parts: a *factorisation* without gradient (`svd`, `rotation_of`), and functions
-that take the factors along with F and return the value with its closed differential with respect to F (method.md, section 3).
+that take the factors along with F and return the value with its closed differential with respect to F.
 The factors are so computed once per particle and kernel, in the backward pass too.
 
 Everything is float64, whatever the precision of the fields: float32 factorisations are off by up to 8e-3.

@@ -225,7 +225,7 @@ class _MaterialState(torch.autograd.Function):
 
 
 def material_state(law: Law, F: Tensor, C_affine: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-    """(w, s, e) that an adapter reads (method.md, section 4), differentiable.
+    """(w, s, e) that an adapter reads, differentiable.
 
     w: (N, 6) vech(W - I); s: (N, 6) vech(R^T tau R) [Pa] of the prior; e: (N, 6) vech(dev log W), None for elastic laws.
     """

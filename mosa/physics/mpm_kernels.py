@@ -1,4 +1,4 @@
-"""Transfers between particles and grid, with hand-written adjoints (method.md, section 6): MLS-MPM, APIC, quadratic B-splines.
+"""Transfers between particles and grid, with hand-written adjoints: MLS-MPM, APIC, quadratic B-splines.
 
 A node (i, j, k) sits at dx (i, j, k). The grid is a window of `dims` nodes from `origin`, flat, z fastest; it holds
 (momentum, mass) as one 4-vector, and the node velocity after gravity and contact.

@@ -1,4 +1,4 @@
-"""Return mappings: what leaves of a trial F once a law has yielded (method.md, sections 2 and 4).
+"""Return mappings: what leaves of a trial F once a law has yielded (the paper's appendix on constitutive models; eq. 9).
 
 A mapping gets the trial F = (I + dt C_affine) F_before with its factors, F_before and C_affine themselves (for flows that follow a
 rate), the material Hencky strain H = log W, and n2 = |E'|^2, the squared norm that enters the yield function: E' = dev(H) for a

@@ -184,7 +184,7 @@ def collide(v: Tensor, y: Tensor, planes: Sequence[Plane]) -> Tensor:
 def substep(law: str, state: ParticleState, p: dict[str, Tensor], volume: Tensor, density: float, *, dx: float, dt: float,
             gravity: Sequence[float], planes: Sequence[Plane] = (), operator=None, plastic_operator=None, norm_eps: float = 0.0,
             cutoff: float = 0.0) -> ParticleState:  # fmt: skip
-    """One substep of `rollout`'s algorithm (method.md, section 6)."""
+    """One substep of `rollout`'s algorithm."""
     x, v, C, F = state.x, state.v, state.C_affine, state.F
     tau = adapted_stress(law, F, p, operator, C)
     mass = density * volume

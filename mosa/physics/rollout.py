@@ -3,7 +3,7 @@
 State convention: after n substeps a state holds (x^n, v^n, C_affine^n, F^{n+1}, F_tot^{n+1}); F is advanced right after its
 C_affine is known, so that F belongs to x and is known when a substep starts. One substep is then stress(F) -> P2G -> grid ->
 G2P -> x += dt v -> F <- map((I + dt C_affine) F), and a rollout starts with one advance of F by the initial C_affine. This is
-the order of method.md, section 6, cut at another place.
+the usual order, F first in a substep, cut at another place (docs/decisions.md, "Order of a substep").
 """
 
 import math

@@ -1,4 +1,4 @@
-"""How many substeps a frame needs: the bound of method.md, section 6, and that of explicit viscosity."""
+"""How many substeps a frame needs: the bound of elastic waves and particle speed, and that of explicit viscosity."""
 
 import math
 

@@ -1,4 +1,6 @@
-"""Laws that flow at a rate: Herschel-Bulkley (exponent 1) in two variants and the Newtonian fluid (method.md, section 2).
+"""Laws that flow at a rate: Herschel-Bulkley (exponent 1) in two variants and the Newtonian fluid.
+
+The first variant is that of the paper's appendix on constitutive models, the second and the fluid are those of public simulators.
 
 Parameters: kappa bulk modulus [Pa]; mu shear modulus [Pa], for the fluid a viscosity [Pa s]; yield_stress [Pa]; viscosity [Pa s].
 Return mappings have the signature of `plasticity`.

@@ -1,6 +1,6 @@
 """Motion cues: deformation of each particle's rest neighbourhood by weighted least squares, and rotation and stretch from it.
 
-Source: method.md, section 7. With isotropic Gaussians their rotation is not identifiable from images (only F F^T is),
+Source: paper, eq. 13 and 14. With isotropic Gaussians their rotation is not identifiable from images (only F F^T is),
 so beside the paper's cue (`gaussian`) there is `neighbourhood`, which fits F to the reconstructed displacements of the
 nearest rest neighbours.
 """
@@ -82,7 +82,7 @@ def neighbourhood(rest: Tensor, *, neighbours: int = 20, condition_limit: float 
 def polar(deformation: Tensor) -> tuple[Tensor, Tensor]:
     """Rotation (..., 3, 3) with det +1 and descending singular values (..., 3) of deformation gradients, not differentiable.
 
-    The smallest singular value carries the sign of the determinant (method.md, section 1). Computed in float64.
+    The smallest singular value carries the sign of the determinant. Computed in float64.
     """
     U, S, Vh = torch.linalg.svd(deformation.detach().double())
     sign = torch.ones_like(S)

@@ -1,7 +1,7 @@
 """Dynamic stage: the motion of the filled scaffold through all frames, fitted to the images by rendering.
 
-Source: method.md, section 7. First every frame is tracked from the one before it, starting from the displacement of the
-visual hulls' centres; then all frames are refined together. The interior, which no camera sees, follows the surface
+Second stage of the paper's section 3.2. First every frame is tracked from the one before it, starting from the displacement of
+the visual hulls' centres; then all frames are refined together. The interior, which no camera sees, follows the surface
 through the smooth modes, their bending energy and a weak elastic energy.
 """
 

@@ -98,7 +98,7 @@ def _mlp(inputs: int, hidden: int, layers: int, outputs: int) -> nn.Sequential:
 
 
 class MotionBasisNetwork(nn.Module):
-    """Deformation = mean over `bases` of coefficient_b(x, t) basis_b(t), after GIC (rendering.md, "Dynamic stage").
+    """Deformation = mean over `bases` of coefficient_b(x, t) basis_b(t), after GIC (paper, eq. 2).
 
     basis_b: time to 10 numbers (translation 3 in units of `reach` [m], quaternion 4, log scale 3); coefficient_b: position
     and time to a number. The value at t = 0 is subtracted, so that frame 0 is the rest frame. Scale and rotation are free.

@@ -37,7 +37,7 @@ CACHE_VERSION = 2
 class ReconstructionSettings:
     """resolution: voxels along the object's longest side in the hull; ridge_passes: hull.shave_ridges; carve: empty what
     lies in front of the static Gaussians' depth by more than carve_tolerance [spacings]; points: static Gaussians;
-    neighbours: of the least-squares deformation; cue: neighbourhood | gaussian (method.md, section 7); margin: px of the
+    neighbours: of the least-squares deformation; cue: neighbourhood | gaussian (docs/cues.md); margin: px of the
     windows around mattes; splats: 3DGS PLY file of the object at frame 0, in the scene's world, that replaces the static
     stage (None: fit it)."""
 

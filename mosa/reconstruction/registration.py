@@ -3,7 +3,7 @@ compare.
 
 The body is a set of splats that moves rigidly: x = Q (X - X_c) + x_c. Colour and matte of its rendering are
 compared with the images by robust least squares over poses (Levenberg-Marquardt), from many rotations at first,
-coarse to fine; geometry alone would not fix a ball (method.md, section 10).
+coarse to fine; geometry alone would not fix a ball.
 """
 
 from __future__ import annotations

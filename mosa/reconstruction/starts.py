@@ -1,6 +1,6 @@
 """Where a sequence starts: pose of frame 0 and velocity of the frames before first contact, from images alone.
 
-Stage 1 of method.md, section 9, and the held-out starts of section 10.
+The training sequence starts in the rest pose, every other in the pose that its first frame shows. The fit does not move them.
 """
 
 from __future__ import annotations

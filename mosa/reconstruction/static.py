@@ -1,4 +1,4 @@
-"""Static stage: isotropic Gaussians fitted to one frame by rendering, from the visual hull's surface (rendering.md)."""
+"""Static stage: isotropic Gaussians fitted to one frame by rendering, from the visual hull's surface (paper, section 3.2)."""
 
 from __future__ import annotations
 

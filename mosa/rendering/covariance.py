@@ -13,7 +13,7 @@ from mosa.rendering.projection_kernels import LOW_PASS
 from mosa.types import Cameras
 
 CLAMP_MARGIN = 0.3
-"""J is evaluated within the image plus this many half fields of view on each side (rendering.md, Jacobian clamp)."""
+"""J is evaluated within the image plus this many half fields of view on each side, as in gsplat."""
 
 NEAR = 0.01
 """Nearest depth [m] that is projected; what lies nearer is culled by the rasteriser."""
@@ -54,7 +54,7 @@ def covariance_from(scales: Tensor, rotations: Tensor) -> Tensor:
 def project_gaussians(means: Tensor, covariances: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
     """Centres (B, N, 2) [px] and low-passed covariances (B, N, 3) [px^2] as (xx, xy, yy), one camera per batch entry.
 
-    means: (B, N, 3) [m]; covariances: (B, N, 3, 3) [m^2]. The same map as the rasteriser's (rendering.md): J from
+    means: (B, N, 3) [m]; covariances: (B, N, 3, 3) [m^2]. The same map as the rasteriser's (`projection_kernels`): J from
     the clamped, the centre from the unclamped direction. Gaussians nearer than 0.01 m, which are never drawn, are
     treated as if at 0.01 m so that everything stays finite.
     """

@@ -1,7 +1,7 @@
 """Gaussian flow: how the image of moving, deforming Gaussians moves from one frame to the next, as a map in pixels.
 
 flow(u) = sum_i w_i [B_i2 B_i1^-1 (u - m_i1) + m_i2 - u] with w_i = alpha_i T_i of the first frame and B the
-principal square root of the projected covariance (GaussianFlow, Gao et al. 2024, eq. 6-8; rendering.md). It is
+principal square root of the projected covariance (GaussianFlow, Gao et al. 2024, eq. 6-8). It is
 linear in u, so six feature channels composited like colours give it exactly, over all contributors.
 """
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from mosa.types import Cameras
 
 NEAR, LOW_PASS = 0.01, 0.3
-"""Near plane [m] and low-pass [px^2] of the preset gsplat (rendering.md)."""
+"""Near plane [m] and low-pass [px^2] of the preset gsplat (`splatting.PRESETS`)."""
 
 
 @functools.cache

@@ -1,7 +1,7 @@
 """Warp kernels that project 3D Gaussians into images and carry gradients back, one thread per Gaussian (and image).
 
 Local affine approximation of the perspective map (EWA splatting, Zwicker et al. 2001; 3D Gaussian Splatting, Kerbl
-et al. 2023): Sigma_2D = J R Sigma R^T J^T + 0.3 I. The conventions are those of rendering.md; the adjoint is
+et al. 2023): Sigma_2D = J R Sigma R^T J^T + 0.3 I. The conventions are those of `rasterizer`; the adjoint is
 written by hand.
 """
 

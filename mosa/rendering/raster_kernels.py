@@ -4,7 +4,7 @@ they reach.
 Per image the Gaussians are visited front to back, and inside each one the pixels of its ellipse row by row; the
 state of a pixel (transmittance, colour so far) lives in the image. Work is proportional to the (pixel, Gaussian)
 pairs that count, there are no lists to build, and in the backward pass every Gaussian's gradient is a local sum.
-tile_kernels.py has the same sums pixel by pixel, for CUDA. Both meet the conventions of rendering.md.
+tile_kernels.py has the same sums pixel by pixel, for CUDA. Both meet the conventions of `rasterizer`.
 """
 
 import functools

@@ -1,7 +1,12 @@
 """Differentiable rasterisation of 3D Gaussians: one call for both backends, and depth.
 
 `warp` (mosa/rendering/splatting.py) runs everywhere in float32 and float64; `gsplat` (gsplat_backend.py) is a
-CUDA package that one may choose instead. Conventions of rendering.md (gsplat's by default, INRIA's by `preset`).
+CUDA package that one may choose instead.
+
+Conventions, gsplat's: pixel centres at j + 0.5; J at slopes clamped to the image and 0.3 half fields of view around
+it; 0.3 px^2 added to projected covariances; front to back by depth; alpha = min(cap, o exp(-q/2)), skipped below
+1/255; a Gaussian that would bring the transmittance to 1e-4 or below ends the pixel and is not added. Near plane,
+extent and cap are those of `preset` (`splatting.PRESETS`).
 """
 
 from __future__ import annotations
@@ -83,7 +88,7 @@ def rasterize(
     means: (S, N, 3) [m]; covariances: (S, N, 3, 3) [m^2], only the symmetric part counts (`covariance_from` makes
     them of scales and rotations); opacities: (N,) or (S, N) in [0, 1]; features: (B, N, C) or (1, N, C) shared by
     all images (`view_colors` makes colours of spherical harmonics); cameras: B of them; state_index: (B,) state
-    that image b shows; background: (C,) or None for zeros; preset: gsplat | inria (rendering.md); scan: gaussian
+    that image b shows; background: (C,) or None for zeros; preset: gsplat | inria (`PRESETS`); scan: gaussian
     (default on CPU) | tile (default on CUDA, and what a CPU test compares with); backend: warp | gsplat, None for
     that of `use_backend`. The dtype of the inputs, float32 or float64, is that of the computation.
 

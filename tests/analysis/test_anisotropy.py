@@ -1,4 +1,4 @@
-"""Directional figures of a law (evaluation.md, last item) against closed forms of linear elasticity."""
+"""Directional figures of a law (mosa/analysis/anisotropy.py) against closed forms of linear elasticity."""
 
 import math
 

@@ -31,7 +31,7 @@ OPTIONS = {
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_at_initialisation_it_is_the_prior_bit_for_bit(options, dtype):
-    """Check 8 of verification.md: G and h are exactly 0, and so is the increment, far from rest too."""
+    """Check 8 of docs/verification.md: G and h are exactly 0, and so is the increment, far from rest too."""
     torch.manual_seed(3)
     adapter = StressAdapter(**options)
     adapter.switch_on(E_REF)
@@ -53,7 +53,7 @@ def test_without_any_part_it_is_the_prior_whatever_the_weights():
 
 @pytest.mark.parametrize("options", [*OPTIONS.values(), {"no_prior_stress": True}], ids=[*OPTIONS.keys(), "no prior stress"])
 def test_the_operator_is_the_steps_of_the_paper(options):
-    """Check 10 of verification.md: d = (A - I) s + b, and what the simulator gets, in Pa."""
+    """Check 10 of docs/verification.md: d = (A - I) s + b, and what the simulator gets, in Pa."""
     adapter = drawn_adapter(**options)
     w, s = drawn_states(40)
     A, b = adapter.redistribution(w, s)
@@ -131,7 +131,7 @@ def test_gradients_against_differences(at_rest, options):
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10**6), st.floats(-6, 6), st.floats(-3, 3), st.sampled_from([torch.float32, torch.float64]))
 def test_bounds_hold_for_any_input_and_any_weights(seed, input_power, weight_power, dtype):
-    """Check 9 of verification.md: inputs to 1e6, weights to 1e3."""
+    """Check 9 of docs/verification.md: inputs to 1e6, weights to 1e3."""
     alpha, l_max = 0.1, 0.1
     adapter = drawn_adapter(seed, size=10.0**weight_power, dtype=dtype, alpha=alpha, l_max=l_max)
     w, s = drawn_states(8, seed, size=10.0**input_power / 4, dtype=dtype)

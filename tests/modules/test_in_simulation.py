@@ -43,7 +43,7 @@ def roll(adapter, dtype: torch.dtype, frames: int, ground: bool = True, stride: 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_an_untrained_adapter_moves_the_body_as_the_prior_does_bit_for_bit(dtype):
-    """Check 8 of verification.md, where it matters: in the motion, through contact."""
+    """Check 8 of docs/verification.md, where it matters: in the motion, through contact."""
     adapter = StressAdapter()
     adapter.switch_on(E, NU)
     with torch.no_grad():
@@ -55,7 +55,7 @@ def test_an_untrained_adapter_moves_the_body_as_the_prior_does_bit_for_bit(dtype
 
 
 def test_gradient_in_the_weights_over_200_substeps_is_that_of_differences():
-    """Check 18 of verification.md, free flight of a vibrating body: one direction through all weights."""
+    """Check 18 of docs/verification.md, free flight of a vibrating body: one direction through all weights."""
     adapter = StressAdapter(hidden=8).double()
     randomise(adapter, 0.3)
     adapter.switch_on(E, NU)

@@ -16,7 +16,7 @@ def drawn(*shape: int, seed: int = 0, size: float = 0.1) -> torch.Tensor:
 
 
 def by_hand(s: np.ndarray, planes: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """method.md section 4, step 3 and 4, one component after the other; planes, normal: I + C."""
+    """The paper's eq. 5 and 7, one component after the other; planes, normal: I + C."""
     xx, yy, zz, yz, zx, xy = s
     t_x, t_y, t_z = planes[0] @ [xx, xy, zx], planes[1] @ [yy, yz, xy], planes[2] @ [zz, zx, yz]
     n = normal @ [t_x[0], t_y[0], t_z[0]]
@@ -63,7 +63,7 @@ def test_shears_do_not_feel_the_normal_matrix():
     st.sampled_from([torch.float32, torch.float64]),
 )
 def test_factors_are_bounded_and_invertible_for_any_output_of_a_network(raw, alpha, dtype):
-    """Check 9 of verification.md."""
+    """Check 9 of docs/verification.md."""
     numbers = alpha * torch.tanh(torch.tensor(raw, dtype=dtype))
     L, U = microplane.lu_factors(numbers)
     slack = 4 * torch.finfo(dtype).eps

@@ -1,4 +1,4 @@
-"""The corrected law in the world: symmetric and frame indifferent for all weights (checks 4 and 5 of verification.md)."""
+"""The corrected law in the world: symmetric and frame indifferent for all weights (checks 4 and 5 of docs/verification.md)."""
 
 import pytest
 import torch
@@ -28,7 +28,7 @@ def deformations(count: int, seed: int) -> torch.Tensor:
 
 
 def corrected_stress(adapter, law: str, F: torch.Tensor, frame: str = "material") -> torch.Tensor:
-    """tau_hat (N, 3, 3) [Pa] of method.md section 4; frame `world` leaves the rotation out (the negative control)."""
+    """tau_hat (N, 3, 3) [Pa] of the paper's eq. 3; frame `world` leaves the rotation out (the negative control)."""
     p = {"mu": torch.tensor(MU).double(), "lam": torch.tensor(LAM).double()}
     R = reference.polar(F) if frame == "material" else torch.eye(3).double().expand_as(F)
     W = reference.polar(F).mT @ F

@@ -279,7 +279,7 @@ def test_gradient_of_a_rollout(name, make_block, monkeypatch):
 
             h = steps.get(key, 1e-6)
             estimates = [(8 * (shifted(s) - shifted(-s)) - (shifted(2 * s) - shifted(-2 * s))) / (12 * s) for s in (h, 2 * h)]
-            # a contact that opens or a node that changes sides between the steps is no derivative (verification.md, check 18)
+            # a contact that opens or a node that changes sides between the steps is no derivative (docs/verification.md, check 18)
             apart = abs(estimates[0] - estimates[1]) / abs(estimates[0])
             if apart < 1e-6:
                 break

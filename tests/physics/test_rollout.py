@@ -96,7 +96,7 @@ def test_gradient_against_differences(law, substeps, tolerance, make_block):
             h = 0.01 * h
         estimates = [(8 * (shifted(s) - shifted(-s)) - (shifted(2 * s) - shifted(-2 * s))) / (12 * s) for s in (h, 0.1 * h)]
         value = (found[name] * direction).sum()
-        # for laws with switches verification.md allows ten times the relative difference of two steps
+        # for laws with switches docs/verification.md allows ten times the relative difference of two steps
         relative = float((estimates[0] - estimates[1]).abs() / estimates[1].abs())
         allowed = max(tolerance, 10 * relative if tolerance > 1e-6 else 0.0)
         assert allowed < 1e-2, (name, relative)

@@ -65,7 +65,7 @@ def energy_error(law: str) -> float:
 
 
 def moduli(law: str) -> tuple[float, float]:
-    """(C11, C44) [Pa] of method.md, section 2: lam + 2 mu and mu; a fluid's are those of its pressure, 7 kappa and 0."""
+    """(C11, C44) [Pa] of the law at small strain: lam + 2 mu and mu; a fluid's are those of its pressure, 7 kappa and 0."""
     values = parameters_of(law)
     if is_fluid(law):
         return 7 * values["kappa"], 0.0

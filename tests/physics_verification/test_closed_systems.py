@@ -1,4 +1,4 @@
-"""Checks 1 to 3 and 26 of verification.md: what a closed system keeps, with the full adapter on."""
+"""Checks 1 to 3 and 26 of docs/verification.md: what a closed system keeps, with the full adapter on."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""Checks 12 and 14 to 16 of verification.md: motions with a closed solution. Free fall (13) is here too, for every law."""
+"""Checks 12 and 14 to 16 of docs/verification.md: motions with a closed solution. Free fall (13) is here too, for every law."""
 
 import itertools
 import math

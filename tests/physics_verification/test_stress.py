@@ -1,4 +1,4 @@
-"""Checks 4 to 7 of verification.md for every registered law: symmetry, frame indifference, energy, small strain.
+"""Checks 4 to 7 of docs/verification.md for every registered law: symmetry, frame indifference, energy, small strain.
 
 Beside the units: the adapter's stages alone in tests/modules/test_objectivity.py, gradients in tests/physics/test_elasticity.py.
 """

@@ -115,7 +115,7 @@ def test_neighbourhood_form_against_truth(squashed, seen):
 
 
 def test_own_rotations_of_isotropic_gaussians_say_nothing(squashed, seen):
-    """A_t = V^2 s_0^2 has no trace of R (method.md, section 7): the paper's rotation cue is no better than silence."""
+    """A_t = V^2 s_0^2 has no trace of R (docs/cues.md): the paper's rotation cue is no better than silence."""
     errors, true = seen
     silent = cue_errors(motionless(true), true, squashed.times)
     assert errors["gaussian"]["rotation_deg_median"] > 0.7 * silent["rotation_deg_median"]

@@ -1,4 +1,4 @@
-"""Triton kernels of the assembly (method.md, section 4, steps 3 and 4), one lane per particle, with hand-written adjoints.
+"""Triton kernels of the assembly (paper, eq. 5 to 7; `microplane`), one lane per particle, with hand-written adjoints.
 
 Plane p has the components (p, c1, c2) of vech: (xx, xy, zx), (yy, yz, xy), (zz, zx, yz). Each shear is the second component of one
 plane and the third of the next, and their mean; so with planes in cyclic order all three are treated alike.

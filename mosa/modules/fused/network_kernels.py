@@ -1,4 +1,4 @@
-"""Triton kernels of the four networks of `ProgressiveOperator`, forward (method.md, section 4, steps 1, 2, 4 and 5).
+"""Triton kernels of the four networks of `ProgressiveOperator`, forward (paper, eq. 4, 7 and 8).
 
 A program takes BLOCK rows through one network; nothing hidden leaves it. There are M = N + 1 rows: row N is the state at rest,
 which the loads of w and s fill with zeros. w and s are (N, 6) as the simulator hands them over; everything that one kernel leaves
