@@ -162,7 +162,7 @@ def identification(body: Body, scene: Scene) -> dict[str, float]:
         material, contact, heterogeneity, _ = body.parts(variant)
         mean = float(body.factor(heterogeneity).detach().mean())
         for name, value in material.physical().items():
-            scale = mean if name == material.stiffness else 1.0
+            scale = mean if name in material.modulated else 1.0
             figures[f"{prefix}/{name}"] = float(value.detach()) * scale
             if name in scene.known_parameters:
                 true = scene.known_parameters[name]
