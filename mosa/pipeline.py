@@ -246,14 +246,16 @@ def floor_figures(body: Body, evaluated: list[Sequence], world) -> dict[str, flo
 
 
 def write_outputs(folder: Path, cfg: DictConfig, body: Body, evaluated: list[Sequence], figures: dict, kept: dict) -> None:
-    """metrics.json, rollout.npz, video.mp4 and a strip of it; the tables on the screen and in results.md."""
+    """metrics.json, rollout.npz, video.mp4 of the last sequence, strip.png of all that are held out; tables in results.md."""
     (folder / "metrics.json").write_text(json.dumps(dict(sorted(figures.items())), indent=1))
     save_rollout(folder / "rollout.npz", {prefix: variants["adapted"] for prefix, variants in kept.items()})
     if cfg.evaluation.video:
         columns = comparison(body, evaluated[-1], kept[evaluated[-1].prefix])
         enlarge = max(1, round(320 / max(columns["real"].shape[1:3])))
         write_video(folder / "video.mp4", side_by_side(columns, enlarge), fps=6)
-        write_strip(folder / "strip.png", columns, enlarge=max(1, enlarge - 1))
+        shown = [s for s in evaluated if s.prefix.startswith("test")] or evaluated[-1:]
+        rows = {f"{s.prefix}: {title}": images for s in shown for title, images in comparison(body, s, kept[s.prefix]).items()}
+        write_strip(folder / "strip.png", rows, enlarge=max(1, enlarge - 1))
     table = results_table(figures) + "\n\n" + parameter_table(figures)
     (folder / "results.md").write_text(table + "\n")
     print(f"\n{table}\n\nrun folder: {folder}")
@@ -263,7 +265,7 @@ def comparison(body: Body, shown: Sequence, variants: dict) -> dict:
     """Images (T, h, w, 3) of real, prior and adapted from the first camera, cut to where the object goes."""
     scene = shown.scene
     camera = [(scene.training_cameras or [0])[0]]
-    x0, y0, width, height = crop_boxes(scene.mattes[camera], margin=12)
+    x0, y0, width, height = crop_boxes(scene.mattes[camera], margin=16)
     columns = {"real": scene.images[camera]}
     columns |= {title: render(body, variants[v], scene, camera) for v, title in (("prior", "prior"), ("adapted", "adapted (MoSA)"))}
     return {title: crop_images(images, x0, y0, width, height, axis=2)[0] for title, images in columns.items()}

@@ -49,7 +49,8 @@ def write_video(path: str | Path, frames: list[np.ndarray], fps: float = 12.0) -
 
 
 def write_strip(path: str | Path, columns: dict[str, Tensor], frames: int = 6, enlarge: int = 1) -> Path:
-    """PNG with one captioned row per entry of `columns` (name -> (T, H, W, 3)) and about `frames` frames from left to right."""
+    """PNG of about `frames` frames from left to right, one captioned row per entry of `columns`: name -> (T, H, W, 3), sizes may
+    differ."""
     path = Path(path)
     count = min(len(c) for c in columns.values())
     chosen = np.unique(np.linspace(0, count - 1, frames).round().astype(int))
@@ -59,5 +60,7 @@ def write_strip(path: str | Path, columns: dict[str, Tensor], frames: int = 6, e
         if enlarge > 1:
             row = cv2.resize(row, None, fx=enlarge, fy=enlarge, interpolation=cv2.INTER_CUBIC)
         rows.append(label(row, name))
+    width = max(row.shape[1] for row in rows)
+    rows = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
     imageio.imwrite(path, np.concatenate(rows))
     return path
