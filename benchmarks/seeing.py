@@ -4,6 +4,7 @@
     OMP_NUM_THREADS=1 python benchmarks/seeing.py scene.scale=0.5                  # a line with other settings
     OMP_NUM_THREADS=1 python benchmarks/seeing.py --table                          # print what has been measured
     OMP_NUM_THREADS=1 python benchmarks/seeing.py scene.scale=0.5 --pictures docs/images
+    OMP_NUM_THREADS=1 python benchmarks/seeing.py --scene rabbit --pictures docs/images    # pictures only
 
 The arguments are overrides of conf/train.yaml, as train.py takes them; the line is named by them. The scene is PAC-NeRF's bird
 (conf/scene/pacnerf_bird.yaml), camera 5 is held out of every stage. `derived/visual_hull_track.json` of the scene's folder is read
@@ -56,7 +57,7 @@ import matplotlib.pyplot as plt
 from matplotlib.collections import PolyCollection
 
 CONF = Path(__file__).parents[1] / "conf"
-HELD = "5"
+BIRD, HELD = "pacnerf_bird", "5"
 """The camera that is held out. val and test of the scene's own split repeat camera 0, which is a training camera there."""
 DARK = 0.35
 """Largest channel of a pixel that is no bird: its own pixels are brighter in all cameras and frames before contact."""
@@ -75,9 +76,9 @@ class Seen:
     camera: int
 
 
-def configuration(overrides: list[str], out: Path) -> DictConfig:
+def configuration(overrides: list[str], out: Path, scene: str = BIRD) -> DictConfig:
     with initialize_config_dir(str(CONF.resolve()), version_base=None):
-        return compose("train", ["scene=pacnerf_bird", f"scene.holdout_cameras=[{HELD}]", f"scene.cache={out}/cache", *overrides])
+        return compose("train", [f"scene={scene}", f"scene.holdout_cameras=[{HELD}]", f"scene.cache={out}/cache", *overrides])
 
 
 def see(cfg: DictConfig) -> Seen:
@@ -371,6 +372,7 @@ def silhouette_errors(alpha: Tensor, mattes: Tensor) -> Tensor:
 
 
 def pictures(seen: Seen, to: Path) -> list[Path]:
+    """Pictures named seeing_<scene>_*.png in the folder `to`."""
     scene, camera = seen.scene, seen.camera
     to.mkdir(parents=True, exist_ok=True)
     # a window per frame: frames take the place of views
@@ -391,7 +393,7 @@ def pictures(seen: Seen, to: Path) -> list[Path]:
         "difference, three times": cut(difference, shown),
         "red: matte not covered; blue: rendered outside of it": cut(errors, shown),
     }
-    files = [write(strip, to / "seeing_bird_strip.png", enlarge)]
+    files = [write(strip, to / f"seeing_{scene.name}_strip.png", enlarge)]
     steps = [t for t in shown if t < scene.frames - 1]
     found, optical = seen.views.flow[0], real_flow(seen)
     optical = torch.where((scene.mattes[camera, :-1] > 0.5)[..., None], optical, 0.0)
@@ -401,8 +403,8 @@ def pictures(seen: Seen, to: Path) -> list[Path]:
         f"full colour: {largest:.0f} px or more": cut(flow_colors(found, largest), steps),
         "optical flow of the real images (DIS), inside the matte": cut(flow_colors(optical, largest), steps),
     }
-    files.append(write(rows, to / "seeing_bird_flow.png", enlarge, to_uint8(color_wheel(96))))
-    return [*files, ellipsoids(seen, to / "seeing_bird_ellipsoids.png")]
+    files.append(write(rows, to / f"seeing_{scene.name}_flow.png", enlarge, to_uint8(color_wheel(96))))
+    return [*files, ellipsoids(seen, to / f"seeing_{scene.name}_ellipsoids.png")]
 
 
 def ellipsoids(seen: Seen, file: Path, exaggeration: float = 2.0) -> Path:
@@ -434,7 +436,9 @@ def ellipsoids(seen: Seen, file: Path, exaggeration: float = 2.0) -> Path:
             plot.tick_params(labelsize=7)
             plot.autoscale_view()
     figure.colorbar(mapped, ax=plots, shrink=0.6).set_label("largest |stretch - 1| (not exaggerated)", fontsize=8)
-    figure.suptitle(f"bird (real footage), a layer through the middle; stretches drawn {exaggeration:g} times as large", fontsize=9)
+    what = "synthetic" if seen.scene.synthetic else "real footage"
+    title = f"{seen.scene.name} ({what}), a layer through the middle; stretches drawn {exaggeration:g} times as large"
+    figure.suptitle(title, fontsize=9)
     save(figure, file)
     return file
 
@@ -443,12 +447,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("overrides", nargs="*", help="of conf/train.yaml, e.g. scene.scale=0.5 simulation.particles=2000")
     parser.add_argument("--out", type=Path, default=Path("outputs/seeing"), help="results and cached stages")
+    parser.add_argument("--scene", default=BIRD, help="pictures only, of another scene")
     parser.add_argument("--table", action="store_true", help="only print what has been measured, all lines")
     parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="also draw the pictures of this line")
     args = parser.parse_args()
     if args.table:
         lines = [json.loads(file.read_text()) for file in args.out.glob("*.json")]
         print(tables(sorted(lines, key=lambda line: (len(line["overrides"]), line["overrides"]))))
+        return
+    if args.scene != BIRD:  # no figures to compare with, but pictures
+        for picture in pictures(see(configuration(args.overrides, args.out, args.scene)), args.pictures or args.out):
+            print(picture)
         return
     # the order of overrides matters to hydra: it is kept
     file = args.out / f"bird-{hashlib.sha256(' '.join(args.overrides).encode()).hexdigest()[:8]}.json"
