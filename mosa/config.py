@@ -85,7 +85,7 @@ def build_adapter(config: Mapping[str, Any]) -> torch.nn.Module | None:
         return None
     try:
         build = get_class(config["_target_"])
-    except Exception as error:
+    except (ImportError, ValueError) as error:
         raise ConfigError(f"adapter._target_: expected a class, found {config['_target_']!r} ({error})") from error
     return known_keys("adapter", build, {k: v for k, v in config.items() if k != "_target_"})
 

@@ -161,7 +161,7 @@ def assemble_fit(
     stages = build_stages(settings, heterogeneity=body.heterogeneity is not None, adapter=body.adapter is not None)
     module = LitMosa(
         body, takes=takes, world=build_world(config["world"]), background=scene.background.to(device),
-        frame_dt=config["frame_dt"], stages=stages, weights=plain(cfg.losses), clip=settings["clip"], config=config,
+        stages=stages, weights=plain(cfg.losses), clip=settings["clip"], config=config,
     )
     data = MultiViewDataModule(takes[0].observations, views_per_step=settings["views"],
                                steps=sum(s.iterations for s in stages), seed=cfg.seed)
@@ -181,7 +181,8 @@ def take_of(cfg, scene: Scene, start: Start, reconstruction: Reconstruction, bod
     frames, cues = len(scene.training_frames), reconstruction.cues
     names = ("positions", "rotation", "stretch", "weight", "covariances")
     return Take(start, training_observations(scene, reconstruction, margin=cfg.rendering.margin, device=device),
-                MotionCues(*(getattr(cues, n)[:frames].to(device) for n in names)), first_contact(body, start, scene))
+                MotionCues(*(getattr(cues, n)[:frames].to(device) for n in names)), float(scene.times[1] - scene.times[0]),
+                first_contact(body, start, scene))
 
 
 BACKWARD = 3.5  # cost of a step with gradients over one without, measured on the rabbit
@@ -246,15 +247,16 @@ def floor_figures(body: Body, evaluated: list[Sequence], world) -> dict[str, flo
 
 
 def write_outputs(folder: Path, cfg: DictConfig, body: Body, evaluated: list[Sequence], figures: dict, kept: dict) -> None:
-    """metrics.json, rollout.npz, video.mp4 of the last sequence, strip.png of all that are held out; tables in results.md."""
+    """metrics.json, rollout.npz, video.mp4 of the last held-out sequence, strip.png of all; tables in results.md."""
     (folder / "metrics.json").write_text(json.dumps(dict(sorted(figures.items())), indent=1))
     save_rollout(folder / "rollout.npz", {prefix: variants["adapted"] for prefix, variants in kept.items()})
     if cfg.evaluation.video:
-        columns = comparison(body, evaluated[-1], kept[evaluated[-1].prefix])
+        shown = [s for s in evaluated if s.prefix.startswith("test")] or evaluated[-1:]
+        pictures = {s.prefix: comparison(body, s, kept[s.prefix]) for s in shown}
+        columns = pictures[shown[-1].prefix]
         enlarge = max(1, round(320 / max(columns["real"].shape[1:3])))
         write_video(folder / "video.mp4", side_by_side(columns, enlarge), fps=6)
-        shown = [s for s in evaluated if s.prefix.startswith("test")] or evaluated[-1:]
-        rows = {f"{s.prefix}: {title}": images for s in shown for title, images in comparison(body, s, kept[s.prefix]).items()}
+        rows = {f"{prefix}: {title}": images for prefix, each in pictures.items() for title, images in each.items()}
         write_strip(folder / "strip.png", rows, enlarge=max(1, enlarge - 1))
     table = results_table(figures) + "\n\n" + parameter_table(figures)
     (folder / "results.md").write_text(table + "\n")

@@ -28,11 +28,12 @@ TERMS = ("image", "mask", "flow", "rotation", "stretch", "heterogeneity", "posit
 @dataclass(frozen=True)
 class Take:
     """A sequence to learn from. start: where the body starts; observations: targets (datamodule.py); cues: the reconstruction's,
-    of the training frames; first_contact: index of the first frame after it."""
+    of the training frames, frame_dt [s] apart; first_contact: index of the first frame after it."""
 
     start: Start
     observations: Observations
     cues: MotionCues
+    frame_dt: float
     first_contact: int
 
 
@@ -49,7 +50,6 @@ class LitMosa(L.LightningModule):
         takes: Sequence[Take],
         world: World,
         background: Tensor,
-        frame_dt: float,
         stages: Sequence[Stage],
         weights: Mapping[str, float],
         clip: float = 1.0,
@@ -61,7 +61,7 @@ class LitMosa(L.LightningModule):
             raise ConfigError(f"losses: unknown terms {unknown}; known are {', '.join(TERMS)}")
         self.automatic_optimization = False
         self.body, self.world, self.takes, self.background = body, world, list(takes), background
-        self.frame_dt, self.stages = frame_dt, list(stages)
+        self.stages = list(stages)
         self.weights, self.clip, self.config = dict(weights), clip, config or {}
         self.stage_index, self.losses, self.steps_done = 0, [], 0
         self.misfit = MISFIT  # of the model the joint stage starts from, measured when it begins
@@ -155,7 +155,7 @@ class LitMosa(L.LightningModule):
                 collected.append(adapter.statistics())
 
         rollout = body.simulate(
-            take.start, self.world, frames, self.frame_dt, with_adapter=adapted, with_heterogeneity=stage.name != "prior",
+            take.start, self.world, frames, take.frame_dt, with_adapter=adapted, with_heterogeneity=stage.name != "prior",
             collect=collect if adapted else None,
         )
         def on(name: str) -> bool:
@@ -223,7 +223,7 @@ class LitMosa(L.LightningModule):
         """Mean distance of the particles from the reconstruction's, over the object's size, without adapter."""
         misfits = []
         for take in self.takes:
-            rollout = self.body.simulate(take.start, self.world, len(take.cues.positions), self.frame_dt, with_adapter=False)
+            rollout = self.body.simulate(take.start, self.world, len(take.cues.positions), take.frame_dt, with_adapter=False)
             misfits.append(float(losses.position_loss(rollout.x, take.cues.positions, self.body.size)))
         return sum(misfits) / len(misfits)
 
@@ -261,7 +261,7 @@ class LitMosa(L.LightningModule):
         take, body = self.takes[0], self.body
         frames = len(take.cues.positions)
         adapted = body.adapter is not None and body.adapter.is_on  # it is switched on when its stage begins
-        rollout = body.simulate(take.start, self.world, frames, self.frame_dt, with_adapter=adapted)
+        rollout = body.simulate(take.start, self.world, frames, take.frame_dt, with_adapter=adapted)
         targets = take.observations.select([view], frames)
         seen = observe(rollout.x, deformed_covariances(rollout.F_tot, body.covariances), body.opacities, body.colors,
                        targets.cameras, self.background)

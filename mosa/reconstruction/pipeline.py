@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import json
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
 from mosa.data.splats import load_ply
 from mosa.errors import ConfigError, DataError
+from mosa.reconstruction.cache import StageCache
 from mosa.reconstruction.cues import gaussian_cues, neighbourhood, neighbourhood_cues
 from mosa.reconstruction.dynamic import DynamicSettings, Scaffold, fit_motion
 from mosa.reconstruction.filling import Particles, body_volume, carve, fill
@@ -109,42 +107,19 @@ def spacing_for(scene: Scene, particles: int, settings: ReconstructionSettings |
     return (body_volume(object_hull(scene, settings or ReconstructionSettings())) / particles) ** (1 / 3)
 
 
-class _Cache:
-    """Stage results in one folder per (data, settings, spacing, seed); files appear complete or not at all."""
-
-    def __init__(self, root: Path | None, key: Mapping[str, Any]) -> None:
-        self.folder = None
-        if root is not None:
-            digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]
-            self.folder = Path(root) / "reconstruction" / f"{key['scene']}-{digest}"
-            self.folder.mkdir(parents=True, exist_ok=True)
-            (self.folder / "key.json").write_text(json.dumps(key, indent=1, sort_keys=True))
-
-    def stage(self, name: str, compute: Callable[[], Any]) -> Any:
-        """The stored result of a stage, or `compute()` stored. A damaged file is computed again."""
-        if self.folder is None:
-            return compute()
-        path = self.folder / f"{name}.pt"
-        if path.exists():
-            try:
-                return torch.load(path, map_location="cpu", weights_only=True)
-            except Exception as error:
-                print(f"{path}: cannot be read ({error}); this stage is computed again")
-        result = compute()
-        partial = path.with_suffix(f".{os.getpid()}.tmp")
-        torch.save(result, partial)
-        os.replace(partial, path)
-        return result
-
-    def strip(self, name: str, windows: Windows, rendered: Tensor, columns: int = 8) -> None:
-        """Real above rendered, one picture per stage."""
-        if self.folder is None:
-            return
-        import imageio.v3 as imageio
-
-        chosen = np.unique(np.linspace(0, len(windows) - 1, columns).astype(int))
-        rows = [torch.cat(list(images[chosen].cpu()), 1) for images in (windows.images, rendered)]
-        imageio.imwrite(self.folder / f"{name}.png", (torch.cat(rows).clamp(0, 1).numpy() * 255).round().astype(np.uint8))
+def _open_cache(cache_dir: str | Path | None, scene: Scene, settings: ReconstructionSettings, seed: int, **more: Any) -> StageCache:
+    """The cache of what is computed from the training views and frames of `scene`; more: whatever else the results depend on."""
+    key = {
+        "version": CACHE_VERSION,
+        "scene": f"{scene.name}-{scene.sequence}",
+        "data": scene.fingerprint,
+        "views": scene.training_cameras,
+        "frames": scene.training_frames,
+        "seed": seed,
+        "settings": asdict(settings),
+        "box": scene.box.tolist(),
+    }
+    return StageCache(Path(cache_dir) if cache_dir is not None else None, key | more)
 
 
 def _tensors(splats: Splats) -> dict[str, Tensor]:
@@ -212,21 +187,11 @@ def reconstruct(
     if spacing <= 0:
         raise ConfigError(f"reconstruct: spacing must be positive, found {spacing}")
     views, frames = scene.training_cameras, scene.training_frames
-    key = {
-        "version": CACHE_VERSION,
-        "scene": f"{scene.name}-{scene.sequence}",
-        "data": scene.fingerprint,
-        "views": views,
-        "frames": frames,
-        "spacing": spacing,
-        "seed": seed,
-        "settings": asdict(settings),
-        "box": scene.box.tolist(),
-    }
+    more = {"spacing": spacing}
     if settings.splats is not None:
         imported = imported_splats(settings.splats, scene)
-        key["splats"] = hashlib.sha256(Path(settings.splats).read_bytes()).hexdigest()[:16]
-    cache = _Cache(Path(cache_dir) if cache_dir is not None else None, key)
+        more["splats"] = hashlib.sha256(Path(settings.splats).read_bytes()).hexdigest()[:16]
+    cache = _open_cache(cache_dir, scene, settings, seed, **more)
     hull = Volume(**cache.stage("hull", lambda: _volume_tensors(object_hull(scene, settings))))
     windows = object_windows(scene, views, frames, margin=settings.margin).to(device)
     still, background = windows.of_frame(0), scene.background.to(device)
@@ -305,19 +270,11 @@ def follow(
     views, frames = scene.training_cameras, scene.training_frames
     _first_frame(scene)
     pose = (rotation, center, rest_center)
-    key = {
-        "version": CACHE_VERSION,
-        "scene": f"{scene.name}-{scene.sequence}",
-        "data": scene.fingerprint,
-        "body": [first.fingerprint, first.training_cameras, first.training_frames, reconstruction.spacing],
-        "pose": [[round(v, 6) for v in part.flatten().tolist()] for part in pose],
-        "views": views,
-        "frames": frames,
-        "seed": seed,
-        "settings": asdict(settings),
-        "box": scene.box.tolist(),
-    }
-    cache = _Cache(Path(cache_dir) if cache_dir is not None else None, key)
+    cache = _open_cache(
+        cache_dir, scene, settings, seed,
+        body=[first.fingerprint, first.training_cameras, first.training_frames, reconstruction.spacing],
+        pose=[[round(v, 6) for v in part.flatten().tolist()] for part in pose],
+    )  # fmt: skip
     windows = object_windows(scene, views, frames, margin=settings.margin).to(device)
     splats = posed(_on(reconstruction.splats, "cpu"), *(p.cpu() for p in pose))
     static = splats if reconstruction.static is None else posed(_on(reconstruction.static, "cpu"), *(p.cpu() for p in pose))
@@ -366,7 +323,7 @@ def _motion(
     settings: ReconstructionSettings,
     seed: int,
     bar: Callable[[str, int], tqdm],
-    cache: _Cache,
+    cache: StageCache,
 ) -> dict[str, Tensor]:
     """Positions, covariances and, where free, shapes of the particles in every training frame."""
     views, frames = scene.training_cameras, scene.training_frames

@@ -1,15 +1,8 @@
 """Each ablation changes the term or the parameters it names and leaves the others as they are at the first joint step."""
 
-from pathlib import Path
-
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-
-from mosa.config import run_config
-from mosa.pipeline import assemble_fit, body_of, plain, reconstruct_scene, scenes, starts
-
-ROOT = Path(__file__).parents[2]
+from assembled import assembled
 
 
 @pytest.fixture(scope="module")
@@ -19,14 +12,8 @@ def first_step(tmp_path_factory):
 
     def compute(ablation: str):
         if ablation not in known:
-            with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-                cfg = compose("train", overrides=["debug=default", f"scene.cache={cache}", f"ablation={ablation}"])
-            scene, _ = scenes(cfg)
-            reconstruction, dx = reconstruct_scene(cfg, scene, "cpu")
-            config = run_config(plain(cfg), scene, dx)
-            body = body_of(reconstruction, config)
-            start = starts(body, reconstruction, scene, [])["train"]
-            module, _ = assemble_fit(cfg, scene, reconstruction, body, start, config, "cpu")
+            _, scene, module = assembled(cache, f"ablation={ablation}")
+            body = module.body
             joint = module.stages[-1]
             module.begin(joint)
             with torch.no_grad():

@@ -3,14 +3,12 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-
-from mosa.config import run_config
-from mosa.pipeline import assemble_fit, body_of, plain, reconstruct_scene, scenes, starts
+from assembled import assembled
 
 ROOT = Path(__file__).parents[2]
 
@@ -20,21 +18,8 @@ def cache(tmp_path_factory):
     return tmp_path_factory.mktemp("cache")
 
 
-def assembled(cache, taught):
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        cfg = compose("train", overrides=["debug=default", f"scene.cache={cache}", f"scene.also_train={taught}"])
-    scene, others = scenes(cfg)
-    reconstruction, dx = reconstruct_scene(cfg, scene, "cpu")
-    config = run_config(plain(cfg), scene, dx)
-    body = body_of(reconstruction, config)
-    others = [s for s in others if s.sequence in taught]
-    found = starts(body, reconstruction, scene, others, taught)
-    more = [(s, found[f"train/{s.sequence}"]) for s in others]
-    return assemble_fit(cfg, scene, reconstruction, body, found["train"], config, "cpu", more)[0]
-
-
 def test_a_step_descends_the_mean_over_the_sequences(cache):
-    module = assembled(cache, ["test_60"])
+    _, _, module = assembled(cache, taught=["test_60"])
     assert len(module.takes) == 2
     parameters = list(module.body.material.parameters())
     stage, views = module.stages[0], [0, 1]
@@ -54,6 +39,18 @@ def test_a_step_descends_the_mean_over_the_sequences(cache):
     assert module.losses[0] == pytest.approx((first + second) / 2, rel=1e-6) and first != second
     found = torch.stack([p.grad for p in parameters])
     assert (found - (g1 + g2) / 2).abs().max() <= 1e-5 * found.abs().max()
+
+
+def test_a_take_is_simulated_at_its_own_frame_rate(cache):
+    _, _, module = assembled(cache)
+    take, stage = module.takes[0], module.stages[0]
+    longer = replace(take, frame_dt=2 * take.frame_dt)
+    with torch.no_grad():
+        _, found = module.terms(stage, [0], 3, longer)
+        expected = module.body.simulate(take.start, module.world, 3, longer.frame_dt, with_adapter=False)
+        usual = module.body.simulate(take.start, module.world, 3, take.frame_dt, with_adapter=False)
+    assert (found.x - expected.x).abs().max() < 1e-6
+    assert (expected.x - usual.x).abs().max() > 1e-2
 
 
 def run(cache, folder, script, *overrides):
