@@ -39,7 +39,7 @@ def rollouts(body: Body, sequence: Sequence, world: World, variants=VARIANTS) ->
     sizes: list[float] = []
     result = {
         v: body.simulate(sequence.start, world, scene.frames, frame_dt, variant=v,
-                         collect=lambda adapter: sizes.append(float(adapter.statistics().mean_abs_C)))
+                         collect=lambda found: sizes.append(float(found.mean_abs_C)))
         for v in variants
     }
     return result, float(np.mean(sizes)) if sizes else None

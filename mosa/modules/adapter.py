@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -16,8 +16,7 @@ from mosa.modules.progressive import Correction, ProgressiveOperator, apply
 from mosa.physics.rollout import AdapterOperator, MaterialState
 
 
-@dataclass(frozen=True)
-class OperatorStatistics:
+class OperatorStatistics(NamedTuple):
     """Of one or more evaluations, with gradients: what penalties and reports are made of.
 
     mean_abs_C: over particles, the four matrices and all entries of |C|. mean, within: (48,) mean and variance over particles
@@ -88,6 +87,8 @@ class Adapter(nn.Module):
         return not bool(torch.isnan(self.E_ref))
 
     def check_on(self) -> None:
+        if self.E_ref.is_cuda and torch.cuda.is_current_stream_capturing():
+            return  # a capture may not look; the pass ran before it was captured
         if not self.is_on:
             raise ConfigError("adapter: no reference modulus; call switch_on(E) with the calibrated prior's before simulating")
 

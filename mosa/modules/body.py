@@ -224,8 +224,8 @@ class Body(nn.Module):
     ) -> Rollout:
         """Roll `frames` frames out (frame 0 is the start). Differentiable in every parameter and in `start`.
 
-        collect: called with every adapter operator (penalties, mean |C|). counts: of substeps, to replay those of an
-        adaptive rollout. Errors: SimulationDiverged, ConfigError (time step).
+        collect: called with the statistics of every evaluation of the adapter (penalties, mean |C|). counts: of substeps, to
+        replay those of an adaptive rollout. Errors: SimulationDiverged, ConfigError (time step).
         """
         material, contact, heterogeneity, adapter = self.parts(variant)
         if not with_heterogeneity:
@@ -258,16 +258,10 @@ class Body(nn.Module):
         lift = contact() * up
         state = replace(state, x=state.x + lift)
         state = ParticleState(*(getattr(state, name).to(dtype) for name in ("x", "v", "C_affine", "F", "F_tot")))
-        operator = None
-        if adapter is not None:
-            def operator(material_state):
-                result = adapter(material_state)
-                if collect is not None:
-                    collect(adapter)
-                return result
+        stride = None if adapter is not None and adapter.steady else self.settings.stride
         rollout = simulator.rollout(
             state, {k: p.to(dtype) for k, p in parameters.items()}, self.volume.to(dtype), self.density, frames,
-            adapter=operator, stride=None if adapter is not None and adapter.steady else self.settings.stride, progress=progress,
+            adapter=adapter, stride=stride, collect=collect, progress=progress,
             motions=[c.motion.shifted(lift) for c in world.colliders],  # the offset is the ground's: they keep their place
             **timing,
         )

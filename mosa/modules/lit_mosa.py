@@ -149,14 +149,9 @@ class LitMosa(L.LightningModule):
         body, weights, cues = self.body, self.weights, take.cues
         adapted = stage.name == "joint" and body.adapter is not None
         collected: list = []
-        penalised = weights.get("operator", 0.0) != 0 or weights.get("operator_variance", 0.0) != 0
-        def collect(adapter) -> None:
-            with torch.set_grad_enabled(penalised):
-                collected.append(adapter.statistics())
-
         rollout = body.simulate(
             take.start, self.world, frames, take.frame_dt, with_adapter=adapted, with_heterogeneity=stage.name != "prior",
-            collect=collect if adapted else None,
+            collect=collected.append if adapted else None,
         )
         def on(name: str) -> bool:
             return weights.get(name, 0.0) != 0

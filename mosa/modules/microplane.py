@@ -96,19 +96,28 @@ MANDEL = (1.0, 1.0, 1.0, 2**0.5, 2**0.5, 2**0.5)
 
 def isotropic_stiffness(poisson: Tensor) -> Tensor:
     """(6, 6) C0 = 2 mu I + lam 1x1 in Mandel scaling and units of 2 mu; poisson: ()."""
-    one = poisson.new_tensor([1.0, 1, 1, 0, 0, 0])
-    return torch.eye(6).to(poisson) + poisson / (1 - 2 * poisson) * torch.outer(one, one)
+    identity, volumetric, *_ = _constants(poisson.dtype, poisson.device)
+    return identity + poisson / (1 - 2 * poisson) * volumetric
+
+
+@lru_cache(maxsize=16)
+def _constants(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, ...]:
+    """I (6, 6), 1x1 (6, 6), `MANDEL` (6,), and the unit matrices (36, 6, 6)."""
+    one = torch.tensor([1.0, 1, 1, 0, 0, 0], dtype=dtype)
+    parts = torch.eye(6, dtype=dtype), torch.outer(one, one), torch.tensor(MANDEL, dtype=dtype)
+    return tuple(t.to(device) for t in (*parts, torch.eye(36, dtype=dtype).unflatten(-1, (6, 6))))
 
 
 def major_symmetric(G: Tensor, poisson: Tensor) -> Tensor:
     """(G + C0 G^T C0^-1)/2 in Mandel scaling, (..., 6, 6) on vech: then (I + G) C0 is symmetric and the law has an energy."""
-    scale = G.new_tensor(MANDEL)
-    C0 = isotropic_stiffness(poisson.to(G))
+    identity, volumetric, scale, basis = _constants(G.dtype, G.device)
+    poisson = poisson.to(G)
+    C0, inverse = isotropic_stiffness(poisson), identity - poisson / (1 + poisson) * volumetric
 
     def project(A: Tensor) -> Tensor:
         A = scale[:, None] * A / scale
-        A = 0.5 * (A + C0 @ A.mT @ torch.linalg.inv(C0))
+        A = 0.5 * (A + C0 @ A.mT @ inverse)
         return A / scale[:, None] * scale
 
-    basis = torch.eye(36).to(G).unflatten(-1, (6, 6))  # one linear map on the 36 entries: a matrix product instead of many
+    # one linear map on the 36 entries: a matrix product instead of many
     return (G.flatten(-2) @ project(basis).flatten(-2)).unflatten(-1, (6, 6))

@@ -92,12 +92,16 @@ class SegmentSolver:
             work = self.prepare(state, held, poses, substeps, (origin, dims), with_adjoint=False, steps=steps)
             work.advance()
             flags = work.flags.tolist()
-            if not self._left_window(flags, first, steps.dt):
+            if not self.left_window(flags, first, steps.dt):
                 reaction = () if work.colliders is None else tuple(t.clone() for t in work.colliders.reaction)
                 return work.final(), reaction, (origin, dims)
-        raise self._error(WINDOW, flags[WINDOW], first, steps.dt)
+        raise self.left_behind(flags, first, steps.dt)
 
-    def _left_window(self, flags: list[int], first: int, dt: float) -> bool:
+    def left_behind(self, flags: list[int], first: int, dt: float) -> SimulationDiverged:
+        """The error to raise for a particle that leaves even the widest window."""
+        return self._error(WINDOW, flags[WINDOW], first, dt)
+
+    def left_window(self, flags: list[int], first: int, dt: float) -> bool:
         """Whether a particle left the grid's window; any other event raises."""
         if min(flags) == NO_EVENT:
             return False
@@ -169,10 +173,12 @@ def advance_segment(
     return (final if count == 5 else (*final, final[3])), reaction
 
 
-def _stream(device: torch.device):
+def warp_stream(device: torch.device):
+    """Context in which Warp launches on torch's current stream."""
     if device.type != "cuda":
         return wp.ScopedDevice("cpu")
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)))
+    # without waiting for Warp's own stream: nothing is left on it, and a stream that is being captured could not
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
 
 
 def _arrays(tensors: list[Tensor], kinds: list) -> list:
@@ -186,7 +192,7 @@ def kirchhoff_stress(law: Law, F: Tensor, C_affine: Tensor, parameters: Tensor) 
     mat33, vec6, mat66, vecp = field_types(scalar)
     kernel = stress_kernel(law.stress, law.uses_rotation, scalar, False)
     blank, tau = F.new_zeros(1, 6, 6), torch.zeros_like(F, memory_format=torch.contiguous_format)
-    with _stream(F.device):
+    with warp_stream(F.device):
         arrays = _arrays([F, C_affine, parameters, blank, blank[0, :1], tau], [mat33, mat33, vecp, mat66, vec6, mat33])
         wp.launch(kernel, len(F), inputs=arrays, device=arrays[0].device)
     return tau
@@ -202,7 +208,7 @@ class _MaterialState(torch.autograd.Function):
         ctx.plastic = law.plastic
         w, s, e = (F.new_zeros(len(F), 6) for _ in range(3))
         ctx.save_for_backward(F, C, parameters)
-        with _stream(F.device):
+        with warp_stream(F.device):
             arrays = _arrays([F, C, parameters, w, s, e], ctx.kinds)
             wp.launch(ctx.kernel, len(F), inputs=arrays, device=arrays[0].device)
         return (w, s, e) if law.plastic else (w, s)
@@ -215,7 +221,7 @@ class _MaterialState(torch.autograd.Function):
         # the kernel may consume the seeds: never hand it torch's own
         seeds = [blank.clone() if s is None else s.clone().contiguous() for s in seeds] + [blank.clone()] * (not ctx.plastic)
         gradients = [torch.zeros_like(t, memory_format=torch.contiguous_format) for t in inputs]
-        with _stream(blank.device):
+        with warp_stream(blank.device):
             arrays = _arrays([*inputs, blank, blank, blank], ctx.kinds)
             wp.launch(
                 ctx.kernel, len(blank), inputs=arrays, adj_inputs=_arrays([*gradients, *seeds], ctx.kinds), adjoint=True,
@@ -246,7 +252,7 @@ class _Return(torch.autograd.Function):
             G, h = F.new_zeros(1, 6, 6), F.new_zeros(1, 6)
         ctx.save_for_backward(F, C, parameters, G, h)
         mapped = torch.zeros_like(F, memory_format=torch.contiguous_format)
-        with _stream(F.device):
+        with warp_stream(F.device):
             arrays = _arrays([F, C, parameters, G, h], ctx.kinds)
             inputs = [*arrays, *ctx.constants, *_arrays([mapped], [mat33])]
             wp.launch(ctx.kernel, len(F), inputs=inputs, device=arrays[0].device)
@@ -257,7 +263,7 @@ class _Return(torch.autograd.Function):
     def backward(ctx, seed):
         inputs = list(ctx.saved_tensors)
         gradients = [torch.zeros_like(t, memory_format=torch.contiguous_format) for t in inputs]
-        with _stream(seed.device):
+        with warp_stream(seed.device):
             arrays = _arrays(inputs, ctx.kinds)
             blank, seeds = _arrays([torch.zeros_like(seed), seed.clone()], ctx.kinds[:1] * 2)
             wp.launch(

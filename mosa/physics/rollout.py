@@ -10,14 +10,16 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mosa.errors import ConfigError
 from mosa.physics.adaptive import StepChooser, StepControl, check_counts
 from mosa.physics.boundary import Plane, ground_plane, pack_planes
+from mosa.physics.chain import Chain, advance_chain, grouped
 from mosa.physics.collider_motion import Motion, Trajectory, sample_frame, sample_poses
 from mosa.physics.colliders import Collider, pack_colliders, reach
 from mosa.physics.laws import SLOTS, law_named
@@ -27,7 +29,11 @@ from mosa.physics.workspace import SCALARS, Numerics, Steps
 from mosa.types import Ground, ParticleState, Rollout
 
 SEGMENT = 32
-"""Most substeps in a segment when no adapter cuts it: what the backward pass stores at once."""
+"""Most substeps in a segment when no adapter cuts it, and in a chain: what the backward pass stores at once."""
+
+MEMORY_SHARE = 0.1
+"""Of a GPU's free memory, for what the backward pass of a chain stores."""
+MAX_CHAINS = 8
 
 _UNBOUNDED = 1e30
 
@@ -64,6 +70,8 @@ class Simulator:
     init_affine: `spin` takes the state's C_affine, `zero` replaces it by 0. norm_eps: under the root of yield norms.
     yield_convention: paper | sqrt23. rebuild: write U S V^T back also where nothing yielded (PAC-NeRF does).
     on_inversion: warn | ignore | error for det F <= 0 where the law has a value there; it is an error where it has none.
+    chained: whether the evaluations of an adapter that is a torch module and the segments between them run as chains (chain.py);
+    None: on CUDA, where a chain is one captured graph. Not with colliders or adaptive substeps, which are cut in segments.
     Errors: ConfigError naming the argument. Not safe for use by two threads: buffers are shared between rollouts.
     """
 
@@ -88,6 +96,7 @@ class Simulator:
         yield_convention: str = "paper",
         rebuild: bool = False,
         on_inversion: str = "warn",
+        chained: bool | None = None,
     ) -> None:
         self.law = law_named(law)
         for name, value in (("dx", dx), ("frame_dt", frame_dt), ("substeps", substeps)):
@@ -123,6 +132,8 @@ class Simulator:
             colliders=packed_colliders,
         )  # fmt: skip
         self._workspaces: dict = {}
+        self.chained = self.device.type == "cuda" if chained is None else chained
+        self._chains: dict[tuple, Chain] = {}
 
     def pack(self, parameters: dict[str, Tensor], particles: int, rotation: Tensor | None = None) -> Tensor:
         """(N, SLOTS) parameters in the law's order. Values: numbers, (N,), () or, for vectors of k numbers, (N, k) or (k,).
@@ -169,6 +180,7 @@ class Simulator:
         control: StepControl | None = None,
         counts: Sequence[int] | None = None,
         lag: float | None = None,
+        collect: Callable[[Any], None] | None = None,
     ) -> Rollout:
         """`frames` frames, the start being frame 0 (so frames - 1 intervals are simulated).
 
@@ -176,7 +188,8 @@ class Simulator:
         rollout). parameters: physical values the law names, per particle (N,) or scalar; volume: (N,) [m^3]; density
         [kg/m^3]: number or (N,).
         adapter: asked every `stride` substeps from the start of each frame; None: once, at the start of the rollout (an operator
-        that does not depend on the state). progress: called with the number of each frame.
+        that does not depend on the state). collect: called with `adapter.statistics()`, a named tuple of tensors, of every
+        evaluation. progress: called with the number of each frame.
         motions: of the colliders, instead of their own; start_time [s]: time of frame 0 in these motions.
         control: choose the substeps of each frame from the state at its start (see `adaptive`) instead of taking `substeps`;
         counts: of the frames - 1 intervals, instead of choosing: a replay, in which differences hold the substeps fixed.
@@ -218,13 +231,15 @@ class Simulator:
             numerics = replace(self.numerics, dt=self.frame_dt / taken[0]) if taken else self.numerics
             if self.law.plastic:
                 F_tot = F_tot + numerics.dt * (C @ F_tot)
-                operator = self._ask(adapter, F, C, packed) if adapter is not None else held
+                operator = self._ask(adapter, F, C, packed, collect) if adapter is not None else held
                 F = first_advance(numerics, F, C, packed, operator["plastic_G"], operator["plastic_h"])
             else:
                 F = F_tot = first_advance(numerics, F, C, packed)
         if adapter is not None and stride is None:
-            held.update(self._ask(adapter, F, C, packed))
+            held.update(self._ask(adapter, F, C, packed, collect))
             adapter = None  # answered: nothing cuts the segments
+        chained = self.chained and isinstance(adapter, nn.Module) and not variable and not self.colliders
+        most = self._chain_substeps(n) if chained else SEGMENT
         current = (state.x, state.v, C, F, F_tot)
         poses = () if variable else self._poses(motions, frames, start_time)
         reactions = []
@@ -240,7 +255,18 @@ class Simulator:
             else:
                 steps, along = None, tuple(part[first : first + count] for part in poses)
                 lengths = _segments(count, None if adapter is None else stride)
-            current, forces = self._frame(solver, adapter, packed, current, held, lengths, first, along, steps)
+            if chained:
+                forces = None
+                for group in grouped(lengths, most):
+                    chain = self._chain(adapter, group, current, packed, collect is not None)
+                    current, statistics = advance_chain(chain, solver, current, packed, first)
+                    first += sum(group)
+                    for each in statistics:
+                        collect(each)
+            else:
+                current, forces = self._frame(
+                    solver, adapter, packed, current, held, lengths, first, along, steps, collect
+                )
             lag = dt
             if forces is not None:
                 reactions.append(_mean_force(forces, steps) if variable else forces)
@@ -261,13 +287,13 @@ class Simulator:
 
     def _frame(
         self, solver: SegmentSolver, adapter: Callable | None, packed: Tensor, state: tuple[Tensor, ...], held: dict,
-        lengths: list[int], first: int, poses: tuple[Tensor, ...], steps: Steps | None,
+        lengths: list[int], first: int, poses: tuple[Tensor, ...], steps: Steps | None, collect: Callable | None,
     ) -> tuple[tuple[Tensor, ...], Tensor | None]:  # fmt: skip
         """(state after the segments of a frame, reactions (substeps, K, 6) or None). first: number of its first substep."""
         forces, done = [], 0
         for length in lengths:
             if adapter is not None:
-                held.update(self._ask(adapter, state[3], state[2], packed))
+                held.update(self._ask(adapter, state[3], state[2], packed, collect))
             along = tuple(part[done : done + length] for part in poses)
             state, reaction = advance_segment(solver, state, held, length, first + done, along, steps)
             forces += [torch.cat(reaction, -1)] if reaction else []
@@ -299,7 +325,34 @@ class Simulator:
         rotation = torch.eye(3, dtype=self.dtype, device=self.device).expand(len(F), 3, 3)
         return MaterialState(*material_state(self.law, F, C_affine, self.pack(parameters, len(F), rotation)))
 
-    def _ask(self, adapter: Callable, F: Tensor, C: Tensor, packed: Tensor) -> dict[str, Tensor | None]:
+    def _chain_substeps(self, particles: int) -> int:
+        """Most substeps of a chain, by memory: each keeps 33 numbers a particle (42 where the law yields) and a grid of 7 a node,
+        of which there is about one a particle."""
+        if self.device.type != "cuda":
+            return SEGMENT
+        free = torch.cuda.mem_get_info(self.device)[0]
+        free += torch.cuda.memory_reserved(self.device) - torch.cuda.memory_allocated(self.device)
+        each = particles * (49 if self.law.plastic else 40) * torch.finfo(self.dtype).bits // 8
+        return max(1, min(SEGMENT, int(MEMORY_SHARE * free / each)))
+
+    def _chain(
+        self, adapter: nn.Module, lengths: tuple[int, ...], state: tuple[Tensor, ...], packed: Tensor, collects: bool
+    ) -> Chain:
+        key = (id(adapter), len(packed), lengths, collects)  # the chain holds the adapter: its id is not given to another one
+        if key not in self._chains:
+            if len(self._chains) >= MAX_CHAINS:
+                self._chains.clear()
+            ask = partial(self._ask, adapter)
+            with torch.no_grad():
+                plastic_adapted = ask(state[3].detach(), state[2].detach(), packed.detach())["plastic_G"] is not None
+            self._chains[key] = Chain(
+                self.numerics, adapter, ask, len(packed), lengths, plastic_adapted=plastic_adapted, collects=collects
+            )
+        return self._chains[key]
+
+    def _ask(
+        self, adapter: Callable, F: Tensor, C: Tensor, packed: Tensor, collect: Callable | None = None
+    ) -> dict[str, Tensor | None]:
         n = len(F)
         answer = AdapterOperator(*adapter(MaterialState(*material_state(self.law, F, C, packed))))
         plastic = answer.plastic_G if self.law.plastic else None
@@ -312,6 +365,8 @@ class Simulator:
                     f"adapter output {name}: expected shape {shape} of {self.dtype}, found {tuple(value.shape)} of "
                     f"{value.dtype}"
                 )
+        if collect is not None:
+            collect(adapter.statistics())
         return result
 
     def _check(self, state: ParticleState, volume: Tensor) -> None:

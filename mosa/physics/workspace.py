@@ -156,14 +156,18 @@ class Workspace:
             slots[0].copy_(value)
         if self.plastic:
             self.A[0].copy_(state[4])
-        for name, value in held.items():
-            if value is not None:
-                self.held[name].copy_(value)
+        self.hold(held)
         self.volume.copy_(volume)
         self.mass.copy_(mass)
         if cutoff != self.cutoff:
             self.cutoff = cutoff
             self._graphs.clear()
+
+    def hold(self, held: dict[str, Tensor | None]) -> None:
+        """Copy parameters and the adapter's operator in, those that are given."""
+        for name, value in held.items():
+            if value is not None:
+                self.held[name].copy_(value)
 
     def final(self) -> tuple[Tensor, ...]:
         """Copies of (x, v, C_affine, F, F_tot) after the segment; F_tot is F itself where the law does not yield."""
@@ -176,11 +180,11 @@ class Workspace:
     def advance(self) -> None:
         """All substeps of the segment; events are left in `flags` for the caller to read."""
         self.flags.fill_(NO_EVENT)
-        self._launch("advance", self._advance)
+        self._launch("advance", lambda: self.advance_steps(0, self.substeps))
 
     def adjoint(self) -> None:
         """Adjoint of all substeps, last to first, after `advance`. Seeds: adj_* slot `substeps` % 2, results: slot 0."""
-        self._launch("adjoint", self._adjoint)
+        self._launch("adjoint", lambda: self.adjoint_steps(0, self.substeps))
 
     def _launch(self, name: str, body) -> None:
         if self.numerics.device.type != "cuda":
@@ -239,14 +243,15 @@ class Workspace:
             numerics.norm_eps, int(numerics.rebuild), self.F_wp[new],
         ]  # fmt: skip
 
-    def _advance(self) -> None:
+    def advance_steps(self, first: int, count: int) -> None:
+        """Launch substeps `first` to `first + count` of the segment, from the states in slot `first`."""
         kernels, numerics, n = self.kernels, self.numerics, self.particles
         states, grids = len(self.x), len(self.grid)
         geometry, kicked = self._geometry(self.steps.dt), self._geometry(self.steps.kick)
         low, high = kernels.vec3(*numerics.low), kernels.vec3(*numerics.high)
-        if self.colliders is not None:
+        if self.colliders is not None and first == 0:
             self.colliders.reset()
-        for step in range(self.substeps):
+        for step in range(first, first + count):
             a, b, g = step % states, (step + 1) % states, step % grids
             self.grid_wp[g].zero_()
             self._run(self.stress, n, self._stress_arguments(a, g))
@@ -264,14 +269,17 @@ class Workspace:
             if self.plastic:
                 self._run(self.mapping, n, self._mapping_arguments(a, b))
 
-    def _adjoint(self) -> None:
+    def adjoint_steps(self, first: int, count: int) -> None:
+        """Launch the adjoint of `advance_steps`: from the seeds in slot (first + count) % 2 to slot first % 2.
+
+        adj_held is of these substeps alone."""
         kernels, n, held = self.kernels, self.particles, self.adj_held_wp
         geometry, kicked = self._geometry(self.steps.dt), self._geometry(self.steps.kick)
         for array in held.values():
             array.zero_()
-        if self.colliders is not None:
+        if self.colliders is not None and first + count == self.substeps:
             self.colliders.reset_adjoint()
-        for step in reversed(range(self.substeps)):
+        for step in reversed(range(first, first + count)):
             a, b = step % 2, (step + 1) % 2  # adjoint slots; the states of all substeps are stored
             if self.plastic:
                 self.adj_F_wp[a].zero_()

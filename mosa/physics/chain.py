@@ -1,0 +1,243 @@
+"""Segments with an adapter's evaluations between them, as one torch operation and, on CUDA, one captured graph per pass.
+
+An adapter of the state is asked every few substeps. Done one by one, each answer costs some sixty launches and two transfers to
+the host, which take longer than the arithmetic of 100 000 particles. A chain of K segments looks at the host once. Its backward
+pass advances the chain again, keeping the state of every substep, then goes back through it: the adapter is asked again at the
+start of a segment, this time with a graph, and what the segment's adjoint leaves on its answer goes through that graph to the
+state and to the adapter's weights. Between the passes only a chain's start is kept.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import accumulate, pairwise
+
+import torch
+from torch import Tensor, nn
+
+from mosa.physics.mpm import SegmentSolver, grid_window, warp_stream
+from mosa.physics.mpm_kernels import NO_EVENT
+from mosa.physics.workspace import Numerics, Workspace
+
+ANSWER = ("G", "h", "plastic_G", "plastic_h")
+COARSE = 8
+"""Node counts of a chain's window are multiples of this: each change of them costs a new capture."""
+
+
+class Chain:
+    """Buffers and captured graphs of K segments of `lengths` substeps for N particles and one adapter.
+
+    ask: (F, C_affine, packed parameters) -> the adapter's answer by name (`ANSWER`, None where it has none), differentiable.
+    collects: also return `adapter.statistics()`, a named tuple of tensors, of every evaluation.
+    An adapter that looks at the host cannot be captured: it is run uncaptured, with a warning.
+    """
+
+    def __init__(
+        self, numerics: Numerics, adapter: nn.Module, ask: Callable[..., dict[str, Tensor | None]], particles: int,
+        lengths: Sequence[int], *, plastic_adapted: bool, collects: bool,
+    ) -> None:  # fmt: skip
+        self.numerics, self.adapter, self.ask, self.lengths, self.collects = numerics, adapter, ask, tuple(lengths), collects
+        self.substeps = sum(lengths)
+        self.weights = [p for p in adapter.parameters() if p.requires_grad]
+        self._shape = {"particles": particles, "substeps": self.substeps, "adapted": True, "plastic_adapted": plastic_adapted}
+        self.light = Workspace(numerics, **self._shape, with_adjoint=False)
+        self.full: Workspace | None = None
+        self.dims = (0, 0, 0)
+        self.statistics: tuple[Tensor, ...] = ()
+        self.statistics_seeds: tuple[Tensor, ...] = ()
+        self._kind: type | None = None
+        self.captures = numerics.device.type == "cuda"
+        self._warm: set[str] = set()
+        self._graphs: dict[str, torch.cuda.CUDAGraph] = {}
+        self._key: tuple = ()
+        self._passes = {
+            "forward": self._forward,
+            "adjoint": partial(self._adjoint, penalised=False),
+            "penalised adjoint": partial(self._adjoint, penalised=True),
+        }
+
+    def advance(
+        self, solver: SegmentSolver, state: tuple[Tensor, ...], packed: Tensor, first: int
+    ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...], tuple[int, int, int]]:
+        """(state after the chain, statistics (K, ...) each, lowest node of the window). Errors: as `SegmentSolver.advance`."""
+        dx, dt, total, work = self.numerics.dx, self.numerics.dt, self.substeps, self.light
+        for margin in (4, 3 + total // 2):
+            origin, dims = grid_window(state[0], state[1], dx, 2 * total * dt, margin)
+            self.dims = tuple(max(-(-a // COARSE) * COARSE, b) for a, b in zip(dims, self.dims))
+            self._check_graphs(solver)
+            work.set_window(origin, self.dims)
+            work.load(state, {"parameters": packed}, solver.volume, solver.mass, solver.cutoff)
+            self._capture()
+            self._play("forward", self._passes["forward"])
+            flags = work.flags.tolist()
+            if not solver.left_window(flags, first, dt):
+                return work.final(), tuple(t.clone() for t in self.statistics), origin
+        raise solver.left_behind(flags, first, dt)
+
+    def adjoint(
+        self, solver: SegmentSolver, state: tuple[Tensor, ...], packed: Tensor, origin: tuple[int, int, int],
+        seeds: Sequence[Tensor | None],
+    ) -> tuple[list[Tensor], Tensor, list[Tensor]]:  # fmt: skip
+        """Gradients of (state, parameters, weights). seeds: adjoints of what `advance` returned: state, then statistics."""
+        if self.full is None:
+            self.full = Workspace(self.numerics, **self._shape, with_adjoint=True)
+            self.adj_packed = torch.zeros_like(packed)
+            self.adj_weights = [torch.zeros_like(w) for w in self.weights]
+            self.statistics_seeds = tuple(torch.zeros_like(t) for t in self.statistics)
+        work = self.full
+        work.set_window(origin, self.dims)
+        work.load(state, {"parameters": packed}, solver.volume, solver.mass, solver.cutoff)
+        slot = self.substeps % 2
+        targets = self._targets(slot) + list(self.statistics_seeds)
+        for target, seed in zip(targets, seeds, strict=True):
+            target.zero_() if seed is None else target.copy_(seed)
+        penalised = any(seed is not None for seed in seeds[len(self._targets(slot)) :])
+        name = "penalised adjoint" if penalised else "adjoint"
+        self._play(name, self._passes[name])
+        found = [t.clone() for t in self._targets(0)]
+        return found, self.adj_packed.clone(), [t.clone() for t in self.adj_weights]
+
+    def named(self, statistics: Sequence[Tensor]) -> list:
+        """One named tuple per evaluation, of tensors (K, ...)."""
+        return [self._kind(*parts) for parts in zip(*statistics, strict=True)] if self._kind is not None else []
+
+    def _targets(self, slot: int) -> list[Tensor]:
+        work = self.full
+        targets = [work.adj_x, work.adj_v, work.adj_C, work.adj_F] + ([work.adj_A] if work.plastic else [])
+        return [t[slot] for t in targets]
+
+    def _ask(
+        self, F: Tensor, C: Tensor, packed: Tensor, collects: bool
+    ) -> tuple[dict[str, Tensor | None], tuple[Tensor, ...]]:
+        answer = self.ask(F, C, packed)
+        if not collects:
+            return answer, ()
+        statistics = self.adapter.statistics()
+        self._kind = type(statistics)
+        return answer, tuple(statistics)
+
+    def _advance_all(self, work: Workspace, collects: bool) -> list[tuple[Tensor, ...]]:
+        """Launches all segments; statistics of the evaluations."""
+        work.flags.fill_(NO_EVENT)
+        step, collected = 0, []
+        with torch.no_grad():
+            for length in self.lengths:
+                slot = step % len(work.x)
+                answer, statistics = self._ask(work.F[slot], work.C[slot], work.held["parameters"], collects)
+                collected.append(statistics)
+                work.hold(answer)
+                with warp_stream(self.numerics.device):
+                    work.advance_steps(step, length)
+                step += length
+        return collected
+
+    def _forward(self) -> None:
+        collected = self._advance_all(self.light, self.collects)
+        self.statistics = tuple(torch.stack(parts) for parts in zip(*collected))
+
+    def _adjoint(self, penalised: bool) -> None:
+        work, step = self.full, self.substeps
+        self._advance_all(work, False)
+        self.adj_packed.zero_()
+        torch._foreach_zero_(self.adj_weights)
+        for index in reversed(range(len(self.lengths))):
+            step -= self.lengths[index]
+            with torch.enable_grad():
+                leaves = [t.detach().requires_grad_() for t in (work.F[step], work.C[step], work.held["parameters"])]
+                answer, statistics = self._ask(*leaves, penalised)
+            work.hold({name: None if t is None else t.detach() for name, t in answer.items()})
+            with warp_stream(self.numerics.device):
+                work.adjoint_steps(step, self.lengths[index])
+            pairs = [(answer[name], work.adj_held[name]) for name in ANSWER if answer[name] is not None]
+            pairs += [(t, all_seeds[index]) for t, all_seeds in zip(statistics, self.statistics_seeds)]
+            pairs = [(output, seed) for output, seed in pairs if output.requires_grad]
+            self.adj_packed.add_(work.adj_held["parameters"])
+            if not pairs:
+                continue
+            outputs, seeds = zip(*pairs)
+            found = torch.autograd.grad(outputs, [*leaves, *self.weights], seeds, allow_unused=True)
+            slot = step % 2
+            sums = [work.adj_F[slot], work.adj_C[slot], self.adj_packed, *self.adj_weights]
+            sums, found = zip(*[(s, f) for s, f in zip(sums, found, strict=True) if f is not None])
+            torch._foreach_add_(sums, found)
+
+    def _check_graphs(self, solver: SegmentSolver) -> None:
+        """Forget captured graphs where what they have by value or address is another one."""
+        key = (self.dims, solver.cutoff, *(t.data_ptr() for t in (*self.adapter.parameters(), *self.adapter.buffers())))
+        if key != self._key:
+            self._key = key
+            self._graphs.clear()
+
+    def _play(self, name: str, body: Callable[[], None]) -> None:
+        graph = self._graphs.get(name)
+        if graph is not None:
+            graph.replay()
+        else:
+            body()  # the first time this also compiles and loads the kernels, which a capture must not do
+            self._warm.add(name)
+
+    def _capture(self) -> None:
+        """Capture every pass that has run once. Here for both: the backward pass runs in a thread of autograd's own."""
+        if not self.captures:
+            return
+        for name, body in self._passes.items():
+            if name not in self._warm or name in self._graphs:
+                continue
+            if name != "forward":
+                self.full.set_window((0, 0, 0), self.dims)
+                self.full.cutoff = self.light.cutoff
+            graph = torch.cuda.CUDAGraph()
+            try:
+                with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+                    body()
+            except RuntimeError as error:
+                self.captures = False
+                self._graphs.clear()
+                torch.cuda.synchronize()
+                name = type(self.adapter).__name__
+                warnings.warn(f"{name} cannot be captured as a CUDA graph and runs uncaptured: {error}", stacklevel=2)
+                return
+            self._graphs[name] = graph
+
+
+class _Chained(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, chain: Chain, solver: SegmentSolver, first: int, *inputs):
+        """inputs: state (5), packed parameters, the adapter's weights."""
+        state, packed = tuple(t.detach().contiguous() for t in inputs[:5]), inputs[5].detach().contiguous()
+        ctx.set_materialize_grads(False)
+        result, statistics, origin = chain.advance(solver, state, packed, first)
+        ctx.chain, ctx.solver, ctx.origin = chain, solver, origin
+        ctx.states = 5 if solver.numerics.law.plastic else 4
+        ctx.save_for_backward(*state, packed)
+        return *result[: ctx.states], *statistics
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, *seeds):
+        *state, packed = ctx.saved_tensors
+        found, adj_packed, adj_weights = ctx.chain.adjoint(ctx.solver, tuple(state), packed, ctx.origin, seeds)
+        return None, None, None, *found, *[None] * (5 - ctx.states), adj_packed, *adj_weights
+
+
+def advance_chain(
+    chain: Chain, solver: SegmentSolver, state: tuple[Tensor, ...], packed: Tensor, first: int
+) -> tuple[tuple[Tensor, ...], list]:
+    """((x, v, C_affine, F, F_tot) after the chain, statistics of each evaluation), differentiable in state, parameters and the
+    adapter's weights. first: number of the first substep, for messages. Errors: SimulationDiverged."""
+    result = _Chained.apply(chain, solver, first, *state, packed, *chain.weights)
+    count = 5 if solver.numerics.law.plastic else 4
+    final = result[:count] if count == 5 else (*result[:4], result[3])
+    return final, chain.named(result[count:])
+
+
+def grouped(lengths: Sequence[int], limit: int) -> list[tuple[int, ...]]:
+    """The segments of a frame in chains of at most `limit` substeps, nearly equally many segments each."""
+    per_chain = max(1, limit // max(lengths))
+    chains = -(-len(lengths) // per_chain)
+    size, longer = divmod(len(lengths), chains)
+    sizes = [size + (index < longer) for index in range(chains)]
+    ends = [0, *accumulate(sizes)]
+    return [tuple(lengths[a:b]) for a, b in pairwise(ends)]

@@ -1,0 +1,134 @@
+"""A chain of segments against the same segments one by one: states, gradients and statistics; captured graphs on CUDA."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import nn
+
+from mosa.errors import SimulationDiverged
+from mosa.modules.adapter import StressAdapter, pool
+from mosa.physics.chain import grouped
+from mosa.physics.rollout import Simulator
+from mosa.types import Ground, ParticleState
+
+CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+DEVICES = ["cpu", pytest.param("cuda", marks=[pytest.mark.gpu, CUDA])]
+E, NU = 2e4, 0.3
+
+
+def adapter_of(device: str, dtype: torch.dtype, plastic: bool) -> StressAdapter:
+    adapter = StressAdapter(hidden=16, plastic=plastic, fused=False).to(dtype)
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for p in adapter.parameters():
+            p.copy_(0.3 * torch.randn(p.shape, generator=generator, dtype=torch.float64))
+    adapter.switch_on(E, NU)
+    return adapter.to(device)
+
+
+def rolled(chained, law, device, dtype, state, adapter, *, stride=2, substeps=11, frames=4, penalised=True, **options):
+    """(frames x, F, F_tot, statistics of the evaluations) and gradients of a sum of them, all on the CPU in float64."""
+    names = ("x", "v", "C_affine", "F", "F_tot")
+    state = ParticleState(*(getattr(state, name).to(device=device, dtype=dtype) for name in names))
+    mu = torch.full((), E / (2 * (1 + NU)), device=device, dtype=dtype, requires_grad=True)
+    v0 = torch.zeros(3, device=device, dtype=dtype, requires_grad=True)
+    parameters = {"mu": mu, "lam": 1e4, **({"yield_stress": 300.0} if law == "von_mises" else {})}
+    sim = Simulator(law, dx=0.04, substeps=substeps, frame_dt=4e-4 * substeps, ground=Ground(0.0), dtype=dtype, device=device,
+                    chained=chained, **options)
+    volume = torch.full((len(state.x),), 8e-6, device=device, dtype=dtype)
+    weights = [p for p in adapter.parameters() if p.requires_grad]
+
+    def once():
+        collected = []
+        rollout = sim.rollout(replace(state, v=state.v + v0), parameters, volume, 1000.0, frames, adapter=adapter, stride=stride,
+                              collect=collected.append)
+        over_all = pool(collected)
+        loss = (rollout.x**2).sum() + (rollout.F_tot**2).sum() + (10 * over_all.mean_square + over_all.variance) * penalised
+        gradients = torch.autograd.grad(loss, [mu, v0, *weights], allow_unused=True)
+        values = [rollout.x, rollout.F, rollout.F_tot, over_all.mean, over_all.within, *[g for g in gradients if g is not None]]
+        return [t.detach().cpu().double() for t in values], len(collected)
+
+    return once
+
+
+def assert_same(found, expected, tolerance):
+    for index, (a, b) in enumerate(zip(found, expected, strict=True)):
+        assert (a - b).abs().max() <= tolerance * max(1e-3, float(b.abs().max())), index
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("law, plastic", [("corotated", False), ("von_mises", True), ("von_mises", False)])
+@pytest.mark.parametrize("penalised", [True, False])
+def test_a_chain_is_its_segments(device, law, plastic, penalised, make_block):
+    """11 substeps of a frame are 6 evaluations, the last for one substep. On CUDA: eager, then captured, then replayed."""
+    adapter = adapter_of(device, torch.float64, plastic)
+    make = (law, device, torch.float64, make_block(n=5, velocity=(0.3, -1.0, 0.2)), adapter)
+    (expected, evaluations), once = rolled(False, *make, penalised=penalised)(), rolled(True, *make, penalised=penalised)
+    for _ in range(3):
+        found, count = once()
+        assert count == evaluations
+        assert_same(found, expected, 1e-11 if device == "cpu" else 1e-9)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_graphs_follow_new_weights_states_and_windows(device, make_block):
+    """What a graph holds by value or address may not outlive it: weights change in place and by copy, the body moves."""
+    adapter = adapter_of(device, torch.float64, False)
+    near, far = make_block(n=5, velocity=(0.3, -1.0, 0.2)), make_block(n=5, velocity=(30.0, 20.0, -10.0))
+    for state in (near, near, near, far, far, far, near):
+        make = ("corotated", device, torch.float64, state, adapter)
+        expected, _ = rolled(False, *make)()
+        assert_same(rolled(True, *make)()[0], expected, 1e-9)
+        with torch.no_grad():
+            for p in adapter.parameters():
+                p.mul_(0.9)
+    once = rolled(True, *make)
+    for _ in range(3):
+        adapter.load_state_dict(adapter_of(device, torch.float64, False).state_dict())
+        for module in adapter.operator.phi.children():
+            if isinstance(module, nn.Linear):
+                module.weight = nn.Parameter(0.8 * module.weight.detach())
+        expected, _ = rolled(False, *make)()
+        assert_same(rolled(True, *make)()[0], expected, 1e-9)
+        once()
+
+
+def test_divergence_names_the_substep_and_the_particle(make_block):
+    adapter, state = adapter_of("cpu", torch.float64, False), make_block(n=5, velocity=(0.0, 1.5, 0.0))
+    top = float(state.x[:, 1].max()) + 0.008  # reached in the second frame
+    box = torch.tensor([[-1.0, -1.0, -1.0], [1.0, top, 1.0]])
+    messages = []
+    for chained in (False, True):
+        with pytest.raises(SimulationDiverged) as caught:
+            rolled(chained, "neo_hookean", "cpu", torch.float64, state, adapter, box=box)()
+        messages.append(str(caught.value))
+    assert messages[0] == messages[1] and "outside the box" in messages[1]
+    assert int(messages[1].split(",")[0].removeprefix("substep ")) > 11
+
+
+def test_segments_are_grouped_evenly_and_in_order():
+    assert grouped([8] * 5, 32) == [(8, 8, 8), (8, 8)]
+    assert grouped([1] * 40, 32) == [(1,) * 20, (1,) * 20]
+    assert grouped([5, 5, 1], 32) == [(5, 5, 1)]
+    assert grouped([8, 8, 3], 4) == [(8,), (8,), (3,)]
+
+
+@pytest.mark.gpu
+@CUDA
+def test_an_adapter_that_looks_at_the_host_runs_uncaptured(make_block):
+    class Looking(StressAdapter):
+        def forward(self, state):
+            float(state.w.sum())
+            return super().forward(state)
+
+    adapter = Looking(hidden=16, fused=False).double()
+    adapter.switch_on(E, NU)
+    make = ("corotated", "cuda", torch.float64, make_block(n=5), adapter.cuda())
+    expected, _ = rolled(False, *make)()
+    once = rolled(True, *make)
+    once()
+    with pytest.warns(UserWarning, match="Looking cannot be captured"):
+        found, _ = once()
+    assert_same(found, expected, 1e-9)
+    assert_same(once()[0], expected, 1e-9)
