@@ -16,6 +16,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
 
 from mosa.analysis.figures import side_by_side, write_strip, write_video
 from mosa.analysis.tables import parameter_table, results_table
@@ -91,10 +92,11 @@ def starts(
 
     Prefixes: train, then train/<name> for the sequences named in `taught`, test/<name> for the rest, in the order of `others`.
     """
-    found = {"train": sequence_start(body, reconstruction.splats, training, register=False)}
-    for scene in others:
+    splats = reconstruction.splats.to(body.rest.device)  # where its images are rendered
+    found = {"train": sequence_start(body, splats, training, register=False)}
+    for scene in tqdm(others, "poses of the other sequences", leave=False):
         prefix = f"{'train' if scene.sequence in taught else 'test'}/{scene.sequence}"
-        found[prefix] = sequence_start(body, reconstruction.splats, scene, register=True)
+        found[prefix] = sequence_start(body, splats, scene, register=True)
     return found
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import torch
 from torch import Tensor
@@ -111,6 +111,9 @@ class Splats:
     rotations: Tensor
     opacities: Tensor
     colors: Tensor
+
+    def to(self, device: torch.device | str) -> Splats:
+        return Splats(*(getattr(self, f.name).to(device) for f in fields(self)))
 
 
 @dataclass(frozen=True)

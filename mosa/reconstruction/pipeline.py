@@ -202,7 +202,7 @@ def reconstruct(
     @functools.cache  # more than one stage reads it, also where there is no cache folder
     def static_stage() -> dict[str, Tensor]:
         if settings.splats is not None:
-            cache.strip("static", still, _render_still(_on(imported, device), still, background))
+            cache.strip("static", still, _render_still(imported.to(device), still, background))
             return _tensors(imported)
         start = initial_splats(hull, still, count=settings.points, seed=seed)
         with bar("static Gaussians", settings.static.iterations) as steps:
@@ -211,7 +211,7 @@ def reconstruct(
         return _tensors(fitted)
 
     def appearance_stage() -> dict[str, Tensor]:
-        static = _on(Splats(**cache.stage("static", static_stage)), device)
+        static = Splats(**cache.stage("static", static_stage)).to(device)
         particles = fill_body(hull, static, still, settings, spacing)
         start = scaffold_splats(particles, static, device)
         with bar("appearance of the particles", settings.appearance.iterations) as steps:
@@ -224,8 +224,8 @@ def reconstruct(
     splats = Splats(**particles)
 
     def motion_stage() -> dict[str, Tensor]:
-        static = _on(Splats(**cache.stage("static", static_stage)), device)
-        return _motion(scene, _on(splats, device), static, windows, background, settings, seed, bar, cache)
+        static = Splats(**cache.stage("static", static_stage)).to(device)
+        return _motion(scene, splats.to(device), static, windows, background, settings, seed, bar, cache)
 
     motion = cache.stage("motion", motion_stage)
     static = Splats(**cache.stage("static", static_stage))
@@ -276,14 +276,14 @@ def follow(
         pose=[[round(v, 6) for v in part.flatten().tolist()] for part in pose],
     )  # fmt: skip
     windows = object_windows(scene, views, frames, margin=settings.margin).to(device)
-    splats = posed(_on(reconstruction.splats, "cpu"), *(p.cpu() for p in pose))
-    static = splats if reconstruction.static is None else posed(_on(reconstruction.static, "cpu"), *(p.cpu() for p in pose))
+    splats = posed(reconstruction.splats.to("cpu"), *(p.cpu() for p in pose))
+    static = splats if reconstruction.static is None else posed(reconstruction.static.to("cpu"), *(p.cpu() for p in pose))
 
     def bar(name: str, total: int) -> tqdm:
         return tqdm(total=total, desc=f"reconstruction of {scene.sequence}: {name}", disable=not progress, leave=False)
 
     def motion_stage() -> dict[str, Tensor]:
-        return _motion(scene, _on(splats, device), _on(static, device), windows, scene.background.to(device), settings, seed, bar,
+        return _motion(scene, splats.to(device), static.to(device), windows, scene.background.to(device), settings, seed, bar,
                        cache)
 
     motion = cache.stage("motion", motion_stage)
@@ -292,10 +292,6 @@ def follow(
 
 def _volume_tensors(volume: Volume) -> dict[str, Any]:
     return {"values": volume.values.cpu(), "origin": volume.origin.cpu(), "pitch": volume.pitch}
-
-
-def _on(splats: Splats, device: torch.device | str) -> Splats:
-    return Splats(*(getattr(splats, f.name).to(device) for f in fields(Splats)))
 
 
 def scaffold_splats(particles: Particles, static: Splats, device: torch.device | str) -> Splats:
