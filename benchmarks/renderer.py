@@ -175,8 +175,9 @@ def device_time(stage, repeats: int, calls: int = 5) -> float:
     for _ in range(repeats + 1):
         began, ended = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
         began.record()
-        for _ in range(calls):
-            stage()
+        with splatting.torch_stream(torch.device("cuda")):
+            for _ in range(calls):
+                stage()
         ended.record()
         ended.synchronize()
         figures.append(began.elapsed_time(ended) / calls)

@@ -6,6 +6,7 @@ place in its list where a pixel ended; on CUDA the tile lists too, one entry per
 Nothing grows with Gaussians times pixels.
 """
 
+import contextlib
 import functools
 from dataclasses import dataclass
 
@@ -56,6 +57,18 @@ def start_warp() -> None:
     wp.init()
 
 
+@functools.cache
+def _warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
+    return wp.stream_from_torch(stream)
+
+
+def torch_stream(device: torch.device):
+    """Context in which Warp launches where torch does: in order with its work, without waiting at every change between them."""
+    if device.type == "cpu":
+        return contextlib.nullcontext()
+    return wp.ScopedStream(_warp_stream(torch.cuda.current_stream(device)), sync_enter=False)
+
+
 @dataclass(frozen=True)
 class Geometry:
     """What a call fixes besides its differentiable inputs. state_index: (B,) int32; scan: gaussian | tile."""
@@ -98,9 +111,10 @@ class Splat(torch.autograd.Function):
         means, covariances, opacities, features, K, w2c = (
             x.detach().contiguous() for x in (means, covariances, opacities, features, K, w2c)
         )
-        records, depths = project(means, covariances, opacities, K, w2c, geometry)
-        lists = depth_lists(depths, records, geometry)
-        image, transmittance, ends = composite(lists, records, features, geometry)
+        with torch_stream(means.device):
+            records, depths = project(means, covariances, opacities, K, w2c, geometry)
+            lists = depth_lists(depths, records, geometry)
+            image, transmittance, ends = composite(lists, records, features, geometry)
         ctx.save_for_backward(means, covariances, opacities, features, K, w2c, records, transmittance, ends, *lists)
         ctx.geometry = geometry
         return image, 1 - transmittance
@@ -109,12 +123,13 @@ class Splat(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, grad_image: Tensor, grad_alpha: Tensor):
         means, covariances, opacities, features, K, w2c, records, transmittance, ends, *lists = ctx.saved_tensors
-        moments, grad_features = composite_backward(
-            lists, records, features, ends, transmittance, grad_image.contiguous(), grad_alpha.contiguous(), ctx.geometry
-        )
-        projected = (means, covariances, opacities, K, w2c, records, moments, ctx.geometry)
-        gradients = project_backward(*projected)
-        cameras = camera_backward(*projected) if any(ctx.needs_input_grad[4:6]) else (None, None)
+        with torch_stream(means.device):
+            moments, grad_features = composite_backward(
+                lists, records, features, ends, transmittance, grad_image.contiguous(), grad_alpha.contiguous(), ctx.geometry
+            )
+            projected = (means, covariances, opacities, K, w2c, records, moments, ctx.geometry)
+            gradients = project_backward(*projected)
+            cameras = camera_backward(*projected) if any(ctx.needs_input_grad[4:6]) else (None, None)
         return *gradients, grad_features, *cameras, None
 
 

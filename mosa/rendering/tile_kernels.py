@@ -221,12 +221,12 @@ def tile_kernels(dtype: type, channels: int):
                     weight = dtype(0.0)
                     gq = dtype(0.0)
                     if counts:
-                        rest = dtype(1.0) - alpha
+                        unfold = dtype(1.0) / (dtype(1.0) - alpha)
                         own = wp.dot(g, features[f])
-                        T /= rest
+                        T *= unfold
                         weight = T * alpha
                         if r[2] * e <= alpha_max:
-                            gq = dtype(-0.5) * alpha * (own * T - behind / rest)
+                            gq = dtype(-0.5) * alpha * (own * T - behind * unfold)
                         behind += weight * own
                     d = from_center(r, x, y)
                     moment = gq * vec6(dtype(1.0), d[0], d[1], d[0] * d[0], d[0] * d[1], d[1] * d[1])

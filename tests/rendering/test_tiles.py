@@ -41,6 +41,40 @@ def test_any_number_of_channels(channels, shared):
     agree(scene)
 
 
+@pytest.mark.gpu
+@pytest.mark.parametrize("channels", [1, 3, 9, 17, 40])
+@pytest.mark.parametrize("shared", [False, True])
+def test_warps_of_32_lanes_agree_with_one(channels, shared):
+    """On CUDA and on a CPU, lists longer than a warp, capped alphas and pixels that end inside them."""
+    scene = draw(1500, images=3, channels=channels)
+    scene.cameras = ring(3, 61, 45)
+    scene.opacities[::2] = 1.0
+    if shared:
+        scene.features = scene.features[:1]
+    wanted = (*render(scene, rasterize), *gradients(scene, rasterize))
+    for name in (*NAMES, "background", "state_index", "cameras"):
+        setattr(scene, name, getattr(scene, name).to("cuda"))
+    for ours, value in zip((*render(scene, rasterize), *gradients(scene, rasterize)), wanted):
+        torch.testing.assert_close(ours.cpu(), value, rtol=1e-9, atol=1e-10 * float(value.abs().max()))
+
+
+@pytest.mark.gpu
+def test_a_stream_of_its_own():
+    """Warp's kernels follow torch's work on whatever stream it is queued."""
+    scene = draw(200, images=3)
+    for name in (*NAMES, "background", "state_index", "cameras"):
+        setattr(scene, name, getattr(scene, name).to("cuda"))
+    wanted = gradients(scene, rasterize)
+    torch.cuda.synchronize()
+    with torch.cuda.stream(torch.cuda.Stream()):
+        torch.cuda._sleep(10_000_000)
+        scene.means = scene.means + 0.0
+        found = gradients(scene, rasterize)
+    torch.cuda.synchronize()
+    for ours, value in zip(found, wanted):
+        torch.testing.assert_close(ours, value, rtol=1e-9, atol=1e-10 * float(value.abs().max()))
+
+
 def test_gaussians_larger_than_the_image():
     """Also nearly flat ones that cross it as a stripe."""
     scene = draw(15, images=2, size=1.0, channels=9)
