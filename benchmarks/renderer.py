@@ -1,6 +1,8 @@
 """Speed of the rasteriser, forward and backward, beside gsplat where it runs.
 
     python benchmarks/renderer.py [--repeats 7] [--counts 10000 50000] [--device cpu|cuda] [--views 12]
+    python benchmarks/renderer.py --parts     the CUDA kernels' share, stage by stage
+    python benchmarks/renderer.py --parity    differences from gsplat on the scene of tests/rendering/test_backends.py
 
 CPU: one 400 x 400 image, three colours and alpha, CPU-seconds on one thread. CUDA: 12 views of 400 x 400 in one batch, colour,
 alpha and Gaussian flow (nine channels), milliseconds and peak memory. Gradients to means, covariances, opacities and features.
@@ -14,12 +16,14 @@ from __future__ import annotations
 import argparse
 import platform
 import statistics
+import sys
 import time
+from pathlib import Path
 
 import torch
 import warp as wp
 
-from mosa.rendering import gsplat_backend
+from mosa.rendering import gsplat_backend, splatting
 from mosa.rendering.cameras import look_at
 from mosa.rendering.covariance import covariance_from, project_gaussians
 from mosa.rendering.flow import flow_features
@@ -57,13 +61,11 @@ def scene(kind: str, count: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tens
     return means[None], covariance_from(scales, rotations)[None], opacities
 
 
-def step(kind: str, count: int, views: int, channels: int, device: str, backend: str):
-    """A function that renders and differentiates once."""
+def inputs(kind: str, count: int, views: int, channels: int, device: str) -> tuple[tuple[torch.Tensor, ...], Cameras]:
+    """Means, covariances, opacities and features (three colours, with nine channels the six of flow too), and cameras."""
     means, covariances, opacities = (x.to(device) for x in scene(kind, count))
     cameras = ring(views).to(device)
-    index = torch.zeros(views, dtype=torch.long, device=device)
-    g = torch.Generator().manual_seed(1)
-    features = torch.rand(1, count, 3, generator=g).to(device)
+    features = torch.rand(1, count, 3, generator=torch.Generator().manual_seed(1)).to(device)
     if channels == 9:
         moved = 1.01 * means + 0.01
         motion = flow_features(
@@ -71,8 +73,15 @@ def step(kind: str, count: int, views: int, channels: int, device: str, backend:
             moved.expand(views, -1, -1), covariances.expand(views, -1, -1, -1), cameras,
         )  # fmt: skip
         features = torch.cat((features.expand(views, -1, -1), motion), -1)
-    leaves = [x.clone().requires_grad_() for x in (means, covariances, opacities, features)]
-    weight = torch.rand(views, SIZE, SIZE, channels, generator=g).to(device)
+    return (means, covariances, opacities, features), cameras
+
+
+def step(kind: str, count: int, views: int, channels: int, device: str, backend: str):
+    """A function that renders and differentiates once."""
+    values, cameras = inputs(kind, count, views, channels, device)
+    leaves = [x.clone().requires_grad_() for x in values]
+    index = torch.zeros(views, dtype=torch.long, device=device)
+    weight = torch.rand(views, SIZE, SIZE, channels, generator=torch.Generator().manual_seed(2)).to(device)
 
     def run() -> None:
         image, alpha = rasterize(*leaves, cameras, index, backend=backend)
@@ -138,16 +147,102 @@ def on_cuda(counts: list[int], repeats: int, views: int) -> None:
                 )
 
 
+@torch.no_grad()
+def parts(kind: str, count: int, views: int) -> tuple[dict, int]:
+    """The stages of one forward and backward pass as functions of no arguments, by name, and the entries of the tile lists."""
+    (means, covariances, opacities, features), cameras = inputs(kind, count, views, 9, "cuda")
+    index = torch.zeros(views, dtype=torch.int32, device="cuda")
+    g = splatting.Geometry(index, SIZE, SIZE, splatting.PRESETS["gsplat"], "tile")
+    splatting.start_warp()
+    gaussians = (means, covariances, opacities, cameras.K, cameras.w2c)
+    records, depths = splatting.project(*gaussians, g)
+    lists = splatting.depth_lists(depths.clone(), records, g)
+    image, transmittance, ends = splatting.composite(lists, records, features, g)
+    state = (ends, transmittance, torch.rand_like(image), torch.ones_like(transmittance))
+    moments, _ = splatting.composite_backward(lists, records, features, *state, g)
+    return {
+        "projection": lambda: splatting.project(*gaussians, g),
+        "sorting + lists": lambda: splatting.depth_lists(depths.clone(), records, g),
+        "compositing": lambda: splatting.composite(lists, records, features, g),
+        "compositing, backward": lambda: splatting.composite_backward(lists, records, features, *state, g),
+        "projection, backward": lambda: splatting.project_backward(*gaussians, records, moments, g),
+    }, len(lists[0])
+
+
+def device_time(stage, repeats: int, calls: int = 5) -> float:
+    """Milliseconds of one call, the longer of host and device where they overlap: median of `repeats` rows of calls."""
+    figures = []
+    for _ in range(repeats + 1):
+        began, ended = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+        began.record()
+        with splatting.torch_stream(torch.device("cuda")):
+            for _ in range(calls):
+                stage()
+        ended.record()
+        ended.synchronize()
+        figures.append(began.elapsed_time(ended) / calls)
+    return statistics.median(figures[1:])
+
+
+def print_parts(counts: list[int], repeats: int, views: int) -> None:
+    print(f"\nCUDA, {views} images of {SIZE}x{SIZE}, 9 channels, stage by stage, median of {repeats} [ms]\n")
+    names = None
+    for kind in ("object", "cloud"):
+        for count in counts:
+            stages, entries = parts(kind, count, views)
+            if names is None:
+                names = list(stages)
+                print(f"| scene | Gaussians | {' | '.join(names)} | entries |\n|{'---|' * (len(names) + 3)}")
+            figures = [f"{device_time(stage, repeats):.3f}" for stage in stages.values()]
+            print(f"| {kind} | {count} | {' | '.join(figures)} | {entries} |")
+
+
+def print_parity() -> None:
+    """Both backends on the scene that tests/rendering/test_backends.py compares, on CUDA; without gsplat, the two orders of
+    work of this package."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "rendering"))
+    from test_backends import NAMES, outcome, parity_scene
+
+    drawn, clear = parity_scene()
+    if torch.cuda.is_available():
+        for name in (*NAMES, "background", "state_index", "cameras"):
+            setattr(drawn, name, getattr(drawn, name).to("cuda"))
+        clear = clear.to("cuda")
+    reason = gsplat_backend.why_unavailable()
+    ways = {"warp": {"backend": "warp"}, "gsplat": {"backend": "gsplat"}}
+    if reason:
+        print(f"gsplat is left out: {reason}")
+        ways = {"pixel by pixel": {"scan": "tile"}, "Gaussian by Gaussian": {"scan": "gaussian"}}
+    (image, alpha, gradients), (wanted, wanted_alpha, wanted_gradients) = (
+        outcome(drawn, clear, lambda *x, options=options: rasterize(*x, **options)) for options in ways.values()
+    )
+    share = float(clear.float().mean())
+    print(f"\n{' against '.join(ways)}, at {share:.1%} of the pixels, those off the rims, where alpha is 1/255\n")
+    print("| what | largest difference | of the largest value | norm of the difference / norm |\n|---|---|---|---|")
+    rows = {"image": (image[clear], wanted[clear]), "alpha": (alpha[clear], wanted_alpha[clear])}
+    rows |= {f"gradient, {name}": (gradients[name], wanted_gradients[name]) for name in gradients}
+    for name, (ours, theirs) in rows.items():
+        off = (ours - theirs).abs()
+        figures = (off.max(), off.max() / theirs.abs().max(), off.norm() / theirs.norm())
+        print(f"| {name} | {' | '.join(f'{float(x):.1e}' for x in figures)} |")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--views", type=int, default=12)
     parser.add_argument("--counts", type=int, nargs="*")
     parser.add_argument("--device", choices=("cpu", "cuda"), help="default: both where there is CUDA")
+    parser.add_argument("--parts", action="store_true", help="the stages on CUDA, nothing else")
+    parser.add_argument("--parity", action="store_true", help="differences from gsplat, nothing else")
     options = parser.parse_args()
     cuda = torch.cuda.is_available()
     print(f"{platform.processor() or platform.machine()}, torch {torch.__version__}, warp {wp.__version__}", end="")
     print(f", {torch.cuda.get_device_name()}, CUDA {torch.version.cuda}" if cuda else ", no CUDA device")
+    if options.parity:
+        return print_parity()
+    if options.parts:
+        return print_parts(options.counts or [30_000, 100_000, 1_000_000], options.repeats, options.views)
     if options.device != "cuda":
         on_cpu(options.counts or [10_000, 50_000], options.repeats)
     if cuda and options.device != "cpu":

@@ -9,6 +9,8 @@ import functools
 
 import warp as wp
 
+from mosa.rendering.records import gradient_functions, record_functions, record_type
+
 TILE = 16
 """Side of a tile [px]."""
 
@@ -23,8 +25,8 @@ ALPHA_MIN = 1.0 / 255.0
 def projection_kernels(dtype: type):
     """(project, project_backward, camera_backward) for one Warp scalar type.
 
-    Arrays are flat: `means`, `covariances` over S * N, everything per image over B * N. `settings` holds near
-    plane, clamp margin (0.3), largest extent in standard deviations and 1 for the square INRIA extent.
+    Arrays are flat: `means`, `covariances` over S * N, records and their moments (records.py) over B * N. `settings` holds
+    near plane, clamp margin (0.3), largest extent in standard deviations and 1 for the square INRIA extent.
     camera_backward is launched only where cameras are learned: it repeats the work of project_backward instead of
     storing it per image and Gaussian.
     """
@@ -36,6 +38,9 @@ def projection_kernels(dtype: type):
     mat33 = wp.types.matrix(shape=(3, 3), dtype=dtype)
     mat34 = wp.types.matrix(shape=(3, 4), dtype=dtype)
     mat44 = wp.types.matrix(shape=(4, 4), dtype=dtype)
+    record = record_type(dtype)
+    load, store, pack, _, conic, _ = record_functions(dtype)
+    center_gradient, conic_gradient, opacity_gradient = gradient_functions(dtype)
 
     @wp.func
     def rotation(w2c: mat44):
@@ -154,20 +159,16 @@ def projection_kernels(dtype: type):
         width: int,
         height: int,
         # out
-        centers: wp.array(dtype=vec2),
-        conics: wp.array(dtype=vec3),
-        weights: wp.array(dtype=dtype),
+        records: wp.array(dtype=record),
         depths: wp.array(dtype=dtype),
-        rects: wp.array(dtype=wp.vec4i),
     ):
         b, n = wp.tid()
         i = b * count + n
         s = state_index[b] * count + n
         p = to_camera(w2c[b], means[s])
         o = opacities[state_index[b] * opacity_stride + n]
-        weights[i] = o
-        depths[i] = dtype(wp.inf)
-        rects[i] = wp.vec4i(0, 0, 0, 0)
+        depth = dtype(wp.inf)
+        result = record()
         if p[2] > settings[0] and o >= dtype(ALPHA_MIN):
             limits = slope_limits(K[b], width, height, settings[1])
             T = jacobian(K[b], p, limits) * rotation(w2c[b])
@@ -179,9 +180,8 @@ def projection_kernels(dtype: type):
             if det > dtype(0.0):
                 u = (K[b][0, 0] * p[0] + K[b][0, 1] * p[1]) / p[2] + K[b][0, 2]
                 v = K[b][1, 1] * p[1] / p[2] + K[b][1, 2]
-                centers[i] = vec2(u, v)
-                conics[i] = vec3(syy / det, -sxy / det, sxx / det)
-                depths[i] = p[2]
+                depth = p[2]
+                rect = wp.vec4i(0, 0, 0, 0)
                 w = dtype(width)
                 h = dtype(height)
                 zero = dtype(0.0)
@@ -196,7 +196,7 @@ def projection_kernels(dtype: type):
                     x1 = t * wp.floor((wp.clamp(u - half + r + t - dtype(1.0), zero, w + t)) / t)
                     y0 = t * wp.floor((wp.clamp(v - half - r, zero, h + t)) / t)
                     y1 = t * wp.floor((wp.clamp(v - half + r + t - dtype(1.0), zero, h + t)) / t)
-                    rects[i] = wp.vec4i(int(x0), wp.min(int(x1), width), int(y0), wp.min(int(y1), height))
+                    rect = wp.vec4i(int(x0), wp.min(int(x1), width), int(y0), wp.min(int(y1), height))
                 else:
                     e = wp.min(settings[2], wp.sqrt(dtype(2.0) * wp.log(dtype(255.0) * o)))
                     rx = wp.ceil(e * wp.sqrt(sxx))
@@ -205,7 +205,10 @@ def projection_kernels(dtype: type):
                     x1 = wp.clamp(wp.ceil(u + rx), zero, w)
                     y0 = wp.clamp(wp.floor(v - ry), zero, h)
                     y1 = wp.clamp(wp.ceil(v + ry), zero, h)
-                    rects[i] = wp.vec4i(int(x0), int(x1), int(y0), int(y1))
+                    rect = wp.vec4i(int(x0), int(x1), int(y0), int(y1))
+                result = pack(vec2(u, v), o, vec3(syy / det, -sxy / det, sxx / det), rect)
+        store(records, i, result)
+        depths[i] = depth
 
     @wp.kernel(enable_backward=False, module="unique")
     def project_backward(
@@ -220,11 +223,8 @@ def projection_kernels(dtype: type):
         width: int,
         height: int,
         images: int,
-        conics: wp.array(dtype=vec3),
-        rects: wp.array(dtype=wp.vec4i),
-        grad_centers: wp.array(dtype=vec2),
-        grad_conics: wp.array(dtype=vec3),
-        grad_weights: wp.array(dtype=dtype),
+        records: wp.array(dtype=record),
+        moments: wp.array(dtype=record),
         # out, zero at first
         grad_means: wp.array(dtype=vec3),
         grad_covariances: wp.array(dtype=mat33),
@@ -232,23 +232,33 @@ def projection_kernels(dtype: type):
     ):
         # one thread per Gaussian goes through all images: sums over images without atomics, the same at every run
         n = wp.tid()
+        gm = vec3()
+        gA = mat33()
+        go = dtype(0.0)
         for b in range(images):
             i = b * count + n
-            rect = rects[i]
-            if rect[1] > rect[0] and rect[3] > rect[2]:
-                s = state_index[b] * count + n
+            m = load(moments, i)
+            if wp.max(wp.abs(m)) > dtype(0.0):
+                r = load(records, i)
                 R = rotation(w2c[b])
-                p = to_camera(w2c[b], means[s])
+                p = to_camera(w2c[b], means[state_index[b] * count + n])
                 limits = slope_limits(K[b], width, height, settings[1])
                 T = jacobian(K[b], p, limits) * R
-                A = symmetric(covariances[s])
-                G = covariance_gradient(conics[i], grad_conics[i])
-                grad_covariances[s] = grad_covariances[s] + wp.transpose(T) * G * T
-                gJ = dtype(2.0) * G * T * A * wp.transpose(R)
-                gp = point_gradient(K[b], p, limits, grad_centers[i], gJ)
-                grad_means[s] = grad_means[s] + wp.transpose(R) * gp
+                G = covariance_gradient(conic(r), conic_gradient(m))
+                gJ = dtype(2.0) * G * T * symmetric(covariances[state_index[b] * count + n]) * wp.transpose(R)
+                gA += wp.transpose(T) * G * T
+                gm += wp.transpose(R) * point_gradient(K[b], p, limits, center_gradient(r, m), gJ)
+                go += opacity_gradient(r, m)
+            # images of one state mostly follow each other: one write for all of them
+            if b == images - 1 or state_index[wp.min(b + 1, images - 1)] != state_index[b]:
+                s = state_index[b] * count + n
                 k = state_index[b] * opacity_stride + n
-                grad_opacities[k] = grad_opacities[k] + grad_weights[i]
+                grad_covariances[s] = grad_covariances[s] + gA
+                grad_means[s] = grad_means[s] + gm
+                grad_opacities[k] = grad_opacities[k] + go
+                gA = mat33()
+                gm = vec3()
+                go = dtype(0.0)
 
     @wp.kernel(enable_backward=False, module="unique")
     def camera_backward(
@@ -262,10 +272,8 @@ def projection_kernels(dtype: type):
         width: int,
         height: int,
         chunks: int,
-        conics: wp.array(dtype=vec3),
-        rects: wp.array(dtype=wp.vec4i),
-        grad_centers: wp.array(dtype=vec2),
-        grad_conics: wp.array(dtype=vec3),
+        records: wp.array(dtype=record),
+        moments: wp.array(dtype=record),
         # out: partial sums over every `chunks`-th Gaussian, (B * chunks)
         grad_w2c: wp.array(dtype=mat34),
         grad_K: wp.array(dtype=mat33),
@@ -277,23 +285,25 @@ def projection_kernels(dtype: type):
         gk = mat33()
         for n in range(first, count, chunks):
             i = b * count + n
-            rect = rects[i]
-            if rect[1] > rect[0] and rect[3] > rect[2]:
+            moment = load(moments, i)
+            if wp.max(wp.abs(moment)) > dtype(0.0):
+                r = load(records, i)
                 s = state_index[b] * count + n
                 m = means[s]
                 p = to_camera(w2c[b], m)
                 J = jacobian(K[b], p, limits)
                 # Sigma_2D = T A T^T with T = J R
-                gT = dtype(2.0) * covariance_gradient(conics[i], grad_conics[i]) * (J * R) * symmetric(covariances[s])
+                gT = dtype(2.0) * covariance_gradient(conic(r), conic_gradient(moment)) * (J * R) * symmetric(covariances[s])
                 gJ = gT * wp.transpose(R)
-                gp = point_gradient(K[b], p, limits, grad_centers[i], gJ)
+                gc = center_gradient(r, moment)
+                gp = point_gradient(K[b], p, limits, gc, gJ)
                 gR = wp.transpose(J) * gT + wp.outer(gp, m)
                 gw += mat34(
                     gR[0, 0], gR[0, 1], gR[0, 2], gp[0],
                     gR[1, 0], gR[1, 1], gR[1, 2], gp[1],
                     gR[2, 0], gR[2, 1], gR[2, 2], gp[2],
                 )  # fmt: skip
-                gk += intrinsics_gradient(K[b], p, limits, grad_centers[i], gJ)
+                gk += intrinsics_gradient(K[b], p, limits, gc, gJ)
         grad_w2c[b * chunks + first] = gw
         grad_K[b * chunks + first] = gk
 

@@ -12,6 +12,7 @@ import functools
 import warp as wp
 
 from mosa.rendering.projection_kernels import ALPHA_MIN
+from mosa.rendering.records import record_functions, record_type
 
 STOP = 1.0e-4
 """A Gaussian that would bring the transmittance to or below this is not added and ends the pixel."""
@@ -24,6 +25,8 @@ def raster_kernels(dtype: type, channels: int):
     vec2 = wp.types.vector(length=2, dtype=dtype)
     vec3 = wp.types.vector(length=3, dtype=dtype)
     vecc = wp.types.vector(length=channels, dtype=dtype)
+    record = record_type(dtype)
+    load, _, _, center_of, conic_of, pixels = record_functions(dtype)
 
     @wp.func
     def row_span(center: vec2, conic: vec3, reach: dtype, y: int, rect: wp.vec4i):
@@ -43,10 +46,7 @@ def raster_kernels(dtype: type, channels: int):
     @wp.kernel(enable_backward=False, module="unique")
     def forward(
         order: wp.array(dtype=wp.int32),
-        centers: wp.array(dtype=vec2),
-        conics: wp.array(dtype=vec3),
-        weights: wp.array(dtype=dtype),
-        rects: wp.array(dtype=wp.vec4i),
+        records: wp.array(dtype=record),
         features: wp.array(dtype=vecc),
         feature_stride: int,
         alpha_max: dtype,
@@ -63,11 +63,12 @@ def raster_kernels(dtype: type, channels: int):
         for rank in range(count):
             n = order[b * count + rank]
             i = b * count + n
-            rect = rects[i]
+            r = load(records, i)
+            rect = pixels(r)
             if rect[1] > rect[0]:
-                center = centers[i]
-                conic = conics[i]
-                o = weights[i]
+                center = center_of(r)
+                conic = conic_of(r)
+                o = r[2]
                 color = features[b * feature_stride + n]
                 reach = dtype(2.0) * wp.log(o / dtype(ALPHA_MIN))
                 for y in range(rect[2], rect[3]):
@@ -93,10 +94,7 @@ def raster_kernels(dtype: type, channels: int):
     @wp.kernel(enable_backward=False, module="unique")
     def backward(
         order: wp.array(dtype=wp.int32),
-        centers: wp.array(dtype=vec2),
-        conics: wp.array(dtype=vec3),
-        weights: wp.array(dtype=dtype),
-        rects: wp.array(dtype=wp.vec4i),
+        records: wp.array(dtype=record),
         features: wp.array(dtype=vecc),
         feature_stride: int,
         alpha_max: dtype,
@@ -109,9 +107,7 @@ def raster_kernels(dtype: type, channels: int):
         transmittance: wp.array(dtype=dtype),
         behind: wp.array(dtype=dtype),
         # out
-        grad_centers: wp.array(dtype=vec2),
-        grad_conics: wp.array(dtype=vec3),
-        grad_weights: wp.array(dtype=dtype),
+        moments: wp.array(dtype=record),
         grad_features: wp.array(dtype=vecc),
     ):
         b = wp.tid()
@@ -120,19 +116,20 @@ def raster_kernels(dtype: type, channels: int):
             rank = count - 1 - back
             n = order[b * count + rank]
             i = b * count + n
-            rect = rects[i]
+            r = load(records, i)
+            rect = pixels(r)
             if rect[1] > rect[0]:
-                center = centers[i]
-                conic = conics[i]
-                o = weights[i]
+                center = center_of(r)
+                conic = conic_of(r)
+                o = r[2]
                 color = features[b * feature_stride + n]
                 reach = dtype(2.0) * wp.log(o / dtype(ALPHA_MIN))
+                gq_sum = dtype(0.0)
                 gx = dtype(0.0)
                 gy = dtype(0.0)
                 gxx = dtype(0.0)
                 gxy = dtype(0.0)
                 gyy = dtype(0.0)
-                go = dtype(0.0)
                 gf = vecc()
                 for y in range(rect[2], rect[3]):
                     span = row_span(center, conic, reach, y, rect)
@@ -157,18 +154,15 @@ def raster_kernels(dtype: type, channels: int):
                                 behind[pixel] = later + T * alpha * own
                                 transmittance[pixel] = T
                                 if o * e <= alpha_max:
-                                    go += e * ga
                                     gq = dtype(-0.5) * alpha * ga
+                                    gq_sum += gq
                                     gx += gq * dx
                                     gy += gq * dy
                                     gxx += gq * dx * dx
                                     gxy += gq * dx * dy
                                     gyy += gq * dy * dy
-                two = dtype(2.0)
-                # q = a dx^2 + 2 b dx dy + c dy^2 with d = pixel - center
-                grad_centers[i] = -two * vec2(conic[0] * gx + conic[1] * gy, conic[1] * gx + conic[2] * gy)
-                grad_conics[i] = vec3(gxx, two * gxy, gyy)
-                grad_weights[i] = go
+                zero = dtype(0.0)
+                moments[i] = record(gq_sum, gx, gy, gxx, gxy, gyy, zero, zero)
                 k = b * feature_stride + n
                 grad_features[k] = grad_features[k] + gf
 

@@ -11,11 +11,14 @@ extent and cap are those of `preset` (`splatting.PRESETS`).
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError, DataError
 from mosa.rendering import gsplat_backend
+from mosa.rendering.records import SIDE_MAX
 from mosa.rendering.splatting import PRESETS, SCALARS, Geometry, Splat, start_warp
 from mosa.types import Cameras
 
@@ -59,13 +62,17 @@ def _check(means: Tensor, covariances: Tensor, opacities: Tensor, features: Tens
         if name != "state_index" and (value.dtype != means.dtype or value.dtype not in SCALARS):
             raise ConfigError(f"rasterize: {name} is {value.dtype}, means {means.dtype}; use one of float32, float64 for all")
     numbers = {"means": means, "covariances": covariances, "opacities": opacities, "features": features}
-    if not bool(torch.stack([value.detach().isfinite().all() for value in numbers.values()]).all()):  # one wait for the GPU
-        name = next(name for name, value in numbers.items() if not bool(value.detach().isfinite().all()))
+    # largest magnitudes: nan and inf come through, in one pass over each and one wait for the GPU
+    largest = torch.stack([torch.linalg.vector_norm(value.detach(), torch.inf) for value in numbers.values()]).tolist()
+    if not all(map(math.isfinite, largest)):
+        name = next(name for name, size in zip(numbers, largest) if not math.isfinite(size))
         where = (~numbers[name].detach().isfinite()).nonzero()[0].tolist()
         raise DataError(f"rasterize: {name}{where} is not finite; it would silently vanish from the image")
     for name, value, size in (("K", cameras.K, 3), ("w2c", cameras.w2c, 4)):
         if tuple(value.shape) != (images, size, size):
             raise ConfigError(f"rasterize: cameras.{name} has shape {tuple(value.shape)}, expected {(images, size, size)}")
+    if max(cameras.width, cameras.height) > SIDE_MAX:
+        raise ConfigError(f"rasterize: images of {cameras.width} x {cameras.height} px; no side may be longer than {SIDE_MAX}")
     if not means.is_cuda and (int(state_index.min()) < 0 or int(state_index.max()) >= states):
         raise ConfigError(f"rasterize: state_index reaches outside the {states} states")
 

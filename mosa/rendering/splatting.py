@@ -1,11 +1,12 @@
 """Splatting on Warp, for CPU and CUDA: projection and compositing kernels behind one torch autograd function.
 
 Gradients to means, covariances, opacities, features and, where they ask for one, to the cameras' K and w2c, by
-hand-written adjoints. Kept for the backward pass: the projected Gaussians, the final transmittance and the rank at
-which a pixel ended; on CUDA the tile lists too, one entry per (tile, Gaussian) pair that is visible. Nothing grows
-with Gaussians times pixels.
+hand-written adjoints. Kept for the backward pass: the projected Gaussians (records.py), the final transmittance and the
+place in its list where a pixel ended; on CUDA the tile lists too, one entry per (tile, Gaussian) pair that is visible.
+Nothing grows with Gaussians times pixels.
 """
 
+import contextlib
 import functools
 from dataclasses import dataclass
 
@@ -17,7 +18,8 @@ from torch.autograd.function import once_differentiable
 from mosa.rendering.covariance import CLAMP_MARGIN
 from mosa.rendering.projection_kernels import projection_kernels
 from mosa.rendering.raster_kernels import raster_kernels
-from mosa.rendering.tile_kernels import tile_kernels, tile_lists, tile_threads
+from mosa.rendering.tile_kernels import tile_kernels, tile_threads
+from mosa.rendering.tile_lists import tile_lists
 
 CAMERA_CHUNKS = 1024
 """Threads per image that sum the gradient of its camera."""
@@ -55,6 +57,18 @@ def start_warp() -> None:
     wp.init()
 
 
+@functools.cache
+def _warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
+    return wp.stream_from_torch(stream)
+
+
+def torch_stream(device: torch.device):
+    """Context in which Warp launches where torch does: in order with its work, without waiting at every change between them."""
+    if device.type == "cpu":
+        return contextlib.nullcontext()
+    return wp.ScopedStream(_warp_stream(torch.cuda.current_stream(device)), sync_enter=False)
+
+
 @dataclass(frozen=True)
 class Geometry:
     """What a call fixes besides its differentiable inputs. state_index: (B,) int32; scan: gaussian | tile."""
@@ -67,23 +81,23 @@ class Geometry:
 
 
 class _Arrays:
-    """Flat Warp views of torch tensors of one scalar type."""
+    """Flat Warp descriptors of contiguous torch tensors of one scalar type."""
 
     def __init__(self, dtype: torch.dtype):
         self.scalar = SCALARS[dtype]
 
-    def scalars(self, x: Tensor) -> wp.array:
-        return wp.from_torch(x.view(-1), dtype=self.scalar)
+    def scalars(self, x: Tensor):
+        return wp.from_torch(x.view(-1), dtype=self.scalar, return_ctype=True)
 
-    def vectors(self, x: Tensor) -> wp.array:
-        return wp.from_torch(x.view(-1, x.shape[-1]), dtype=_vector(x.shape[-1], self.scalar))
+    def vectors(self, x: Tensor):
+        return wp.from_torch(x.view(-1, x.shape[-1]), dtype=_vector(x.shape[-1], self.scalar), return_ctype=True)
 
-    def matrices(self, x: Tensor) -> wp.array:
-        return wp.from_torch(x.view(-1, *x.shape[-2:]), dtype=_matrix(*x.shape[-2:], self.scalar))
+    def matrices(self, x: Tensor):
+        return wp.from_torch(x.view(-1, *x.shape[-2:]), dtype=_matrix(*x.shape[-2:], self.scalar), return_ctype=True)
 
 
-def _integers(x: Tensor) -> wp.array:
-    return wp.from_torch(x.view(-1), dtype=wp.int32)
+def _integers(x: Tensor):
+    return wp.from_torch(x.view(-1), dtype=wp.int32, return_ctype=True)
 
 
 class Splat(torch.autograd.Function):
@@ -94,172 +108,180 @@ class Splat(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, means, covariances, opacities, features, K, w2c, geometry: Geometry):
-        g, preset = geometry, geometry.preset
         means, covariances, opacities, features, K, w2c = (
             x.detach().contiguous() for x in (means, covariances, opacities, features, K, w2c)
         )
-        images, count, channels = len(g.state_index), means.shape[1], features.shape[-1]
-        arrays, device = _Arrays(means.dtype), wp.device_from_torch(means.device)
-        centers, conics = means.new_zeros(images, count, 2), means.new_zeros(images, count, 3)
-        weights, depths = means.new_empty(images, count), means.new_empty(images, count)
-        rects = torch.empty(images, count, 4, dtype=torch.int32, device=means.device)
-        rects_wp = wp.from_torch(rects.view(-1, 4), dtype=wp.vec4i)
-        settings = _vector(4, arrays.scalar)(preset.near, CLAMP_MARGIN, preset.extent, float(preset.square))
-        opacity_stride = count if opacities.dim() == 2 else 0
-        project, *_ = projection_kernels(arrays.scalar)
-        wp.launch(
-            project,
-            dim=(images, count),
-            inputs=[
-                arrays.vectors(means),
-                arrays.matrices(covariances),
-                arrays.scalars(opacities),
-                opacity_stride,
-                arrays.matrices(K),
-                arrays.matrices(w2c),
-                _integers(g.state_index),
-                settings,
-                count,
-                g.width,
-                g.height,
-            ],
-            outputs=[
-                arrays.vectors(centers),
-                arrays.vectors(conics),
-                arrays.scalars(weights),
-                arrays.scalars(depths),
-                rects_wp,
-            ],
-            device=device,
-        )
-        order = depths.argsort(dim=1, stable=True).to(torch.int32)
-        transmittance = means.new_ones(images, g.height, g.width)
-        image = means.new_zeros(images, g.height, g.width, channels)
-        ends = torch.full((images, g.height, g.width), count, dtype=torch.int32, device=means.device)
-        feature_stride = count if features.shape[0] > 1 else 0
-        shared = [arrays.vectors(centers), arrays.vectors(conics), arrays.scalars(weights)]
-        tail = [arrays.vectors(features), feature_stride, arrays.scalar(preset.alpha_max), count, g.width, g.height]
-        outputs = [arrays.scalars(transmittance), arrays.vectors(image), _integers(ends)]
-        if g.scan == "gaussian":
-            lists = ()
-            kernel, _ = raster_kernels(arrays.scalar, channels)
-            wp.launch(kernel, dim=images, inputs=[_integers(order), *shared, rects_wp, *tail], outputs=outputs, device=device)
-        else:
-            lists = tile_lists(order, rects, g.width, g.height)
-            kernel, _ = tile_kernels(arrays.scalar, channels)
-            wp.launch(
-                kernel,
-                dim=tile_threads(images, g.width, g.height),
-                inputs=[*map(_integers, lists), *shared, rects_wp, *tail],
-                outputs=outputs,
-                device=device,
-            )
-        ctx.save_for_backward(
-            means, covariances, opacities, features, K, w2c, centers, conics, weights, rects, order, transmittance, ends, *lists
-        )
+        with torch_stream(means.device):
+            records, depths = project(means, covariances, opacities, K, w2c, geometry)
+            lists = depth_lists(depths, records, geometry)
+            image, transmittance, ends = composite(lists, records, features, geometry)
+        ctx.save_for_backward(means, covariances, opacities, features, K, w2c, records, transmittance, ends, *lists)
         ctx.geometry = geometry
         return image, 1 - transmittance
 
     @staticmethod
     @once_differentiable
     def backward(ctx, grad_image: Tensor, grad_alpha: Tensor):
-        means, covariances, opacities, features, K, w2c, centers, conics, weights, rects, order, final, ends, *lists = (
-            ctx.saved_tensors
-        )
-        g, preset = ctx.geometry, ctx.geometry.preset
-        images, count, channels = len(g.state_index), means.shape[1], features.shape[-1]
-        arrays, device = _Arrays(means.dtype), wp.device_from_torch(means.device)
-        rects_wp = wp.from_torch(rects.view(-1, 4), dtype=wp.vec4i)
-        transmittance, behind = final.clone(), -grad_alpha * final
-        grad_image = grad_image.contiguous()
-        grad_centers, grad_conics = torch.zeros_like(centers), torch.zeros_like(conics)
-        grad_weights, grad_features = torch.zeros_like(weights), torch.zeros_like(features)
-        feature_stride = count if features.shape[0] > 1 else 0
-        shared = [
-            arrays.vectors(centers),
-            arrays.vectors(conics),
-            arrays.scalars(weights),
-            rects_wp,
-            arrays.vectors(features),
-            feature_stride,
-            arrays.scalar(preset.alpha_max),
-            count,
-            g.width,
-            g.height,
+        means, covariances, opacities, features, K, w2c, records, transmittance, ends, *lists = ctx.saved_tensors
+        with torch_stream(means.device):
+            moments, grad_features = composite_backward(
+                lists, records, features, ends, transmittance, grad_image.contiguous(), grad_alpha.contiguous(), ctx.geometry
+            )
+            projected = (means, covariances, opacities, K, w2c, records, moments, ctx.geometry)
+            gradients = project_backward(*projected)
+            cameras = camera_backward(*projected) if any(ctx.needs_input_grad[4:6]) else (None, None)
+        return *gradients, grad_features, *cameras, None
+
+
+def project(means: Tensor, covariances: Tensor, opacities: Tensor, K: Tensor, w2c: Tensor, g: Geometry) -> tuple[Tensor, Tensor]:
+    """Records (B, N, 8) and depths (2 B N,), infinite where nothing is seen; the second half is room to sort them."""
+    images, count = len(g.state_index), means.shape[1]
+    arrays = _Arrays(means.dtype)
+    records, depths = means.new_empty(images, count, 8), means.new_empty(2 * images * count)
+    kernel, *_ = projection_kernels(arrays.scalar)
+    wp.launch(
+        kernel,
+        dim=(images, count),
+        inputs=[
+            arrays.vectors(means),
+            arrays.matrices(covariances),
+            arrays.scalars(opacities),
+            count if opacities.dim() == 2 else 0,
+            *_projection(arrays, K, w2c, count, g),
+        ],
+        outputs=[arrays.vectors(records), arrays.scalars(depths)],
+        device=wp.device_from_torch(means.device),
+    )
+    return records, depths
+
+
+def depth_lists(depths: Tensor, records: Tensor, g: Geometry) -> tuple[Tensor, ...]:
+    """What compositing walks: the Gaussians of each image by depth, (B, N), or those of each tile, `tile_lists`."""
+    if g.scan == "tile":
+        return tile_lists(depths, records, g.width, g.height)
+    images, count, _ = records.shape
+    return (depths[: images * count].view(images, count).argsort(dim=1, stable=True).to(torch.int32),)
+
+
+def composite(lists: tuple[Tensor, ...], records: Tensor, features: Tensor, g: Geometry) -> tuple[Tensor, Tensor, Tensor]:
+    """Image (B, H, W, C), final transmittance (B, H, W) and the place in its list where each pixel ended (B, H, W)."""
+    images, count, _ = records.shape
+    arrays, shape = _Arrays(records.dtype), (images, g.height, g.width)
+    if g.scan == "tile":
+        kernel, _ = tile_kernels(arrays.scalar, features.shape[-1])
+        threads = tile_threads(images, g.width, g.height)
+        transmittance, image = records.new_empty(shape), records.new_empty(*shape, features.shape[-1])
+        ends = torch.empty(shape, dtype=torch.int32, device=records.device)
+    else:
+        kernel, _ = raster_kernels(arrays.scalar, features.shape[-1])
+        threads = images
+        transmittance, image = records.new_ones(shape), records.new_zeros(*shape, features.shape[-1])
+        ends = torch.full(shape, count, dtype=torch.int32, device=records.device)
+    wp.launch(
+        kernel,
+        dim=threads,
+        inputs=[*map(_integers, lists), *_splats(arrays, records, features, g)],
+        outputs=[arrays.scalars(transmittance), arrays.vectors(image), _integers(ends)],
+        device=wp.device_from_torch(records.device),
+    )
+    return image, transmittance, ends
+
+
+def composite_backward(
+    lists: tuple[Tensor, ...],
+    records: Tensor,
+    features: Tensor,
+    ends: Tensor,
+    transmittance: Tensor,
+    grad_image: Tensor,
+    grad_alpha: Tensor,
+    g: Geometry,
+) -> tuple[Tensor, Tensor]:
+    """Moments (B, N, 8) of the records (records.py) and the gradient of the features."""
+    arrays = _Arrays(records.dtype)
+    moments, grad_features = torch.zeros_like(records), torch.zeros_like(features)
+    if g.scan == "tile":
+        _, kernel = tile_kernels(arrays.scalar, features.shape[-1])
+        threads, state = tile_threads(len(records), g.width, g.height), (transmittance, grad_alpha)
+    else:
+        _, kernel = raster_kernels(arrays.scalar, features.shape[-1])
+        threads, state = len(records), (transmittance.clone(), -grad_alpha * transmittance)
+    wp.launch(
+        kernel,
+        dim=threads,
+        inputs=[
+            *map(_integers, lists),
+            *_splats(arrays, records, features, g),
             _integers(ends),
             arrays.vectors(grad_image),
-            arrays.scalars(transmittance),
-            arrays.scalars(behind),
-        ]
-        outputs = [
-            arrays.vectors(grad_centers),
-            arrays.vectors(grad_conics),
-            arrays.scalars(grad_weights),
-            arrays.vectors(grad_features),
-        ]
-        if g.scan == "gaussian":
-            _, kernel = raster_kernels(arrays.scalar, channels)
-            wp.launch(kernel, dim=images, inputs=[_integers(order), *shared], outputs=outputs, device=device)
-        else:
-            _, kernel = tile_kernels(arrays.scalar, channels)
-            wp.launch(
-                kernel,
-                dim=tile_threads(images, g.width, g.height),
-                inputs=[*map(_integers, lists), *shared],
-                outputs=outputs,
-                device=device,
-            )
-        grad_means, grad_covariances = torch.zeros_like(means), torch.zeros_like(covariances)
-        grad_opacities = torch.zeros_like(opacities)
-        settings = _vector(4, arrays.scalar)(preset.near, CLAMP_MARGIN, preset.extent, float(preset.square))
-        _, kernel, camera_kernel = projection_kernels(arrays.scalar)
-        wp.launch(
-            kernel,
-            dim=count,
-            inputs=[
-                arrays.vectors(means),
-                arrays.matrices(covariances),
-                count if opacities.dim() == 2 else 0,
-                arrays.matrices(K),
-                arrays.matrices(w2c),
-                _integers(g.state_index),
-                settings,
-                count,
-                g.width,
-                g.height,
-                images,
-                arrays.vectors(conics),
-                rects_wp,
-                *outputs[:3],
-            ],
-            outputs=[arrays.vectors(grad_means), arrays.matrices(grad_covariances), arrays.scalars(grad_opacities)],
-            device=device,
-        )
-        grad_K = grad_w2c = None
-        if any(ctx.needs_input_grad[4:6]):
-            chunks = min(count, CAMERA_CHUNKS)
-            partial_w2c, partial_K = means.new_empty(images, chunks, 3, 4), means.new_empty(images, chunks, 3, 3)
-            wp.launch(
-                camera_kernel,
-                dim=(images, chunks),
-                inputs=[
-                    arrays.vectors(means),
-                    arrays.matrices(covariances),
-                    arrays.matrices(K),
-                    arrays.matrices(w2c),
-                    _integers(g.state_index),
-                    settings,
-                    count,
-                    g.width,
-                    g.height,
-                    chunks,
-                    arrays.vectors(conics),
-                    rects_wp,
-                    *outputs[:2],
-                ],
-                outputs=[arrays.matrices(partial_w2c), arrays.matrices(partial_K)],
-                device=device,
-            )
-            grad_K = partial_K.sum(1)
-            grad_w2c = torch.cat((partial_w2c.sum(1), means.new_zeros(images, 1, 4)), 1)
-        return grad_means, grad_covariances, grad_opacities, grad_features, grad_K, grad_w2c, None
+            *map(arrays.scalars, state),
+        ],
+        outputs=[arrays.vectors(moments), arrays.vectors(grad_features)],
+        device=wp.device_from_torch(records.device),
+    )
+    return moments, grad_features
+
+
+def project_backward(
+    means: Tensor, covariances: Tensor, opacities: Tensor, K: Tensor, w2c: Tensor, records: Tensor, moments: Tensor, g: Geometry
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradients of means, covariances and opacities."""
+    arrays, count = _Arrays(means.dtype), means.shape[1]
+    grad_means, grad_covariances, grad_opacities = (torch.zeros_like(x) for x in (means, covariances, opacities))
+    _, kernel, _ = projection_kernels(arrays.scalar)
+    wp.launch(
+        kernel,
+        dim=count,
+        inputs=[
+            arrays.vectors(means),
+            arrays.matrices(covariances),
+            count if opacities.dim() == 2 else 0,
+            *_projection(arrays, K, w2c, count, g),
+            len(records),
+            arrays.vectors(records),
+            arrays.vectors(moments),
+        ],
+        outputs=[arrays.vectors(grad_means), arrays.matrices(grad_covariances), arrays.scalars(grad_opacities)],
+        device=wp.device_from_torch(means.device),
+    )
+    return grad_means, grad_covariances, grad_opacities
+
+
+def camera_backward(
+    means: Tensor, covariances: Tensor, opacities: Tensor, K: Tensor, w2c: Tensor, records: Tensor, moments: Tensor, g: Geometry
+) -> tuple[Tensor, Tensor]:
+    """Gradients of K and w2c; arguments as of project_backward."""
+    arrays, images, count = _Arrays(means.dtype), len(records), means.shape[1]
+    chunks = min(count, CAMERA_CHUNKS)
+    partial_w2c, partial_K = means.new_empty(images, chunks, 3, 4), means.new_empty(images, chunks, 3, 3)
+    *_, kernel = projection_kernels(arrays.scalar)
+    wp.launch(
+        kernel,
+        dim=(images, chunks),
+        inputs=[
+            arrays.vectors(means),
+            arrays.matrices(covariances),
+            *_projection(arrays, K, w2c, count, g),
+            chunks,
+            arrays.vectors(records),
+            arrays.vectors(moments),
+        ],
+        outputs=[arrays.matrices(partial_w2c), arrays.matrices(partial_K)],
+        device=wp.device_from_torch(means.device),
+    )
+    return partial_K.sum(1), torch.cat((partial_w2c.sum(1), means.new_zeros(images, 1, 4)), 1)
+
+
+def _splats(arrays: _Arrays, records: Tensor, features: Tensor, g: Geometry) -> list:
+    """What all compositing kernels take after their lists."""
+    count = records.shape[1]
+    stride = count if features.shape[0] > 1 else 0
+    cap = arrays.scalar(g.preset.alpha_max)
+    return [arrays.vectors(records), arrays.vectors(features), stride, cap, count, g.width, g.height]
+
+
+def _projection(arrays: _Arrays, K: Tensor, w2c: Tensor, count: int, g: Geometry) -> list:
+    """What all projection kernels take after the Gaussians."""
+    preset = g.preset
+    settings = _vector(4, arrays.scalar)(preset.near, CLAMP_MARGIN, preset.extent, float(preset.square))
+    return [arrays.matrices(K), arrays.matrices(w2c), _integers(g.state_index), settings, count, g.width, g.height]

@@ -129,23 +129,26 @@ GRADIENT_TOLERANCES = {  # gsplat's own tests of 1.5: rtol, and atol here in uni
 }  # fmt: skip
 
 
+def outcome(scene, clear, way):
+    """Image, alpha and the gradients of all inputs, by name, of an objective that looks at the clear pixels only."""
+    leaves = {name: getattr(scene, name).detach().clone().requires_grad_() for name in NAMES}
+    w2c = scene.cameras.w2c.detach().clone().requires_grad_()
+    image, alpha = way(*leaves.values(), replace(scene.cameras, w2c=w2c), scene.state_index, scene.background)
+    g = torch.Generator().manual_seed(8)
+    weights = [torch.randn(x.shape, generator=g).to(x) for x in (image, alpha)]
+    total = (image * weights[0] * clear[..., None]).sum() + (alpha * weights[1] * clear).sum()
+    return image.detach(), alpha.detach(), dict(zip((*NAMES, "w2c"), torch.autograd.grad(total, [*leaves.values(), w2c])))
+
+
 def compare(scene, clear, one, other):
-    """Image, alpha and all gradients of two ways to draw a scene; the objective looks at the clear pixels only."""
+    """Image, alpha and all gradients of two ways to draw a scene."""
     assert float(clear.float().mean()) > 0.9
-    results = []
-    for way in (one, other):
-        leaves = {name: getattr(scene, name).detach().clone().requires_grad_() for name in NAMES}
-        w2c = scene.cameras.w2c.detach().clone().requires_grad_()
-        cameras = replace(scene.cameras, w2c=w2c)
-        image, alpha = way(*leaves.values(), cameras, scene.state_index, scene.background)
-        g = torch.Generator().manual_seed(8)
-        weights = [torch.randn(x.shape, generator=g).to(x) for x in (image, alpha)]
-        total = (image * weights[0] * clear[..., None]).sum() + (alpha * weights[1] * clear).sum()
-        results.append((image.detach(), alpha.detach(), torch.autograd.grad(total, [*leaves.values(), w2c])))
+    results = [outcome(scene, clear, way) for way in (one, other)]
     (image, alpha, gradients), (wanted, wanted_alpha, wanted_gradients) = results
     assert float((image - wanted).abs()[clear].max()) < 2e-3
     assert float((alpha - wanted_alpha).abs()[clear].max()) < 2e-3
-    for (name, (rtol, atol)), ours, theirs in zip(GRADIENT_TOLERANCES.items(), gradients, wanted_gradients):
+    for name, (rtol, atol) in GRADIENT_TOLERANCES.items():
+        ours, theirs = gradients[name], wanted_gradients[name]
         scale = float(theirs.abs().max())
         torch.testing.assert_close(ours, theirs, rtol=rtol, atol=atol * scale, msg=lambda text, name=name: f"{name}: {text}")
 
