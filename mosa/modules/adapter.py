@@ -13,6 +13,7 @@ from mosa.errors import ConfigError
 from mosa.modules import microplane
 from mosa.modules.fused.selection import PRECISIONS, check_options, chosen, weights_of
 from mosa.modules.progressive import Correction, ProgressiveOperator, apply
+from mosa.physics.activations import backward_at_hand
 from mosa.physics.rollout import AdapterOperator, MaterialState
 
 
@@ -191,7 +192,7 @@ class StressAdapter(Adapter):
     def _evaluate(self, operator: ProgressiveOperator, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Correction]:
         if chosen(self.fused, operator, w):
             return self._evaluate_fused(operator, w, s)
-        if self.recompute and torch.is_grad_enabled():
+        if self.recompute and torch.is_grad_enabled() and not backward_at_hand():
             return checkpoint(self.affine, operator, w, s, use_reentrant=False, preserve_rng_state=False)
         return self.affine(operator, w, s)
 

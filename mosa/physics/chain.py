@@ -2,9 +2,9 @@
 
 An adapter of the state is asked every few substeps. Done one by one, each answer costs some sixty launches and two transfers to
 the host, which take longer than the arithmetic of 100 000 particles. A chain of K segments looks at the host once. Its backward
-pass advances the chain again, keeping the state of every substep, then goes back through it: the adapter is asked again at the
-start of a segment, this time with a graph, and what the segment's adjoint leaves on its answer goes through that graph to the
-state and to the adapter's weights. Between the passes only a chain's start is kept.
+pass goes back through the states of all substeps: the adapter is asked again at the start of a segment, this time with a graph,
+and what the segment's adjoint leaves on its answer goes through that graph to the state and to the adapter's weights. Between the
+passes all states are kept where there is memory for them (`kept`), else only the chain's start, from which they are made again.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from itertools import accumulate, pairwise
 import torch
 from torch import Tensor, nn
 
+from mosa.physics.activations import at_hand
 from mosa.physics.mpm import SegmentSolver, grid_window, warp_stream
 from mosa.physics.mpm_kernels import NO_EVENT
 from mosa.physics.workspace import Numerics, Workspace
@@ -24,6 +25,8 @@ from mosa.physics.workspace import Numerics, Workspace
 ANSWER = ("G", "h", "plastic_G", "plastic_h")
 COARSE = 8
 """Node counts of a chain's window are multiples of this: each change of them costs a new capture."""
+ATTEMPTS = 3
+"""Captures that may fail before a chain gives up: libraries that set themselves up when they are first captured spoil one."""
 
 
 class Chain:
@@ -48,60 +51,72 @@ class Chain:
         self.statistics: tuple[Tensor, ...] = ()
         self.statistics_seeds: tuple[Tensor, ...] = ()
         self._kind: type | None = None
-        self.captures = numerics.device.type == "cuda"
-        self._warm: set[str] = set()
-        self._graphs: dict[str, torch.cuda.CUDAGraph] = {}
+        self.attempts = ATTEMPTS if numerics.device.type == "cuda" else 0
+        self._warm: set[tuple] = set()
+        self._graphs: dict[tuple, torch.cuda.CUDAGraph] = {}
         self._key: tuple = ()
-        self._passes = {
-            "forward": self._forward,
-            "adjoint": partial(self._adjoint, penalised=False),
-            "penalised adjoint": partial(self._adjoint, penalised=True),
-        }
+        self._passes: dict[tuple, Callable[[], None]] = {}
+        for kept in (False, True):
+            self._passes["forward", kept] = partial(self._forward, kept)
+            for penalised in (False, True):
+                self._passes["adjoint", kept, penalised] = partial(self._adjoint, kept, penalised)
 
     def advance(
-        self, solver: SegmentSolver, state: tuple[Tensor, ...], packed: Tensor, first: int
-    ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...], tuple[int, int, int]]:
-        """(state after the chain, statistics (K, ...) each, lowest node of the window). Errors: as `SegmentSolver.advance`."""
-        dx, dt, total, work = self.numerics.dx, self.numerics.dt, self.substeps, self.light
+        self, solver: SegmentSolver, state: tuple[Tensor, ...], packed: Tensor, first: int, kept: bool = False
+    ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...], tuple[int, int, int], list[Tensor]]:
+        """(state after the chain, statistics (K, ...) each, lowest node of the window, what `adjoint` takes as `tape`).
+
+        kept: leave all substeps on the tape, else nothing. Errors: as `SegmentSolver.advance`."""
+        dx, dt, total = self.numerics.dx, self.numerics.dt, self.substeps
+        work = self._full() if kept else self.light
         for margin in (4, 3 + total // 2):
             origin, dims = grid_window(state[0], state[1], dx, 2 * total * dt, margin)
             self.dims = tuple(max(-(-a // COARSE) * COARSE, b) for a, b in zip(dims, self.dims))
             self._check_graphs(solver)
             work.set_window(origin, self.dims)
             work.load(state, {"parameters": packed}, solver.volume, solver.mass, solver.cutoff)
-            self._capture()
-            self._play("forward", self._passes["forward"])
+            self._capture(solver.cutoff)
+            self._play(("forward", kept))
             flags = work.flags.tolist()
             if not solver.left_window(flags, first, dt):
-                return work.final(), tuple(t.clone() for t in self.statistics), origin
+                statistics = tuple(t.clone() for t in self.statistics)
+                return work.final(), statistics, origin, [t.clone() for t in work.tape()] if kept else []
         raise solver.left_behind(flags, first, dt)
 
     def adjoint(
         self, solver: SegmentSolver, state: tuple[Tensor, ...], packed: Tensor, origin: tuple[int, int, int],
-        seeds: Sequence[Tensor | None],
+        seeds: Sequence[Tensor | None], tape: Sequence[Tensor],
     ) -> tuple[list[Tensor], Tensor, list[Tensor]]:  # fmt: skip
         """Gradients of (state, parameters, weights). seeds: adjoints of what `advance` returned: state, then statistics."""
-        if self.full is None:
-            self.full = Workspace(self.numerics, **self._shape, with_adjoint=True)
-            self.adj_packed = torch.zeros_like(packed)
-            self.adj_weights = [torch.zeros_like(w) for w in self.weights]
+        work = self._full()
+        if not self.statistics_seeds:
             self.statistics_seeds = tuple(torch.zeros_like(t) for t in self.statistics)
-        work = self.full
+        if tape and tape[-1].shape != work.tape()[-1].shape:
+            tape = ()  # the window has grown since
         work.set_window(origin, self.dims)
         work.load(state, {"parameters": packed}, solver.volume, solver.mass, solver.cutoff)
+        for target, value in zip(work.tape(), tape):
+            target.copy_(value)
         slot = self.substeps % 2
         targets = self._targets(slot) + list(self.statistics_seeds)
         for target, seed in zip(targets, seeds, strict=True):
             target.zero_() if seed is None else target.copy_(seed)
         penalised = any(seed is not None for seed in seeds[len(self._targets(slot)) :])
-        name = "penalised adjoint" if penalised else "adjoint"
-        self._play(name, self._passes[name])
+        self._play(("adjoint", bool(tape), penalised))
         found = [t.clone() for t in self._targets(0)]
         return found, self.adj_packed.clone(), [t.clone() for t in self.adj_weights]
 
     def named(self, statistics: Sequence[Tensor]) -> list:
         """One named tuple per evaluation, of tensors (K, ...)."""
         return [self._kind(*parts) for parts in zip(*statistics, strict=True)] if self._kind is not None else []
+
+    def _full(self) -> Workspace:
+        """The buffers of the backward pass, made when they are first needed."""
+        if self.full is None:
+            self.full = Workspace(self.numerics, **self._shape, with_adjoint=True)
+            self.adj_packed = torch.zeros_like(self.full.held["parameters"])
+            self.adj_weights = [torch.zeros_like(w) for w in self.weights]
+        return self.full
 
     def _targets(self, slot: int) -> list[Tensor]:
         work = self.full
@@ -133,18 +148,19 @@ class Chain:
                 step += length
         return collected
 
-    def _forward(self) -> None:
-        collected = self._advance_all(self.light, self.collects)
+    def _forward(self, kept: bool) -> None:
+        collected = self._advance_all(self._full() if kept else self.light, self.collects)
         self.statistics = tuple(torch.stack(parts) for parts in zip(*collected))
 
-    def _adjoint(self, penalised: bool) -> None:
+    def _adjoint(self, kept: bool, penalised: bool) -> None:
         work, step = self.full, self.substeps
-        self._advance_all(work, False)
+        if not kept:
+            self._advance_all(work, False)
         self.adj_packed.zero_()
         torch._foreach_zero_(self.adj_weights)
         for index in reversed(range(len(self.lengths))):
             step -= self.lengths[index]
-            with torch.enable_grad():
+            with torch.enable_grad(), at_hand():
                 leaves = [t.detach().requires_grad_() for t in (work.F[step], work.C[step], work.held["parameters"])]
                 answer, statistics = self._ask(*leaves, penalised)
             work.hold({name: None if t is None else t.detach() for name, t in answer.items()})
@@ -170,46 +186,45 @@ class Chain:
             self._key = key
             self._graphs.clear()
 
-    def _play(self, name: str, body: Callable[[], None]) -> None:
+    def _play(self, name: tuple) -> None:
         graph = self._graphs.get(name)
         if graph is not None:
             graph.replay()
         else:
-            body()  # the first time this also compiles and loads the kernels, which a capture must not do
+            self._passes[name]()  # the first time this also compiles and loads the kernels, which a capture must not do
             self._warm.add(name)
 
-    def _capture(self) -> None:
+    def _capture(self, cutoff: float) -> None:
         """Capture every pass that has run once. Here for both: the backward pass runs in a thread of autograd's own."""
-        if not self.captures:
+        if not self.attempts:
             return
-        for name, body in self._passes.items():
-            if name not in self._warm or name in self._graphs:
-                continue
-            if name != "forward":
-                self.full.set_window((0, 0, 0), self.dims)
-                self.full.cutoff = self.light.cutoff
+        missing = [name for name in self._passes if name in self._warm and name not in self._graphs]
+        if missing and self.full is not None:
+            self.full.set_window(self.full.lowest, self.dims)
+            self.full.cutoff = cutoff
+        for name in missing:
             graph = torch.cuda.CUDAGraph()
             try:
                 with torch.cuda.graph(graph, capture_error_mode="thread_local"):
-                    body()
+                    self._passes[name]()
             except RuntimeError as error:
-                self.captures = False
-                self._graphs.clear()
+                self.attempts -= 1
                 torch.cuda.synchronize()
-                name = type(self.adapter).__name__
-                warnings.warn(f"{name} cannot be captured as a CUDA graph and runs uncaptured: {error}", stacklevel=2)
+                if not self.attempts:
+                    name = type(self.adapter).__name__
+                    warnings.warn(f"{name} cannot be captured as a CUDA graph and runs uncaptured: {error}", stacklevel=2)
                 return
             self._graphs[name] = graph
 
 
 class _Chained(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, chain: Chain, solver: SegmentSolver, first: int, *inputs):
+    def forward(ctx, chain: Chain, solver: SegmentSolver, first: int, kept: bool, *inputs):
         """inputs: state (5), packed parameters, the adapter's weights."""
         state, packed = tuple(t.detach().contiguous() for t in inputs[:5]), inputs[5].detach().contiguous()
         ctx.set_materialize_grads(False)
-        result, statistics, origin = chain.advance(solver, state, packed, first)
-        ctx.chain, ctx.solver, ctx.origin = chain, solver, origin
+        result, statistics, origin, tape = chain.advance(solver, state, packed, first, kept and any(ctx.needs_input_grad))
+        ctx.chain, ctx.solver, ctx.origin, ctx.tape = chain, solver, origin, tape
         ctx.states = 5 if solver.numerics.law.plastic else 4
         ctx.save_for_backward(*state, packed)
         return *result[: ctx.states], *statistics
@@ -218,16 +233,18 @@ class _Chained(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, *seeds):
         *state, packed = ctx.saved_tensors
-        found, adj_packed, adj_weights = ctx.chain.adjoint(ctx.solver, tuple(state), packed, ctx.origin, seeds)
-        return None, None, None, *found, *[None] * (5 - ctx.states), adj_packed, *adj_weights
+        tape, ctx.tape = ctx.tape, []  # free it as soon as it is used
+        found, adj_packed, adj_weights = ctx.chain.adjoint(ctx.solver, tuple(state), packed, ctx.origin, seeds, tape)
+        return None, None, None, None, *found, *[None] * (5 - ctx.states), adj_packed, *adj_weights
 
 
 def advance_chain(
-    chain: Chain, solver: SegmentSolver, state: tuple[Tensor, ...], packed: Tensor, first: int
+    chain: Chain, solver: SegmentSolver, state: tuple[Tensor, ...], packed: Tensor, first: int, kept: bool = False
 ) -> tuple[tuple[Tensor, ...], list]:
     """((x, v, C_affine, F, F_tot) after the chain, statistics of each evaluation), differentiable in state, parameters and the
-    adapter's weights. first: number of the first substep, for messages. Errors: SimulationDiverged."""
-    result = _Chained.apply(chain, solver, first, *state, packed, *chain.weights)
+    adapter's weights. first: number of the first substep, for messages; kept: keep the states of all substeps for the backward
+    pass. Errors: SimulationDiverged."""
+    result = _Chained.apply(chain, solver, first, kept, *state, packed, *chain.weights)
     count = 5 if solver.numerics.law.plastic else 4
     final = result[:count] if count == 5 else (*result[:4], result[3])
     return final, chain.named(result[count:])

@@ -33,6 +33,8 @@ SEGMENT = 32
 
 MEMORY_SHARE = 0.1
 """Of a GPU's free memory, for what the backward pass of a chain stores."""
+KEPT_SHARE = 0.25
+"""Of a GPU's free memory, for the states of all substeps of a rollout, where that is enough for them."""
 MAX_CHAINS = 8
 
 _UNBOUNDED = 1e30
@@ -239,7 +241,7 @@ class Simulator:
             held.update(self._ask(adapter, F, C, packed, collect))
             adapter = None  # answered: nothing cuts the segments
         chained = self.chained and isinstance(adapter, nn.Module) and not variable and not self.colliders
-        most = self._chain_substeps(n) if chained else SEGMENT
+        most, kept = self._chain_memory(n, frames) if chained else (SEGMENT, False)
         current = (state.x, state.v, C, F, F_tot)
         poses = () if variable else self._poses(motions, frames, start_time)
         reactions = []
@@ -259,7 +261,7 @@ class Simulator:
                 forces = None
                 for group in grouped(lengths, most):
                     chain = self._chain(adapter, group, current, packed, collect is not None)
-                    current, statistics = advance_chain(chain, solver, current, packed, first)
+                    current, statistics = advance_chain(chain, solver, current, packed, first, kept)
                     first += sum(group)
                     for each in statistics:
                         collect(each)
@@ -325,15 +327,16 @@ class Simulator:
         rotation = torch.eye(3, dtype=self.dtype, device=self.device).expand(len(F), 3, 3)
         return MaterialState(*material_state(self.law, F, C_affine, self.pack(parameters, len(F), rotation)))
 
-    def _chain_substeps(self, particles: int) -> int:
-        """Most substeps of a chain, by memory: each keeps 33 numbers a particle (42 where the law yields) and a grid of 7 a node,
-        of which there is about one a particle."""
+    def _chain_memory(self, particles: int, frames: int) -> tuple[int, bool]:
+        """(most substeps of a chain, whether to keep the states of all), by memory: a substep has 33 numbers a particle (42 where
+        the law yields) and 7 a node, of which there is about one a particle."""
         if self.device.type != "cuda":
-            return SEGMENT
+            return SEGMENT, True
         free = torch.cuda.mem_get_info(self.device)[0]
         free += torch.cuda.memory_reserved(self.device) - torch.cuda.memory_allocated(self.device)
         each = particles * (49 if self.law.plastic else 40) * torch.finfo(self.dtype).bits // 8
-        return max(1, min(SEGMENT, int(MEMORY_SHARE * free / each)))
+        most = max(1, min(SEGMENT, int(MEMORY_SHARE * free / each)))
+        return most, (frames - 1) * self.substeps * each < KEPT_SHARE * free
 
     def _chain(
         self, adapter: nn.Module, lengths: tuple[int, ...], state: tuple[Tensor, ...], packed: Tensor, collects: bool

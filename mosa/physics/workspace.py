@@ -114,7 +114,7 @@ class Workspace:
                 numerics.colliders, self.scalar, substeps, self._array, self._run, with_adjoint
             )
         self.cutoff = 0.0
-        self.dims = (0, 0, 0)
+        self.lowest, self.dims = (0, 0, 0), (0, 0, 0)
         self.steps = Steps(numerics.dt, numerics.dt)
         self._graphs: dict[tuple, object] = {}
 
@@ -126,8 +126,14 @@ class Workspace:
         tensor = torch.zeros((slots, *shape), dtype=self.numerics.dtype, device=self.numerics.device)
         return list(tensor), [wp.from_torch(t, dtype=kind) for t in tensor]
 
+    def tape(self) -> list[Tensor]:
+        """All that the adjoint reads of a forward pass, one tensor of slots each, the grid's last."""
+        parts = [self.x, self.v, self.C, self.F, self.tau] + ([self.A] if self.plastic else []) + [self.velocity, self.grid]
+        return [part[0]._base for part in parts]
+
     def set_window(self, origin: tuple[int, int, int], dims: tuple[int, int, int]) -> None:
         """Place the grid: lowest node and number of nodes per axis. Reallocates (and forgets graphs) when dims change."""
+        self.lowest = origin
         self.origin.copy_(torch.tensor([origin], dtype=torch.int32))
         if dims == self.dims:
             return

@@ -8,8 +8,8 @@ from torch import nn
 
 from mosa.errors import SimulationDiverged
 from mosa.modules.adapter import StressAdapter, pool
-from mosa.physics.chain import grouped
-from mosa.physics.rollout import Simulator
+from mosa.physics.chain import ATTEMPTS, grouped
+from mosa.physics.rollout import SEGMENT, Simulator
 from mosa.types import Ground, ParticleState
 
 CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -27,7 +27,7 @@ def adapter_of(device: str, dtype: torch.dtype, plastic: bool) -> StressAdapter:
     return adapter.to(device)
 
 
-def rolled(chained, law, device, dtype, state, adapter, *, stride=2, substeps=11, frames=4, penalised=True, **options):
+def rolled(chained, law, device, dtype, state, adapter, *, stride=2, substeps=11, frames=4, penalised=True, kept=True, **options):
     """(frames x, F, F_tot, statistics of the evaluations) and gradients of a sum of them, all on the CPU in float64."""
     names = ("x", "v", "C_affine", "F", "F_tot")
     state = ParticleState(*(getattr(state, name).to(device=device, dtype=dtype) for name in names))
@@ -36,6 +36,7 @@ def rolled(chained, law, device, dtype, state, adapter, *, stride=2, substeps=11
     parameters = {"mu": mu, "lam": 1e4, **({"yield_stress": 300.0} if law == "von_mises" else {})}
     sim = Simulator(law, dx=0.04, substeps=substeps, frame_dt=4e-4 * substeps, ground=Ground(0.0), dtype=dtype, device=device,
                     chained=chained, **options)
+    sim._chain_memory = lambda particles, frames: (SEGMENT, kept)
     volume = torch.full((len(state.x),), 8e-6, device=device, dtype=dtype)
     weights = [p for p in adapter.parameters() if p.requires_grad]
 
@@ -59,12 +60,13 @@ def assert_same(found, expected, tolerance):
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("law, plastic", [("corotated", False), ("von_mises", True), ("von_mises", False)])
-@pytest.mark.parametrize("penalised", [True, False])
-def test_a_chain_is_its_segments(device, law, plastic, penalised, make_block):
+@pytest.mark.parametrize("penalised, kept", [(True, True), (False, True), (True, False), (False, False)])
+def test_a_chain_is_its_segments(device, law, plastic, penalised, kept, make_block):
     """11 substeps of a frame are 6 evaluations, the last for one substep. On CUDA: eager, then captured, then replayed."""
     adapter = adapter_of(device, torch.float64, plastic)
     make = (law, device, torch.float64, make_block(n=5, velocity=(0.3, -1.0, 0.2)), adapter)
-    (expected, evaluations), once = rolled(False, *make, penalised=penalised)(), rolled(True, *make, penalised=penalised)
+    expected, evaluations = rolled(False, *make, penalised=penalised)()
+    once = rolled(True, *make, penalised=penalised, kept=kept)
     for _ in range(3):
         found, count = once()
         assert count == evaluations
@@ -119,7 +121,7 @@ def test_segments_are_grouped_evenly_and_in_order():
 def test_an_adapter_that_looks_at_the_host_runs_uncaptured(make_block):
     class Looking(StressAdapter):
         def forward(self, state):
-            float(state.w.sum())
+            float(state.w.detach().sum())
             return super().forward(state)
 
     adapter = Looking(hidden=16, fused=False).double()
@@ -127,8 +129,7 @@ def test_an_adapter_that_looks_at_the_host_runs_uncaptured(make_block):
     make = ("corotated", "cuda", torch.float64, make_block(n=5), adapter.cuda())
     expected, _ = rolled(False, *make)()
     once = rolled(True, *make)
-    once()
     with pytest.warns(UserWarning, match="Looking cannot be captured"):
-        found, _ = once()
-    assert_same(found, expected, 1e-9)
+        for _ in range(1 + ATTEMPTS):
+            assert_same(once()[0], expected, 1e-9)
     assert_same(once()[0], expected, 1e-9)

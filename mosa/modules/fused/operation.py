@@ -16,6 +16,7 @@ from torch.autograd.function import once_differentiable
 from mosa.modules.fused.adjoint_kernels import phi_backward, psi1_backward, psi2_backward, theta_backward, weight_gradients
 from mosa.modules.fused.assembly_kernels import assemble, assemble_adjoint
 from mosa.modules.fused.network_kernels import phi_forward, psi1_forward, psi2_forward, theta_forward
+from mosa.physics.activations import backward_at_hand
 
 LANES = 128
 """Particles a program of the assembly; rows are padded to a multiple, so that arrays stored by column need no mask."""
@@ -97,6 +98,7 @@ class _FusedOperator(torch.autograd.Function):
                 P=settings.precision, num_warps=_warps(weights[0].shape[0]),
             )  # fmt: skip
         ctx.settings = settings
+        ctx.buffers = buffers if backward_at_hand() else None
         ctx.save_for_backward(w, s, post, *weights)
         ctx.set_materialize_grads(False)
         return G, b, buffers.t.T[:n], buffers.pre.T[:n], post.T[:n]
@@ -115,20 +117,20 @@ class _FusedOperator(torch.autograd.Function):
             seeds[name] = w if seed is None else seed.contiguous()  # w: never read
         needs = ctx.needs_input_grad[3:]
         with torch.cuda.device_of(w):
-            gw, gs, gradients = _backward(w, s, post, settings, weights, seeds, extra, any(needs))
+            gw, gs, gradients = _backward(w, s, post, settings, weights, seeds, extra, any(needs), ctx.buffers)
         gradients = [g if need else None for g, need in zip(gradients, needs, strict=True)]
         return None, gw, gs, *gradients
 
 
 def _backward(
     w: Tensor, s: Tensor, post: Tensor, settings: Settings, weights: Sequence[Tensor], seeds: dict[str, Tensor], extra: bool,
-    wanted: bool,
+    wanted: bool, buffers: _Buffers | None,
 ) -> tuple[Tensor, Tensor, Sequence[Tensor | None]]:  # fmt: skip
     """Adjoints of w, s (N, 6) and, where wanted, of the weights. post: (6, M) of the forward pass; seeds: adjoints of the outputs;
-    extra: of the last three too."""
+    extra: of the last three too; buffers: of the forward pass, None where they are to be computed again."""
     n, hidden = len(w), weights[0].shape[0]
     m = _rows(n)
-    b = _evaluate(w, s, settings, weights, None)
+    b = _evaluate(w, s, settings, weights, None) if buffers is None else buffers
     h1, h2, g1, g2 = (w.new_empty(hidden if wanted else 0, m) for _ in range(4))  # of one network after the other
     grid = (m // settings.block,)
     scale, bound, alpha = settings.scale, settings.l_max or 0.0, settings.alpha
