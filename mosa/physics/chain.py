@@ -16,6 +16,7 @@ from itertools import accumulate, pairwise
 
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call
 
 from mosa.physics.activations import at_hand
 from mosa.physics.mpm import SegmentSolver, grid_window, warp_stream
@@ -32,7 +33,7 @@ ATTEMPTS = 3
 class Chain:
     """Buffers and captured graphs of K segments of `lengths` substeps for N particles and one adapter.
 
-    ask: (F, C_affine, packed parameters) -> the adapter's answer by name (`ANSWER`, None where it has none), differentiable.
+    ask: (adapter, F, C_affine, packed parameters) -> its answer by name (`ANSWER`, None where it has none), differentiable.
     collects: also return `adapter.statistics()`, a named tuple of tensors, of every evaluation.
     An adapter that looks at the host cannot be captured: it is run uncaptured, with a warning.
     """
@@ -43,7 +44,7 @@ class Chain:
     ) -> None:  # fmt: skip
         self.numerics, self.adapter, self.ask, self.lengths, self.collects = numerics, adapter, ask, tuple(lengths), collects
         self.substeps = sum(lengths)
-        self.weights = [p for p in adapter.parameters() if p.requires_grad]
+        self.names = [name for name, p in adapter.named_parameters() if p.requires_grad]
         self._shape = {"particles": particles, "substeps": self.substeps, "adapted": True, "plastic_adapted": plastic_adapted}
         self.light = Workspace(numerics, **self._shape, with_adjoint=False)
         self.full: Workspace | None = None
@@ -123,10 +124,22 @@ class Chain:
         targets = [work.adj_x, work.adj_v, work.adj_C, work.adj_F] + ([work.adj_A] if work.plastic else [])
         return [t[slot] for t in targets]
 
+    @property
+    def weights(self) -> list[Tensor]:
+        return [self.adapter.get_parameter(name) for name in self.names]
+
     def _ask(
-        self, F: Tensor, C: Tensor, packed: Tensor, collects: bool
+        self, F: Tensor, C: Tensor, packed: Tensor, collects: bool, weights: Sequence[Tensor] | None = None
     ) -> tuple[dict[str, Tensor | None], tuple[Tensor, ...]]:
-        answer = self.ask(F, C, packed)
+        """weights: in place of the adapter's own."""
+        adapter = self.adapter
+        if weights is not None:
+            named = dict(zip(self.names, weights, strict=True))
+
+            def adapter(state):
+                return functional_call(self.adapter, named, (state,))
+
+        answer = self.ask(adapter, F, C, packed)
         if not collects:
             return answer, ()
         statistics = self.adapter.statistics()
@@ -161,8 +174,10 @@ class Chain:
         for index in reversed(range(len(self.lengths))):
             step -= self.lengths[index]
             with torch.enable_grad(), at_hand():
-                leaves = [t.detach().requires_grad_() for t in (work.F[step], work.C[step], work.held["parameters"])]
-                answer, statistics = self._ask(*leaves, penalised)
+                inputs = (work.F[step], work.C[step], work.held["parameters"], *self.weights)
+                # aliases: autograd ties a leaf to the stream it was first used on, which a capture on another one may not touch
+                leaves = [t.detach().requires_grad_() for t in inputs]
+                answer, statistics = self._ask(*leaves[:3], penalised, leaves[3:])
             work.hold({name: None if t is None else t.detach() for name, t in answer.items()})
             with warp_stream(self.numerics.device):
                 work.adjoint_steps(step, self.lengths[index])
@@ -173,7 +188,7 @@ class Chain:
             if not pairs:
                 continue
             outputs, seeds = zip(*pairs)
-            found = torch.autograd.grad(outputs, [*leaves, *self.weights], seeds, allow_unused=True)
+            found = torch.autograd.grad(outputs, leaves, seeds, allow_unused=True)
             slot = step % 2
             sums = [work.adj_F[slot], work.adj_C[slot], self.adj_packed, *self.adj_weights]
             sums, found = zip(*[(s, f) for s, f in zip(sums, found, strict=True) if f is not None])

@@ -10,7 +10,6 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -345,12 +344,12 @@ class Simulator:
         if key not in self._chains:
             if len(self._chains) >= MAX_CHAINS:
                 self._chains.clear()
-            ask = partial(self._ask, adapter)
             with torch.no_grad():
-                plastic_adapted = ask(state[3].detach(), state[2].detach(), packed.detach())["plastic_G"] is not None
+                answer = self._ask(adapter, state[3].detach(), state[2].detach(), packed.detach())
             self._chains[key] = Chain(
-                self.numerics, adapter, ask, len(packed), lengths, plastic_adapted=plastic_adapted, collects=collects
-            )
+                self.numerics, adapter, self._ask, len(packed), lengths, collects=collects,
+                plastic_adapted=answer["plastic_G"] is not None,
+            )  # fmt: skip
         return self._chains[key]
 
     def _ask(
