@@ -72,8 +72,8 @@ class Simulator:
     yield_convention: paper | sqrt23. rebuild: write U S V^T back also where nothing yielded (PAC-NeRF does).
     on_inversion: warn | ignore | error for det F <= 0 where the law has a value there; it is an error where it has none.
     chained: whether the evaluations of an adapter that is a torch module and the segments between them run as chains (chain.py);
-    None: on CUDA, where a chain is one captured graph. Not with colliders or adaptive substeps, which are cut in segments. Gradients
-    through a chain reach the adapter's parameters, not other tensors that it may use.
+    None: on CUDA, where a chain is one captured graph. Not with colliders or adaptive substeps, which are cut in segments.
+    Gradients through a chain reach the adapter's parameters, not other tensors that it may use.
     Errors: ConfigError naming the argument. Not safe for use by two threads: buffers are shared between rollouts.
     """
 
