@@ -45,11 +45,15 @@ def train(folder: Path, cache: Path, *overrides: str) -> subprocess.CompletedPro
 
 
 def learned(checkpoint: Path) -> torch.Tensor:
-    """Parameters of the body and of the backbones, in one vector."""
-    saved = torch.load(checkpoint, weights_only=True)
-    shapes = ("body.rest", "body.volume", "body.colors", "body.opacities", "body.covariances")
-    kept = {k: v for k, v in saved["state_dict"].items() if k.startswith("body.") and k not in shapes and "E_ref" not in k}
-    return torch.cat([v.double().flatten() for v in kept.values()])
+    """What the stages step, in one vector: logarithms, logits, weights of networks, entries of the operator, all of order 1."""
+    state = torch.load(checkpoint, weights_only=True)["state_dict"]
+    parts = ("body.material.raw.", "body.contact.", "body.heterogeneity.net.", "body.adapter.operator.free")
+    return torch.cat([v.double().flatten() for k, v in state.items() if k.startswith(parts)])
+
+
+def largest(found: torch.Tensor, expected: torch.Tensor) -> float:
+    """Largest difference of an entry, relative where the entry is above 1."""
+    return float(((found - expected).abs() / expected.abs().clamp(min=1)).max())
 
 
 def relative(found: torch.Tensor, expected: torch.Tensor) -> float:
@@ -105,9 +109,9 @@ def test_two_processes_share_two_sequences(cache, tmp_path):
     result = train(tmp_path / "run", cache, "trainer=ddp", "trainer.accelerator=cpu", "scene.also_train=[test_60]")
     assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
     found, expected = learned(tmp_path / "run/checkpoints/last.ckpt"), learned(alone / "last.ckpt")
-    assert relative(found, expected) < 1e-6
+    assert largest(found, expected) < 1e-6
     single = learned(fit_alone(cache, tmp_path / "first") / "last.ckpt")  # what one rank would learn alone
-    assert relative(single, expected) > 1e-4
+    assert largest(single, expected) > 1e-3
     # the first process speaks for both
     assert result.stdout.count("run folder:") == result.stdout.count("fit: ") == 1 and result.stderr.count("fit joint:   0%") == 1
     assert len(list((tmp_path / "run/tensorboard").rglob("events*"))) == 1
@@ -120,9 +124,9 @@ def test_two_processes_share_the_views_and_resume(cache, tmp_path):
                    f"ckpt_path={alone}/second.ckpt")
     assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
     found, expected = learned(tmp_path / "run/checkpoints/last.ckpt"), learned(alone / "last.ckpt")
-    assert relative(found, expected) < 1e-6
+    assert largest(found, expected) < 1e-6
     fewer = learned(fit_alone(cache, tmp_path / "fewer", "fit.views=1") / "last.ckpt")
-    assert relative(fewer, expected) > 1e-4
+    assert largest(fewer, expected) > 1e-3
 
 
 def exchanging(rank: int, folder: str) -> None:
