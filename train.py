@@ -5,7 +5,13 @@ import sys
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # on small tensors and shared machines a second thread was measured 30x slower
 
+if os.environ.get("LOCAL_RANK", "0") != "0":  # a further process of a fit on several devices: the first speaks for all
+    os.environ["TQDM_DISABLE"] = "1"
+    sys.stdout = open(os.devnull, "w")  # until the process ends
+
 import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig
 
 
@@ -18,9 +24,12 @@ def main(cfg: DictConfig) -> float | None:
         return train(cfg)
     except MosaError as error:
         print(f"\n{type(error).__name__}: {error}", file=sys.stderr)
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            return float("inf")  # the sweep's other jobs go on
         sys.exit(2)
     except KeyboardInterrupt:
-        print("\nstopped; resume with ckpt_path=<run folder>/checkpoints/last.ckpt", file=sys.stderr)
+        if os.environ.get("LOCAL_RANK", "0") == "0":
+            print("\nstopped; resume with ckpt_path=<run folder>/checkpoints/last.ckpt", file=sys.stderr)
         sys.exit(130)
 
 

@@ -74,5 +74,5 @@ class ImageStrips(L.Callback):
         self.every = every
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
-        if self.every > 0 and module.steps_done % self.every == 0:
+        if trainer.is_global_zero and self.every > 0 and module.steps_done % self.every == 0:
             module.logger.experiment.add_image("real_above_rendered_below", module.strip(), module.steps_done)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import resource
+import sys
 import time
 import warnings
 from collections.abc import Collection
@@ -15,15 +16,17 @@ import lightning as L
 import torch
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.plugins.environments import LightningEnvironment
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
+from mosa import parallel
 from mosa.analysis.figures import side_by_side, write_strip, write_video
 from mosa.analysis.tables import parameter_table, results_table
 from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLast
 from mosa.config import build_body, build_stages, build_world, plain, run_config
 from mosa.data.datamodule import MultiViewDataModule, training_observations
-from mosa.errors import ConfigError
+from mosa.errors import ConfigError, MosaError
 from mosa.evaluation import Sequence, evaluate, identification, render
 from mosa.modules.body import Body, Start
 from mosa.modules.lit_mosa import LitMosa, Take
@@ -31,6 +34,7 @@ from mosa.reconstruction.starts import first_contact, sequence_start, splats_of
 from mosa.rendering.cameras import crop_boxes, crop_images
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import use_backend
+from mosa.run import begins_from, device_names, device_of, finished, read_starts, shared_starts, written_starts
 from mosa.twin import Twin, save_rollout
 from mosa.types import MotionCues, Reconstruction, Scene
 
@@ -110,11 +114,16 @@ def train(cfg: DictConfig) -> float | None:
     quiet()
     L.seed_everything(cfg.seed, verbose=False)
     clock, folder = Clock(), run_folder()
-    device = "cuda" if cfg.trainer.accelerator in ("gpu", "cuda") else "cpu"
+    if (done := finished(cfg, folder)) is not None:
+        print(f"skipped: {folder} has its metrics.json (resume=auto)")
+        return optimized(done, cfg.optimized_metric)
+    cfg.ckpt_path = begins_from(cfg, folder)
+    device = device_of(cfg)
     use_backend(cfg.rendering.backend)
     with clock.measure("data"):
         scene, held_out = scenes(cfg)
     taught = list(cfg.scene.get("also_train") or [])
+    parallel.check_share(len(device_names(cfg)), 1 + len(taught), min(cfg.fit.views, len(scene.training_cameras)))
     if scene.synthetic:
         print(f"scene {scene.name}: synthetic, made by this program; not a capture")
     with clock.measure("reconstruction"):
@@ -122,15 +131,17 @@ def train(cfg: DictConfig) -> float | None:
     config = run_config(plain(cfg), scene, dx)
     body = body_of(reconstruction, config).to(device)
     with clock.measure("starts"):
-        found = starts(body, reconstruction, scene, held_out, taught)
-    config["starts"] = {k: {n: getattr(s, n).tolist() for n in ("rotation", "center", "velocity", "angular_velocity")}
-                        for k, s in found.items()}
+        found = shared_starts(cfg, folder, lambda: starts(body, reconstruction, scene, held_out, taught), body)
+    config["starts"] = written_starts(found)
     world = build_world(config["world"])
     with clock.measure("fit"):
         more = [(s, found[f"train/{s.sequence}"]) for s in held_out if s.sequence in taught]
         module, data = assemble_fit(cfg, scene, reconstruction, body, found["train"], config, device, more)
-        print(fit_estimate(module))
+        if parallel.launched_rank() == 0:
+            print(fit_estimate(module, len(device_names(cfg))))
         fit(cfg, module, data, folder, device)
+    if parallel.launched_rank() != 0:
+        return None
     with clock.measure("evaluation"):
         figures, kept = evaluate(body, sequences(body, scene, held_out, found), world,
                                  samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
@@ -191,7 +202,7 @@ BACKWARD = 3.5  # cost of a step with gradients over one without, measured on th
 ADAPTER_COST, ADAPTER_BYTES = 1.8, 4.8e3  # of a step with networks over one without; per particle and evaluation
 
 
-def fit_estimate(module: LitMosa) -> str:
+def fit_estimate(module: LitMosa, processes: int = 1) -> str:
     """One line on how long the fit will take and what its networks will keep in memory, from one timed step without gradients."""
     body, stages = module.body, module.stages
     first = module.takes[0]
@@ -199,7 +210,7 @@ def fit_estimate(module: LitMosa) -> str:
     began = time.perf_counter()
     with torch.no_grad():
         module.terms(stages[0], [0, min(1, len(first.observations.cameras) - 1)], frames)
-    step = BACKWARD * (time.perf_counter() - began) * len(module.takes)
+    step = BACKWARD * (time.perf_counter() - began) * -(-len(module.takes) // processes)
     networks = body.adapter is not None and not body.adapter.steady
     seconds = sum(s.iterations * step * (ADAPTER_COST if s.name == "joint" and networks else 1) for s in stages)
     evaluations = (frames - 1) * body.last_substeps / body.settings.stride
@@ -216,13 +227,24 @@ def fit(cfg, module: LitMosa, data: MultiViewDataModule, folder: Path, device: s
     callbacks = [KeepLast(folder / "checkpoints"), FitProgress()]
     if cfg.logger.enabled and cfg.logger.images_every:
         callbacks.append(ImageStrips(cfg.logger.images_every))
-    trainer = L.Trainer(accelerator=cfg.trainer.accelerator, devices=cfg.trainer.devices, max_epochs=-1, logger=logger,
-                        callbacks=callbacks, plugins=[AtomicCheckpointIO()], enable_checkpointing=False,
+    shared = {"strategy": parallel.SharedSteps()} if len(device_names(cfg)) > 1 else {}
+    trainer = L.Trainer(accelerator=cfg.trainer.accelerator, devices=plain(cfg.trainer)["devices"], max_epochs=-1, logger=logger,
+                        callbacks=callbacks, plugins=[AtomicCheckpointIO(), LightningEnvironment()], enable_checkpointing=False,
                         enable_progress_bar=False, enable_model_summary=False, log_every_n_steps=1,
-                        reload_dataloaders_every_n_epochs=1, default_root_dir=folder)
-    trainer.fit(module, datamodule=data, ckpt_path=cfg.ckpt_path, weights_only=True)
+                        reload_dataloaders_every_n_epochs=1, default_root_dir=folder, use_distributed_sampler=False, **shared)
+    try:
+        trainer.fit(module, datamodule=data, ckpt_path=cfg.ckpt_path, weights_only=True)
+    except MosaError as error:
+        if parallel.launched_rank() != 0:  # what stops the fit stops it everywhere, and the first process says what it was
+            sys.exit(2)
+        if isinstance(error, parallel.RankLost) and (reason := trainer.strategy.launcher.wait_ended()):
+            raise parallel.RankLost(parallel.LOST.format(reason)) from error
+        raise
+    except SystemExit:  # Lightning's answer to Ctrl-C
+        raise KeyboardInterrupt from None
     if module.stage is not None:
         raise KeyboardInterrupt
+    parallel.disconnect()
     module.body.to(device)
 
 
@@ -249,8 +271,7 @@ def floor_figures(body: Body, evaluated: list[Sequence], world) -> dict[str, flo
 
 
 def write_outputs(folder: Path, cfg: DictConfig, body: Body, evaluated: list[Sequence], figures: dict, kept: dict) -> None:
-    """metrics.json, rollout.npz, video.mp4 of the last held-out sequence, strip.png of all; tables in results.md."""
-    (folder / "metrics.json").write_text(json.dumps(dict(sorted(figures.items())), indent=1))
+    """rollout.npz, video.mp4 of the last held-out sequence, strip.png of all; tables in results.md; metrics.json."""
     save_rollout(folder / "rollout.npz", {prefix: variants["adapted"] for prefix, variants in kept.items()})
     if cfg.evaluation.video:
         shown = [s for s in evaluated if s.prefix.startswith("test")] or evaluated[-1:]
@@ -262,6 +283,9 @@ def write_outputs(folder: Path, cfg: DictConfig, body: Body, evaluated: list[Seq
         write_strip(folder / "strip.png", rows, enlarge=max(1, enlarge - 1))
     table = results_table(figures) + "\n\n" + parameter_table(figures)
     (folder / "results.md").write_text(table + "\n")
+    partial = folder / "metrics.json.partial"  # the last file, and whole: it tells resume=auto that the run is complete
+    partial.write_text(json.dumps(dict(sorted(figures.items())), indent=1))
+    partial.replace(folder / "metrics.json")
     print(f"\n{table}\n\nrun folder: {folder}")
 
 
@@ -297,7 +321,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     if cfg.get("scene"):
         run.scene = cfg.scene
     scene, held_out = scenes(run)
-    known = {k: Start(**{n: torch.tensor(v) for n, v in s.items()}) for k, s in twin.config["starts"].items()}
+    known = read_starts(twin.config["starts"])
     if cfg.get("scene"):
         splats = splats_of(twin.body)
         known = {f"test/{s.sequence}": sequence_start(twin.body, splats, s, register=True) for s in (scene, *held_out)}

@@ -9,9 +9,9 @@ import lightning as L
 import torch
 from torch import Tensor
 
-from mosa import losses
+from mosa import losses, parallel
 from mosa.data.datamodule import Observations
-from mosa.errors import ConfigError, SimulationDiverged
+from mosa.errors import ConfigError, MosaError, SimulationDiverged
 from mosa.modules.adapter import pool
 from mosa.modules.body import Body, Start, World
 from mosa.modules.material import material_states
@@ -117,29 +117,47 @@ class LitMosa(L.LightningModule):
         for group in optimizer.param_groups:
             group["lr"] = group["rate"] * stage.decay(iteration)
         optimizer.zero_grad()
-        total, mean = 0.0, {}
-        for take in self.takes:  # one graph at a time: memory is that of one sequence
-            length = len(take.cues.positions)
-            frames = stage.active_frames(iteration, min(take.first_contact + 3, length), length)
-            terms, rollout = self.terms(stage, views, frames, take)
-            loss = sum(self.weights.get(name, 0.0) * value for name, value in terms.items()) / len(self.takes)
-            if not torch.isfinite(loss):
-                bad = [name for name, value in terms.items() if not torch.isfinite(value)]
-                raise SimulationDiverged(f"stage {stage.name}, iteration {iteration}: loss terms {bad} are not finite; "
-                                         "lower fit.*.lr or simulation.courant")
-            self.manual_backward(loss)
-            total = total + loss.detach()
-            for name, value in terms.items():
-                mean[name] = mean.get(name, 0.0) + value.detach() / len(self.takes)
-        loss, terms = total, mean
+        figures, failure = {}, None
+        try:
+            for index, own, weight in parallel.share(len(self.takes), views):
+                for name, value in self.descend(stage, iteration, self.takes[index], own, weight).items():
+                    figures[name] = figures.get(name, 0.0) + weight * value
+        except MosaError as error:
+            failure = error
+        parallel.agree(failure)
+        terms = parallel.exchange((p for group in optimizer.param_groups for p in group["params"]), figures)
+        loss = terms.pop("loss")
         norms = self.gradient_norms(optimizer, stage, iteration)
         optimizer.step()
         self.body.contact.project()
         self.losses.append(float(loss))
         self.steps_done += 1
-        self.report(stage, iteration, frames, terms, loss, norms, views, rollout)
+        self.report(stage, iteration, terms, loss, norms)
         if stage.ended(self.losses):
             self.finish(stage)
+
+    def descend(self, stage: Stage, iteration: int, take: Take, views: list[int], weight: float) -> dict[str, Tensor]:
+        """Add the gradient of one take's loss, times `weight`; the loss, its terms and what else is logged, not weighted.
+
+        One graph at a time: memory is that of one sequence.
+        """
+        frames = self.active_frames(stage, iteration, take)
+        terms, rollout = self.terms(stage, views, frames, take)
+        loss = sum(self.weights.get(name, 0.0) * value for name, value in terms.items())
+        if not torch.isfinite(loss):
+            bad = [name for name, value in terms.items() if not torch.isfinite(value)]
+            raise SimulationDiverged(f"stage {stage.name}, iteration {iteration}: loss terms {bad} are not finite; "
+                                     "lower fit.*.lr or simulation.courant")
+        self.manual_backward(weight * loss)
+        figures = {name: value.detach() for name, value in terms.items()} | {"loss": loss.detach()}
+        figures["inverted"] = loss.new_tensor(float(rollout.inverted))
+        if "mean_abs_C" in self.last:
+            figures["mean_abs_C"] = loss.new_tensor(self.last["mean_abs_C"])
+        return figures
+
+    def active_frames(self, stage: Stage, iteration: int, take: Take) -> int:
+        length = len(take.cues.positions)
+        return stage.active_frames(iteration, min(take.first_contact + 3, length), length)
 
     def terms(
         self, stage: Stage, views: list[int], frames: int, take: Take | None = None
@@ -211,7 +229,8 @@ class LitMosa(L.LightningModule):
                 parameters = {k: v.detach() for k, v in material.per_particle(1.0).items()}
                 warm_start(adapter, material_states(material.law, parameters))
             if self.weights.get("operator", 0.0) != 0:
-                self.misfit = max(self.measure_misfit(), 0.1 * MISFIT)
+                self.misfit = max(parallel.mean(self.measure_misfit()), 0.1 * MISFIT)
+        parallel.synchronise(self.body)  # on a GPU ranks may come to slightly different numbers
 
     @torch.no_grad()
     def measure_misfit(self) -> float:
@@ -232,21 +251,25 @@ class LitMosa(L.LightningModule):
         if self.stage is None:
             self.trainer.should_stop = True
 
+    def on_train_start(self) -> None:
+        if self.stage is None:  # a run that was stopped after its fit
+            self.trainer.should_stop = True
+
     # ---------------------------------------------------------------- logs
-    def report(self, stage, iteration, frames, terms, loss, norms, views, rollout) -> None:
-        """Scalars of one step: every term raw and weighted, parameters, mean |C|, gradient norms."""
-        values = {"loss/total": loss.detach(), "fit/frames": float(frames), "fit/stage": float(self.stage_index)}
+    def report(self, stage: Stage, iteration: int, terms: dict[str, Tensor], loss: Tensor, norms: dict[str, float]) -> None:
+        """Scalars of one step, means over the takes: every term raw and weighted, parameters, mean |C|, gradient norms."""
+        values = {"loss/total": loss, "fit/frames": float(self.active_frames(stage, iteration, self.takes[-1])),
+                  "fit/stage": float(self.stage_index), "fit/inverted": terms.pop("inverted")}
+        if "mean_abs_C" in terms:
+            values["adapter/mean_abs_C"] = terms.pop("mean_abs_C")
         for name, value in terms.items():
-            values[f"loss_raw/{name}"] = value.detach()
-            values[f"loss_weighted/{name}"] = self.weights[name] * value.detach()
+            values[f"loss_raw/{name}"] = value
+            values[f"loss_weighted/{name}"] = self.weights[name] * value
         for name, value in self.body.material.physical().items():
             values[f"id/{name}"] = value.detach()
         values["id/contact_offset"] = self.body.contact().detach()
         for name, value in norms.items():
             values[f"gradient_norm/{name}"] = value
-        if "mean_abs_C" in self.last:
-            values["adapter/mean_abs_C"] = self.last["mean_abs_C"]
-        values["fit/inverted"] = float(rollout.inverted)
         self.log_dict({k: torch.as_tensor(v, dtype=torch.float32) for k, v in values.items()}, on_step=True, on_epoch=False)
         self.last |= {k: float(v) for k, v in values.items()}
 

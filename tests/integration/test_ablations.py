@@ -6,9 +6,9 @@ from assembled import assembled
 
 
 @pytest.fixture(scope="module")
-def first_step(tmp_path_factory):
+def first_step(cache):
     """Function ablation -> (loss terms of the first joint step, names of the trainable parameters)."""
-    cache, known = tmp_path_factory.mktemp("cache"), {}
+    known = {}
 
     def compute(ablation: str):
         if ablation not in known:

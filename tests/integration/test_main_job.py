@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,6 +20,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory):
+    """Its own: the first run reconstructs too."""
     return tmp_path_factory.mktemp("cache")
 
 
@@ -102,12 +104,26 @@ def test_a_killed_run_resumes_bit_for_bit(run, cache, tmp_path):
         assert torch.equal(value, resumed["state_dict"][key]), key
 
 
+def test_resume_auto_goes_on_and_then_skips(run, cache, tmp_path):
+    """From a run that was killed after its fit: nothing is left to fit, the figures are."""
+    shutil.copytree(run / "checkpoints", tmp_path / "checkpoints")
+    first = call("train.py", tmp_path, cache, "resume=auto", "evaluation.video=false", "evaluation.samples=256")
+    assert first.returncode == 0 and f"going on from {tmp_path}/checkpoints/last.ckpt" in first.stdout, first.stderr[-3000:]
+    whole, found = (json.loads((folder / "metrics.json").read_text()) for folder in (run, tmp_path))
+    assert {k: v for k, v in found.items() if k.startswith("id/")} == {k: v for k, v in whole.items() if k.startswith("id/")}
+    written = (tmp_path / "metrics.json").stat().st_mtime_ns
+    second = call("train.py", tmp_path, cache, "resume=auto")
+    assert second.returncode == 0 and f"skipped: {tmp_path}" in second.stdout, second.stderr[-3000:]
+    assert (tmp_path / "metrics.json").stat().st_mtime_ns == written
+
+
 @pytest.mark.parametrize(
     ("overrides", "expected"),
     [
         (["prior=jelly"], "Could not find 'prior/jelly'"),
         (["ckpt_path=nowhere.ckpt"], "ckpt_path: no file nowhere.ckpt"),
         (["losses.colour=1"], "colour"),
+        (["trainer.devices=1000", "trainer.accelerator=gpu"], "trainer.devices: expected at most"),
         (["scene=pacnerf", "scene.path=/nonexistent"], "/nonexistent"),
     ],
 )

@@ -5,12 +5,6 @@ import torch
 from assembled import assembled
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    """The reconstruction does not depend on the prior: one serves all."""
-    return tmp_path_factory.mktemp("cache")
-
-
 @pytest.mark.parametrize("prior", ["herschel_bulkley", "herschel_bulkley_hencky", "newtonian"])
 def test_the_loss_reaches_every_parameter(prior, cache):
     cfg, scene, module = assembled(cache, f"prior={prior}")

@@ -13,11 +13,6 @@ from assembled import assembled
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    return tmp_path_factory.mktemp("cache")
-
-
 def test_a_step_descends_the_mean_over_the_sequences(cache):
     _, _, module = assembled(cache, taught=["test_60"])
     assert len(module.takes) == 2

@@ -1,0 +1,77 @@
+"""A run's place: what its folder already holds, the device of each of its processes, and what they hand on through it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig
+
+from mosa import parallel
+from mosa.config import plain
+from mosa.errors import ConfigError
+from mosa.modules.body import Body, Start
+
+
+def finished(cfg: DictConfig, folder: Path) -> dict[str, float] | None:
+    """The figures of a run that is complete and, with resume=auto, is not made again. Errors: ConfigError."""
+    if cfg.resume not in (None, "auto"):
+        raise ConfigError(f"resume: expected null or auto, found {cfg.resume!r}; a checkpoint's path is ckpt_path")
+    path = folder / "metrics.json"
+    return json.loads(path.read_text()) if cfg.resume == "auto" and path.is_file() else None
+
+
+def begins_from(cfg: DictConfig, folder: Path) -> str | None:
+    """The checkpoint that the fit goes on from: with resume=auto the run folder's own where it has one."""
+    last = folder / "checkpoints" / "last.ckpt"
+    if cfg.resume != "auto" or not last.is_file():
+        return cfg.ckpt_path
+    print(f"going on from {last} (resume=auto)")
+    return str(last)
+
+
+def device_names(cfg: DictConfig) -> list[str]:
+    """torch device of each process of the fit."""
+    return parallel.devices(cfg.trainer.accelerator, plain(cfg.trainer)["devices"])
+
+
+def device_of(cfg: DictConfig) -> str:
+    """torch device of this process. Errors: ConfigError naming the key of conf/trainer."""
+    names = device_names(cfg)
+    if len(names) > 1 and HydraConfig.get().mode == RunMode.MULTIRUN:
+        raise ConfigError(f"trainer.devices: expected one in a sweep, found {len(names)}: its jobs run beside each other "
+                          "(docs/sweeps.md)")
+    name = names[parallel.launched_rank()] if len(names) > 1 else names[0]
+    if name != "cpu":
+        torch.cuda.set_device(name)
+    return name
+
+
+def written_starts(found: dict[str, Start]) -> dict[str, dict[str, list]]:
+    """Plain containers, fit for a checkpoint; `read_starts` gives the same numbers."""
+    names = ("rotation", "center", "velocity", "angular_velocity")
+    return {k: {n: getattr(s, n).tolist() for n in names} for k, s in found.items()}
+
+
+def read_starts(written: dict[str, dict[str, list]], like: torch.Tensor | None = None) -> dict[str, Start]:
+    found = {k: {n: torch.tensor(v) for n, v in s.items()} for k, s in written.items()}
+    return {k: Start(**{n: v if like is None else v.to(like) for n, v in s.items()}) for k, s in found.items()}
+
+
+def shared_starts(cfg: DictConfig, folder: Path, find: Callable[[], dict[str, Start]], body: Body) -> dict[str, Start]:
+    """The starts, found by the first process of the fit and read by the others: on a GPU each would find slightly different ones,
+    and so look for another motion in the cache."""
+    path = folder / "starts.json"
+    if parallel.launched_rank() != 0:
+        if not path.is_file():
+            raise ConfigError("trainer.devices: expected a run started by python train.py, which starts the other processes; "
+                              f"found LOCAL_RANK={parallel.launched_rank()} and no {path} (torchrun and srun are not supported)")
+        return read_starts(json.loads(path.read_text()), body.rest)
+    found = find()
+    if len(device_names(cfg)) > 1:
+        path.write_text(json.dumps(written_starts(found)))
+    return found
