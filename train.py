@@ -14,6 +14,9 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
+failed: list[str] = []
+"""What went wrong in the jobs of a sweep that run in this process."""
+
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
 def main(cfg: DictConfig) -> float | None:
@@ -25,6 +28,7 @@ def main(cfg: DictConfig) -> float | None:
     except MosaError as error:
         print(f"\n{type(error).__name__}: {error}", file=sys.stderr)
         if HydraConfig.get().mode == RunMode.MULTIRUN:
+            failed.append(str(error))
             return float("inf")  # the sweep's other jobs go on
         sys.exit(2)
     except KeyboardInterrupt:
@@ -35,3 +39,5 @@ def main(cfg: DictConfig) -> float | None:
 
 if __name__ == "__main__":
     main()
+    if failed:
+        sys.exit(f"\n{len(failed)} jobs of the sweep failed; the first: {failed[0]}")

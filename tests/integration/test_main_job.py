@@ -132,3 +132,12 @@ def test_a_mistake_ends_in_one_message(overrides, expected, cache, tmp_path):
     assert result.returncode != 0
     assert expected in result.stderr
     assert "Traceback" not in result.stderr
+
+
+def test_a_sweep_goes_on_after_a_job_that_fails_and_says_so_at_the_end(cache, tmp_path):
+    keys = ["debug=default", f"scene.cache={cache}", "trainer.accelerator=gpu", "trainer.devices=1000,2000"]
+    sweep = [sys.executable, "train.py", "-m", f"hydra.sweep.dir={tmp_path}", *keys]
+    result = subprocess.run(sweep, cwd=ROOT, capture_output=True, text=True, timeout=400)
+    assert result.returncode == 1
+    assert all(f"found {count}" in result.stderr for count in (1000, 2000))
+    assert "2 jobs of the sweep failed; the first: trainer.devices" in result.stderr
