@@ -92,9 +92,9 @@ class Chain:
         work = self._full()
         if not self.statistics_seeds:
             self.statistics_seeds = tuple(torch.zeros_like(t) for t in self.statistics)
+        work.set_window(origin, self.dims)
         if tape and tape[-1].shape != work.tape()[-1].shape:
             tape = ()  # the window has grown since
-        work.set_window(origin, self.dims)
         work.load(state, {"parameters": packed}, solver.volume, solver.mass, solver.cutoff)
         for target, value in zip(work.tape(), tape):
             target.copy_(value)
@@ -259,6 +259,7 @@ def advance_chain(
     """((x, v, C_affine, F, F_tot) after the chain, statistics of each evaluation), differentiable in state, parameters and the
     adapter's weights. first: number of the first substep, for messages; kept: keep the states of all substeps for the backward
     pass. Errors: SimulationDiverged."""
+    kept = kept and torch.is_grad_enabled()  # inside, gradients are off, and inputs say what they would need with them on
     result = _Chained.apply(chain, solver, first, kept, *state, packed, *chain.weights)
     count = 5 if solver.numerics.law.plastic else 4
     final = result[:count] if count == 5 else (*result[:4], result[3])

@@ -341,7 +341,8 @@ class Simulator:
     def _chain(
         self, adapter: nn.Module, lengths: tuple[int, ...], state: tuple[Tensor, ...], packed: Tensor, collects: bool
     ) -> Chain:
-        key = (id(adapter), len(packed), lengths, collects)  # the chain holds the adapter: its id is not given to another one
+        learned = tuple(p.requires_grad for p in adapter.parameters())
+        key = (id(adapter), len(packed), lengths, collects, learned)  # the chain holds the adapter: its id stays its own
         if key not in self._chains:
             if len(self._chains) >= MAX_CHAINS:
                 self._chains.clear()

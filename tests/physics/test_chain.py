@@ -96,6 +96,43 @@ def test_graphs_follow_new_weights_states_and_windows(device, make_block):
         once()
 
 
+def test_weights_that_are_freed_later_get_their_gradient(make_block):
+    adapter, state = adapter_of("cpu", torch.float64, False), make_block(n=5)
+    sim = Simulator("corotated", dx=0.04, substeps=8, frame_dt=3.2e-3, ground=Ground(0.0), dtype=torch.float64, chained=True)
+    volume = torch.full((len(state.x),), 8e-6, dtype=torch.float64)
+
+    def end():
+        return sim.rollout(state, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 3, adapter=adapter, stride=2).x[-1].square().sum()
+
+    adapter.requires_grad_(False)
+    end()
+    adapter.requires_grad_(True)
+    found = torch.autograd.grad(end(), list(adapter.parameters()), allow_unused=True)
+    assert all(g is not None for g in found) and any(bool(g.abs().max() > 0) for g in found)
+
+
+def test_a_window_that_grows_between_the_passes_does_not_change_the_gradient(make_block):
+    """A rollout of a faster body, without gradients, widens the grid of a chain whose backward pass is still to come."""
+    adapter, near = adapter_of("cpu", torch.float64, False), make_block(n=5)
+    far = replace(near, v=near.v + torch.tensor([40.0, 30.0, -20.0], dtype=torch.float64) * near.x[:, :1])
+    volume = torch.full((len(near.x),), 8e-6, dtype=torch.float64)
+    gradients = []
+    for disturbed in (False, True):
+        sim = Simulator("corotated", dx=0.04, substeps=8, frame_dt=3.2e-3, dtype=torch.float64, chained=True)
+
+        def end(state, sim=sim):
+            return sim.rollout(state, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 3, adapter=adapter, stride=2).x[-1].square().sum()
+
+        loss = end(near)
+        if disturbed:
+            before = next(iter(sim._chains.values())).dims
+            with torch.no_grad():
+                end(replace(far, v=30 * far.v))
+            assert next(iter(sim._chains.values())).dims != before
+        gradients.append(torch.autograd.grad(loss, list(adapter.parameters())))
+    assert_same(gradients[1], gradients[0], 1e-11)
+
+
 def test_divergence_names_the_substep_and_the_particle(make_block):
     adapter, state = adapter_of("cpu", torch.float64, False), make_block(n=5, velocity=(0.0, 1.5, 0.0))
     top = float(state.x[:, 1].max()) + 0.008  # reached in the second frame
