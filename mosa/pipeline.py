@@ -34,7 +34,7 @@ from mosa.reconstruction.starts import first_contact, sequence_start, splats_of
 from mosa.rendering.cameras import crop_boxes, crop_images
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import use_backend
-from mosa.run import begins_from, device_names, device_of, finished, read_starts, shared_starts, written_starts
+from mosa.run import begins_from, device_names, device_of, finished, shared_starts
 from mosa.twin import Twin, save_rollout
 from mosa.types import MotionCues, Reconstruction, Scene
 
@@ -132,7 +132,7 @@ def train(cfg: DictConfig) -> float | None:
     body = body_of(reconstruction, config).to(device)
     with clock.measure("starts"):
         found = shared_starts(cfg, folder, lambda: starts(body, reconstruction, scene, held_out, taught), body)
-    config["starts"] = written_starts(found)
+    config["starts"] = {k: s.written() for k, s in found.items()}
     world = build_world(config["world"])
     with clock.measure("fit"):
         more = [(s, found[f"train/{s.sequence}"]) for s in held_out if s.sequence in taught]
@@ -321,7 +321,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     if cfg.get("scene"):
         run.scene = cfg.scene
     scene, held_out = scenes(run)
-    known = read_starts(twin.config["starts"])
+    known = {k: Start.read(s) for k, s in twin.config["starts"].items()}
     if cfg.get("scene"):
         splats = splats_of(twin.body)
         known = {f"test/{s.sequence}": sequence_start(twin.body, splats, s, register=True) for s in (scene, *held_out)}

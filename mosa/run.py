@@ -51,17 +51,6 @@ def device_of(cfg: DictConfig) -> str:
     return name
 
 
-def written_starts(found: dict[str, Start]) -> dict[str, dict[str, list]]:
-    """Plain containers, fit for a checkpoint; `read_starts` gives the same numbers."""
-    names = ("rotation", "center", "velocity", "angular_velocity")
-    return {k: {n: getattr(s, n).tolist() for n in names} for k, s in found.items()}
-
-
-def read_starts(written: dict[str, dict[str, list]], like: torch.Tensor | None = None) -> dict[str, Start]:
-    found = {k: {n: torch.tensor(v) for n, v in s.items()} for k, s in written.items()}
-    return {k: Start(**{n: v if like is None else v.to(like) for n, v in s.items()}) for k, s in found.items()}
-
-
 def shared_starts(cfg: DictConfig, folder: Path, find: Callable[[], dict[str, Start]], body: Body) -> dict[str, Start]:
     """The starts, found by the first process of the fit and read by the others: on a GPU each would find slightly different ones,
     and so look for another motion in the cache."""
@@ -70,8 +59,8 @@ def shared_starts(cfg: DictConfig, folder: Path, find: Callable[[], dict[str, St
         if not path.is_file():
             raise ConfigError("trainer.devices: expected a run started by python train.py, which starts the other processes; "
                               f"found LOCAL_RANK={parallel.launched_rank()} and no {path} (torchrun and srun are not supported)")
-        return read_starts(json.loads(path.read_text()), body.rest)
+        return {k: Start.read(s, body.rest) for k, s in json.loads(path.read_text()).items()}
     found = find()
     if len(device_names(cfg)) > 1:
-        path.write_text(json.dumps(written_starts(found)))
+        path.write_text(json.dumps({k: s.written() for k, s in found.items()}))
     return found

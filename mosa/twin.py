@@ -46,7 +46,7 @@ class Twin:
         state = {k.removeprefix("body."): v for k, v in checkpoint["state_dict"].items() if k.startswith("body.")}
         body = build_body(saved["config"], {k: state[k] for k in ("rest", "volume", "colors", "opacities", "covariances")})
         body.load_state_dict(state)
-        start = Start(**{k: torch.tensor(v) for k, v in saved["start"].items()})
+        start = Start.read(saved["start"])
         config = saved["config"]
         return cls(body.to(device).eval(), build_world(config["world"]), config["frame_dt"], config, start)
 

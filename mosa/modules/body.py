@@ -6,8 +6,8 @@ One module for fitting, evaluation and later use, so that what is learned is wha
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor, nn
@@ -38,6 +38,16 @@ class Start:
     center: Tensor
     velocity: Tensor
     angular_velocity: Tensor
+
+    def written(self) -> dict[str, list]:
+        """Plain containers, fit for a checkpoint; `read` gives the same numbers."""
+        return {f.name: getattr(self, f.name).tolist() for f in fields(self)}
+
+    @classmethod
+    def read(cls, written: Mapping[str, list], like: Tensor | None = None) -> Start:
+        """like: tensor of the device and type wanted, None for the CPU's float32."""
+        found = {name: torch.tensor(value) for name, value in written.items()}
+        return cls(**{name: value if like is None else value.to(like) for name, value in found.items()})
 
 
 @dataclass(frozen=True)

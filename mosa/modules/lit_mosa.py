@@ -75,9 +75,8 @@ class LitMosa(L.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict) -> None:
         checkpoint["mosa"] = {"config": self.config, "stage": self.stage_index, "losses": list(self.losses),
-                              "steps_done": self.steps_done, "particles": len(self.body.rest), "misfit": self.misfit}
-        checkpoint["mosa"]["start"] = {k: getattr(self.takes[0].start, k).tolist() for k in
-                                       ("rotation", "center", "velocity", "angular_velocity")}
+                              "steps_done": self.steps_done, "particles": len(self.body.rest), "misfit": self.misfit,
+                              "start": self.takes[0].start.written()}
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
         if "mosa" not in checkpoint:
