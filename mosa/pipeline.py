@@ -242,9 +242,10 @@ def fit(cfg, module: LitMosa, data: MultiViewDataModule, folder: Path, device: s
         raise
     except SystemExit:  # Lightning's answer to Ctrl-C
         raise KeyboardInterrupt from None
+    finally:
+        parallel.disconnect()
     if module.stage is not None:
         raise KeyboardInterrupt
-    parallel.disconnect()
     module.body.to(device)
 
 

@@ -152,6 +152,7 @@ def exchanging(rank: int, folder: str) -> None:
         parallel.agree(None)
     except parallel.RankLost as error:
         Path(folder, "lost").write_text(str(error))
+    parallel.disconnect()
 
 
 def test_ranks_exchange_agree_and_notice_a_loss(tmp_path):
