@@ -181,29 +181,33 @@ class StressAdapter(Adapter):
         self.check_on()
         outer, inner = state.w.dtype, self.E_ref.dtype
         w = state.w.to(inner)
-        G, b, parts = self._evaluate(self.operator, w, state.stress.to(inner) / self.E_ref)
+        G, h, parts = self._evaluate(self.operator, w, state.stress.to(inner), self.E_ref)
         self._last = (parts.C, parts.pre, parts.post)
         plastic_G = plastic_h = None
         if self.plastic_operator is not None and state.plastic_strain is not None:
-            plastic_G, plastic_h, _ = self._evaluate(self.plastic_operator, w, state.plastic_strain.to(inner))
+            plastic_G, plastic_h, _ = self._evaluate(
+                self.plastic_operator, w, state.plastic_strain.to(inner), torch.ones_like(self.E_ref)
+            )
             plastic_G, plastic_h = plastic_G.to(outer), plastic_h.to(outer)
-        return AdapterOperator(G.to(outer), (self.E_ref * b).to(outer), plastic_G, plastic_h)
+        return AdapterOperator(G.to(outer), h.to(outer), plastic_G, plastic_h)
 
-    def _evaluate(self, operator: ProgressiveOperator, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Correction]:
+    def _evaluate(
+        self, operator: ProgressiveOperator, w: Tensor, s: Tensor, unit: Tensor
+    ) -> tuple[Tensor, Tensor, Correction]:
+        """`affine` with s and b in multiples of unit (); the fused kernels give C as (N, 4, 12), the numbers of the matrices."""
         if chosen(self.fused, operator, w):
-            return self._evaluate_fused(operator, w, s)
+            from mosa.modules.fused.operation import Settings, fused_operator
+
+            settings = Settings(
+                operator.alpha, operator.l_max, float(operator.scale), self.rest_free, PRECISIONS[self.precision]
+            )
+            G, h, numbers, pre, post = fused_operator(w, s, unit.reshape(1), settings, weights_of(operator))
+            return G, h, Correction(G, pre, post, numbers.unflatten(-1, (4, 12)))
         if self.recompute and torch.is_grad_enabled() and not backward_at_hand():
-            return checkpoint(self.affine, operator, w, s, use_reentrant=False, preserve_rng_state=False)
-        return self.affine(operator, w, s)
-
-    def _evaluate_fused(self, operator: ProgressiveOperator, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Correction]:
-        """`affine` by the fused kernels; C of the result is (N, 4, 12), the numbers of the matrices."""
-        from mosa.modules.fused.operation import Settings, fused_operator
-
-        settings = Settings(operator.alpha, operator.l_max, float(operator.scale), PRECISIONS[self.precision])
-        G, b, numbers, pre, post = fused_operator(w, s, settings, weights_of(operator))
-        b = rested(b[:-1], b[-1:], w, s) if self.rest_free else b[:-1]
-        return G, b, Correction(G, pre, post, numbers.unflatten(-1, (4, 12)))
+            G, b, parts = checkpoint(self.affine, operator, w, s / unit, use_reentrant=False, preserve_rng_state=False)
+        else:
+            G, b, parts = self.affine(operator, w, s / unit)
+        return G, unit * b, parts
 
 
 def rested(b: Tensor, rest: Tensor, w: Tensor, s: Tensor) -> Tensor:

@@ -155,7 +155,7 @@ class Chain:
                 slot = step % len(work.x)
                 answer, statistics = self._ask(work.F[slot], work.C[slot], work.held["parameters"], collects)
                 collected.append(statistics)
-                work.hold(answer)
+                work.point(answer)
                 with warp_stream(self.numerics.device):
                     work.advance_steps(step, length)
                 step += length
@@ -178,7 +178,7 @@ class Chain:
                 # aliases: autograd ties a leaf to the stream it was first used on, which a capture on another one may not touch
                 leaves = [t.detach().requires_grad_() for t in inputs]
                 answer, statistics = self._ask(*leaves[:3], penalised, leaves[3:])
-            work.hold({name: None if t is None else t.detach() for name, t in answer.items()})
+            work.point({name: None if t is None else t.detach() for name, t in answer.items()})
             with warp_stream(self.numerics.device):
                 work.adjoint_steps(step, self.lengths[index])
             pairs = [(answer[name], work.adj_held[name]) for name in ANSWER if answer[name] is not None]

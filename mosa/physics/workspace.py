@@ -175,6 +175,12 @@ class Workspace:
             if value is not None:
                 self.held[name].copy_(value)
 
+    def point(self, held: dict[str, Tensor | None]) -> None:
+        """As `hold`, without a copy: the next launches read these tensors. The caller keeps them."""
+        for name, value in held.items():
+            if value is not None:
+                self.held_wp[name] = wp.from_torch(value.contiguous(), dtype=self.held_wp[name].dtype)
+
     def final(self) -> tuple[Tensor, ...]:
         """Copies of (x, v, C_affine, F, F_tot) after the segment; F_tot is F itself where the law does not yield."""
         last = self.substeps % len(self.x)

@@ -1,32 +1,35 @@
-"""Triton kernels of the backward pass of the four networks: hidden layers recomputed, weight gradients summed per program.
+"""Triton kernels of the backward pass of the four networks, hidden layers recomputed, and of their weight gradients.
 
-`*_backward` take one tile of BLOCK rows through the adjoint of a network and leave, by column, what its weight gradients are made
-of: h1, h2 activations and g1, g2 adjoints of the two hidden layers (H, M), x inputs, g adjoints of the outputs. `weight_gradients`
-sums the products: each program over its share of the rows, into its own row of `partial`, and torch adds these rows once: no
-atomics, the same result every time. In one kernel the sums would push everything else out of the registers. g..: adjoints.
+`*_backward` take tiles of BLOCK rows through the adjoint of a network. Gradients of its weights are sums of products over the rows,
+a program's share of them in its own row of `partial` (programs, size), which torch adds up: no atomics, the same result every
+time. SUMS says where they are made:
+inside: in the same kernel, sums in registers. Half the instructions and a fifth of the memory traffic, but only where weights and
+    sums fit on a multiprocessor: single tf32 products, 64 columns.
+outside: the kernel leaves, by column, what they are made of: h1, h2 activations and g1, g2 adjoints of the two hidden layers
+    (H, M), x inputs, gout adjoints of the outputs; `weight_gradients` multiplies them.
+none: nobody wants them.
+g..: adjoints. D., d.: sums of a weight's and a bias's gradient; a bias has a column of ones as its input.
 """
 
 import triton
 import triton.language as tl
 
-from mosa.modules.fused.network_kernels import (
-    by_column,
-    dense,
-    matrix,
-    network_input,
-    normal,
-    product,
-    psi2_hidden,
-    silu,
-    store_by_column,
-    theta_hidden,
-)
+from mosa.modules.fused.network_kernels import by_column, factor, forward, network_input, product, silu, store_by_column, tile_of
 
 
 @triton.jit
 def by_row(p, r, c, rows):
     """(BLOCK, 16) tile of (rows, 6)."""
     return tl.load(p + r[:, None] * 6 + c[None, :], mask=(r[:, None] < rows) & (c[None, :] < 6), other=0.0)
+
+
+@triton.jit
+def seeds_of_b(gh, rest, unit, r, c, N, RESTED: tl.constexpr):
+    """(BLOCK, 16) adjoints of b from those of h (N, 6) and their sum."""
+    g = by_row(gh, r, c, N)
+    if RESTED:
+        g -= tl.where(r[:, None] == N, tl.load(rest + c, mask=c < 6, other=0.0)[None, :], 0.0)
+    return tl.load(unit) * g
 
 
 @triton.jit
@@ -39,164 +42,305 @@ def store_input_adjoint(gw, gs, g, r, M):
 
 
 @triton.jit
-def hidden_adjoint(
-    g, z1, W2, b2, h1, h2, g1, g2, r, M, WEIGHTS: tl.constexpr, H: tl.constexpr, P: tl.constexpr
-):  # fmt: skip
-    """(BLOCK, H) adjoint of z1 from g, that of the second activations; with WEIGHTS all four hidden arrays are stored."""
-    h = tl.arange(0, H)
-    a1, _ = silu(z1)
-    if WEIGHTS:
-        store_by_column(h1, a1, r, h, M, H)
-    a2, d2 = silu(dense(a1, matrix(W2, h, h, H, H, H), tl.load(b2 + h), P))
-    e2 = g * d2
-    if WEIGHTS:
-        store_by_column(h2, a2, r, h, M, H)
-        store_by_column(g2, e2, r, h, M, H)
-    _, d1 = silu(z1)
-    e1 = product(e2, matrix(W2, h, h, H, H, H), P) * d1
-    if WEIGHTS:
-        store_by_column(g1, e1, r, h, M, H)
-    return e1
-
-
-@triton.jit(do_not_specialize=["N"])
-def theta_backward(
-    l2, w, s2, post, gb, extra, W1, b1, W2, b2, W3, b3, h1, h2, g1, g2, gout, gl2, gw, gs2, N, M, scale, bound,
-    BOUNDED: tl.constexpr, EXTRA: tl.constexpr, WEIGHTS: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
-):  # fmt: skip
-    """gl2 (H, M), gw, gs2 (6, M) from the adjoints gb (N + 1, 6) of b and extra (N, 6) of post; gout (6, M). The scaled (w, s2)
-    becomes rows H to H + 11 of l2."""
-    r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    h, c = tl.arange(0, H), tl.arange(0, 16)
-    _, rest, z1 = theta_hidden(l2, w, s2, W1, b1, r, N, M, scale, H, P)
-    g = by_row(gb, r, c, N + 1)
-    if EXTRA:
-        g += by_row(extra, r, c, N)
-    if BOUNDED:
-        y = by_column(post, r, c, M, 6)
-        g *= bound - y * y / bound
-    if WEIGHTS:
-        store_by_column(l2 + H * M, rest, r, c, M, 12)
-        store_by_column(gout, g, r, c, M, 6)
-    g = product(g, matrix(W3, c, h, H, 6, H), P)
-    e1 = hidden_adjoint(g, z1, W2, b2, h1, h2, g1, g2, r, M, WEIGHTS, H, P)
-    store_by_column(gl2, product(e1, matrix(W1, h, h, H + 12, H, H), P), r, h, M, H)
-    gx = scale * product(e1, matrix(W1 + H, h, c, H + 12, H, 12), P)
-    store_input_adjoint(gw, gs2, gx, r, M)
+def outer(g, x, P: tl.constexpr):
+    """g^T x, summed over the rows."""
+    return product(tl.trans(g), factor(x, P), P)
 
 
 @triton.jit
-def normal_adjoint(gt, t, s1, g, r, M, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr):
-    """Stores the adjoints of u00, u01, u02, l00 of a plane, rows 4 plane to 4 plane + 3 of gt (12, M); returns those of the three
-    components of s1. g: adjoint of the normal traction."""
-    v0, v1, v2, u00, u01, u02, l00 = normal(t, s1, r, M, plane, c1, c2)
-    k = g * (1.0 + l00)
-    first = gt + 4 * plane * M + r
-    tl.store(first, k * v0)
-    tl.store(first + M, k * v1)
-    tl.store(first + 2 * M, k * v2)
-    tl.store(first + 3 * M, g * (v0 + u00 * v0 + u01 * v1 + u02 * v2))
-    return k * (1.0 + u00), k * u01, k * u02
+def backward(W, OUT: tl.constexpr, IN: tl.constexpr, STRIDE: tl.constexpr, P: tl.constexpr):
+    return factor(tile_of(W, OUT, IN, STRIDE), P)
 
 
-@triton.jit(do_not_specialize=["N"])
+@triton.jit
+def ones_column(BLOCK: tl.constexpr):
+    """(BLOCK, 16): ones, then zeros."""
+    return tl.where(tl.arange(0, 16)[None, :] == 0, tl.full((BLOCK, 16), 1.0, tl.float32), 0.0)
+
+
+@triton.jit
+def with_ones(x, column: tl.constexpr):
+    """x (BLOCK, 16) with ones in a column that is not used."""
+    return tl.where(tl.arange(0, 16)[None, :] == column, 1.0, x)
+
+
+@triton.jit
+def store_square(at, D, IN: tl.constexpr, H: tl.constexpr):
+    """The sums (H, H) of a weight (H, IN), or of its first columns."""
+    h = tl.arange(0, H)
+    tl.store(at + h[:, None] * IN + h[None, :], D)
+
+
+@triton.jit
+def store_columns(at, D, row: tl.constexpr, column: tl.constexpr, first: tl.constexpr, count: tl.constexpr, H: tl.constexpr):
+    """Columns `first` to `first + count` of the sums (H, 16), `row` and `column` numbers apart."""
+    h, c = tl.arange(0, H)[:, None], tl.arange(0, 16)[None, :]
+    tl.store(at + h * row + (c - first) * column, D, mask=(c >= first) & (c < first + count) & (h >= 0))
+
+
+@triton.jit(do_not_specialize=["N", "start"])
+def theta_backward(
+    l2, w, s2, post, gh, rest, unit, extra, W1, b1, W2, b2, W3, b3, h1, h2, g1, g2, gout, partial, gl2, gw, gs2, start, size, N, M,
+    scale, bound, BOUNDED: tl.constexpr, RESTED: tl.constexpr, EXTRA: tl.constexpr, SUMS: tl.constexpr, H: tl.constexpr,
+    BLOCK: tl.constexpr, P: tl.constexpr,
+):  # fmt: skip
+    """gl2 (H, M), gw, gs2 (6, M) from the adjoints gh (N, 6) of h and extra (N, 6) of post; gout (6, M). Outside, the scaled
+    (w, s2) becomes rows H to H + 11 of l2."""
+    h, c = tl.arange(0, H), tl.arange(0, 16)
+    if SUMS == "inside":
+        V1, Vx = forward(W1, H, H, H + 12, P), forward(W1 + H, H, 12, H + 12, P)
+        U1, Ux = backward(W1, H, H, H + 12, P), backward(W1 + H, H, 12, H + 12, P)
+        V2, U2 = forward(W2, H, H, H, P), backward(W2, H, H, H, P)
+        U3 = backward(W3, 6, H, H, P)
+    D1, D2 = tl.zeros((H, H), tl.float32), tl.zeros((H, H), tl.float32)
+    Dx, d2, D3 = tl.zeros((H, 16), tl.float32), tl.zeros((H, 16), tl.float32), tl.zeros((H, 16), tl.float32)
+    d3 = tl.zeros((BLOCK, 16), tl.float32)
+    for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
+        r = tile * BLOCK + tl.arange(0, BLOCK)
+        x, of_state = by_column(l2, r, h, M, H), network_input(w, s2, w, r, N, M, scale, False)
+        z1 = product(x, V1 if SUMS == "inside" else forward(W1, H, H, H + 12, P), P) + tl.load(b1 + h)[None, :]
+        z1 += product(of_state, Vx if SUMS == "inside" else forward(W1 + H, H, 12, H + 12, P), P)
+        a1, _ = silu(z1)
+        a2, k2 = silu(product(a1, V2 if SUMS == "inside" else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :])
+        g = seeds_of_b(gh, rest, unit, r, c, N, RESTED)
+        if EXTRA:
+            g += by_row(extra, r, c, N)
+        if BOUNDED:
+            y = by_column(post, r, c, M, 6)
+            g *= bound - y * y / bound
+        if SUMS == "inside":
+            d3 += g
+            D3 += outer(a2, g, P)
+        elif SUMS == "outside":
+            store_by_column(gout, g, r, c, M, 6)
+            store_by_column(h1, a1, r, h, M, H)
+            store_by_column(h2, a2, r, h, M, H)
+            store_by_column(l2 + H * M, of_state, r, c, M, 12)
+        e2 = product(g, U3 if SUMS == "inside" else backward(W3, 6, H, H, P), P) * k2
+        if SUMS == "inside":
+            D2 += outer(e2, a1, P)
+            d2 += outer(e2, ones_column(BLOCK), P)
+        elif SUMS == "outside":
+            store_by_column(g2, e2, r, h, M, H)
+        _, k1 = silu(z1)
+        e1 = product(e2, U2 if SUMS == "inside" else backward(W2, H, H, H, P), P) * k1
+        if SUMS == "inside":
+            D1 += outer(e1, x, P)
+            Dx += outer(e1, with_ones(of_state, 12), P)
+        elif SUMS == "outside":
+            store_by_column(g1, e1, r, h, M, H)
+        store_by_column(gl2, product(e1, U1 if SUMS == "inside" else backward(W1, H, H, H + 12, P), P), r, h, M, H)
+        store_input_adjoint(gw, gs2, scale * product(e1, Ux if SUMS == "inside" else backward(W1 + H, H, 12, H + 12, P), P), r, M)
+    if SUMS == "inside":
+        at = partial + tl.program_id(0) * size + start
+        store_square(at, D1, H + 12, H)
+        store_columns(at + H, Dx, H + 12, 1, 0, 12, H)
+        at += H * (H + 12)
+        store_columns(at, Dx, 1, 0, 12, 1, H)
+        at += H
+        store_square(at, D2, H, H)
+        at += H * H
+        store_columns(at, d2, 1, 0, 0, 1, H)
+        at += H
+        store_columns(at, D3, 1, H, 0, 6, H)
+        tl.store(at + 6 * H + c, tl.sum(d3, 0), mask=c < 6)
+
+
+@triton.jit(do_not_specialize=["N", "start"])
 def psi2_backward(
-    l1, t, s1, l2, gt, gl2, W1, b1, W2, b2, W3, b3, h1, h2, g1, g2, gout, gl1, gtn, gsn, N, M, scale, alpha,
-    WEIGHTS: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
+    l1, t, l2, gt, gl2, W1, b1, W2, b2, W3, b3, h1, h2, g1, g2, gout, partial, gl1, start, size, N, M, alpha,
+    SUMS: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
 ):  # fmt: skip
-    """gl1 (H, M) and, through the normals, gtn (12, M) and gsn (6, M), from gt (48, M), its last 12 rows, and gl2 (H, M); gout
-    (12 + H, M). The scaled normals become rows H to H + 2 of l1."""
-    r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    """gl1 (H + 3, M), its last rows those of the scaled normals, from gt (48, M), its last 12 rows, and gl2 (H, M). The last layer's
+    sums are always made outside, from h2 (H, M) and gout (12 + H, M)."""
     h, c = tl.arange(0, H), tl.arange(0, 16)
-    y = by_column(t + 36 * M, r, c, M, 12)
-    e = by_column(gt + 36 * M, r, c, M, 12) * (alpha - y * y / alpha)
-    yb = by_column(l2, r, h, M, H)
-    eb = by_column(gl2, r, h, M, H) * (alpha - yb * yb / alpha)
-    if WEIGHTS:
-        store_by_column(gout, e, r, c, M, 12)
-        store_by_column(gout + 12 * M, eb, r, h, M, H)
-    g = product(e, matrix(W3, c, h, H, 12, H), P)
-    g += product(eb, matrix(W3 + 12 * H, h, h, H, H, H), P)
-    _, nx, ny, nz, z1 = psi2_hidden(l1, t, s1, W1, b1, r, M, scale, H, P)
-    if WEIGHTS:
-        tl.store(l1 + H * M + r, nx)
-        tl.store(l1 + (H + 1) * M + r, ny)
-        tl.store(l1 + (H + 2) * M + r, nz)
-    e1 = hidden_adjoint(g, z1, W2, b2, h1, h2, g1, g2, r, M, WEIGHTS, H, P)
-    store_by_column(gl1, product(e1, matrix(W1, h, h, H + 3, H, H), P), r, h, M, H)
-    kx = scale * tl.sum(e1 * tl.load(W1 + h * (H + 3) + H)[None, :], 1)
-    ky = scale * tl.sum(e1 * tl.load(W1 + h * (H + 3) + H + 1)[None, :], 1)
-    kz = scale * tl.sum(e1 * tl.load(W1 + h * (H + 3) + H + 2)[None, :], 1)
-    xa, xb, xc = normal_adjoint(gtn, t, s1, kx, r, M, 0, 5, 4)
-    ya, yb_, yc = normal_adjoint(gtn, t, s1, ky, r, M, 1, 3, 5)
-    za, zb, zc = normal_adjoint(gtn, t, s1, kz, r, M, 2, 4, 3)
-    tl.store(gsn + r, xa)
-    tl.store(gsn + M + r, ya)
-    tl.store(gsn + 2 * M + r, za)
-    tl.store(gsn + 3 * M + r, yb_ + zc)
-    tl.store(gsn + 4 * M + r, zb + xc)
-    tl.store(gsn + 5 * M + r, xb + yc)
+    if SUMS == "inside":
+        V1, Vx = forward(W1, H, H, H + 3, P), forward(W1 + H, H, 3, H + 3, P)
+        U1, Ux = backward(W1, H, H, H + 3, P), backward(W1 + H, H, 3, H + 3, P)
+        V2, U2 = forward(W2, H, H, H, P), backward(W2, H, H, H, P)
+        U3, U4 = backward(W3, 12, H, H, P), backward(W3 + 12 * H, H, H, H, P)
+    D1, D2 = tl.zeros((H, H), tl.float32), tl.zeros((H, H), tl.float32)
+    Dx, d2 = tl.zeros((H, 16), tl.float32), tl.zeros((H, 16), tl.float32)
+    for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
+        r = tile * BLOCK + tl.arange(0, BLOCK)
+        x, normals = by_column(l1, r, h, M, H), by_column(l1 + H * M, r, c, M, 3)
+        z1 = product(x, V1 if SUMS == "inside" else forward(W1, H, H, H + 3, P), P) + tl.load(b1 + h)[None, :]
+        z1 += product(normals, Vx if SUMS == "inside" else forward(W1 + H, H, 3, H + 3, P), P)
+        a1, _ = silu(z1)
+        a2, k2 = silu(product(a1, V2 if SUMS == "inside" else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :])
+        y = by_column(t + 36 * M, r, c, M, 12)
+        e = by_column(gt + 36 * M, r, c, M, 12) * (alpha - y * y / alpha)
+        yb = by_column(l2, r, h, M, H)
+        eb = by_column(gl2, r, h, M, H) * (alpha - yb * yb / alpha)
+        if SUMS != "none":
+            store_by_column(h2, a2, r, h, M, H)
+            store_by_column(gout, e, r, c, M, 12)
+            store_by_column(gout + 12 * M, eb, r, h, M, H)
+        g = product(e, U3 if SUMS == "inside" else backward(W3, 12, H, H, P), P)
+        g += product(eb, U4 if SUMS == "inside" else backward(W3 + 12 * H, H, H, H, P), P)
+        e2 = g * k2
+        if SUMS == "inside":
+            D2 += outer(e2, a1, P)
+            d2 += outer(e2, ones_column(BLOCK), P)
+        elif SUMS == "outside":
+            store_by_column(h1, a1, r, h, M, H)
+            store_by_column(g2, e2, r, h, M, H)
+        _, k1 = silu(z1)
+        e1 = product(e2, U2 if SUMS == "inside" else backward(W2, H, H, H, P), P) * k1
+        if SUMS == "inside":
+            D1 += outer(e1, x, P)
+            Dx += outer(e1, with_ones(normals, 3), P)
+        elif SUMS == "outside":
+            store_by_column(g1, e1, r, h, M, H)
+        store_by_column(gl1, product(e1, U1 if SUMS == "inside" else backward(W1, H, H, H + 3, P), P), r, h, M, H)
+        store_by_column(gl1 + H * M, product(e1, Ux if SUMS == "inside" else backward(W1 + H, H, 3, H + 3, P), P), r, c, M, 3)
+    if SUMS == "inside":
+        at = partial + tl.program_id(0) * size + start
+        store_square(at, D1, H + 3, H)
+        store_columns(at + H, Dx, H + 3, 1, 0, 3, H)
+        at += H * (H + 3)
+        store_columns(at, Dx, 1, 0, 3, 1, H)
+        at += H
+        store_square(at, D2, H, H)
+        store_columns(at + H * H, d2, 1, 0, 0, 1, H)
 
 
-@triton.jit(do_not_specialize=["N"])
+@triton.jit(do_not_specialize=["N", "start"])
 def psi1_backward(
-    w, s1, t, gt, gtn, gl1, W1, b1, W2, b2, W3, b3, Wp, bp, h1, h2, g1, g2, x, gplanes, gout, gw, gs, N, M, scale, alpha,
-    WEIGHTS: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
+    w, s1, t, gt, gl1, l1, W1, b1, W2, b2, W3, b3, Wp, bp, h1, h2, g1, g2, x, gplanes, gout, partial, gw, gs, start, size, N,
+    M, scale, alpha, SUMS: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
 ):  # fmt: skip
-    """gw, gs (6, M) of w and s1 from gt (48, M), its first 36 rows, gtn (12, M) of `psi2_backward`, and gl1 (H, M); x (12, M),
-    gplanes (36, M), gout (H, M)."""
-    r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    """gw, gs (6, M) of w and s1 from gt (48, M), its first 36 rows, and gl1 (H, M); x (12, M), gplanes (36, M), gout (H, M)."""
     h, c, planes = tl.arange(0, H), tl.arange(0, 16), tl.arange(0, 64)
-    place = planes % 12
-    through_normals = (planes < 36) & ((place < 3) | (place == 6))
-    source = 4 * (planes // 12) + tl.where(place == 6, 3, place)
-    y = by_column(t, r, planes, M, 36)
-    e = by_column(gt, r, planes, M, 36)
-    e += tl.load(gtn + source[None, :] * M + r[:, None], mask=through_normals[None, :], other=0.0)
-    e *= alpha - y * y / alpha
-    g = by_column(gl1, r, h, M, H) + product(e, matrix(Wp, planes, h, H, 36, H), P)
-    inputs = network_input(w, s1, r, N, M, scale, False)
-    if WEIGHTS:
-        store_by_column(gplanes, e, r, planes, M, 36)
-        store_by_column(gout, g, r, h, M, H)
-        store_by_column(x, inputs, r, c, M, 12)
-    g = product(g, matrix(W3, h, h, H, H, H), P)
-    z1 = dense(inputs, matrix(W1, h, c, 12, H, 12), tl.load(b1 + h), P)
-    e1 = hidden_adjoint(g, z1, W2, b2, h1, h2, g1, g2, r, M, WEIGHTS, H, P)
-    store_input_adjoint(gw, gs, scale * product(e1, matrix(W1, h, c, 12, H, 12), P), r, M)
+    if SUMS == "inside":
+        V1, U1 = forward(W1, H, 12, 12, P), backward(W1, H, 12, 12, P)
+        V2, U2 = forward(W2, H, H, H, P), backward(W2, H, H, H, P)
+        U3, Up = backward(W3, H, H, H, P), backward(Wp, 36, H, H, P)
+    D2, D3, Dp = tl.zeros((H, H), tl.float32), tl.zeros((H, H), tl.float32), tl.zeros((64, H), tl.float32)
+    D1, d2, d3 = tl.zeros((H, 16), tl.float32), tl.zeros((H, 16), tl.float32), tl.zeros((H, 16), tl.float32)
+    dp = tl.zeros((64, 16), tl.float32)
+    for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
+        r = tile * BLOCK + tl.arange(0, BLOCK)
+        y = by_column(t, r, planes, M, 36)
+        e = by_column(gt, r, planes, M, 36) * (alpha - y * y / alpha)
+        g = by_column(gl1, r, h, M, H) + product(e, Up if SUMS == "inside" else backward(Wp, 36, H, H, P), P)
+        if SUMS == "inside":
+            Dp += outer(e, by_column(l1, r, h, M, H), P)
+            dp += outer(e, ones_column(BLOCK), P)
+        inputs = network_input(w, s1, w, r, N, M, scale, False)
+        z1 = product(inputs, V1 if SUMS == "inside" else forward(W1, H, 12, 12, P), P) + tl.load(b1 + h)[None, :]
+        a1, _ = silu(z1)
+        a2, k2 = silu(product(a1, V2 if SUMS == "inside" else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :])
+        if SUMS == "inside":
+            D3 += outer(g, a2, P)
+            d3 += outer(g, ones_column(BLOCK), P)
+        elif SUMS == "outside":
+            store_by_column(gplanes, e, r, planes, M, 36)
+            store_by_column(gout, g, r, h, M, H)
+            store_by_column(x, inputs, r, c, M, 12)
+            store_by_column(h1, a1, r, h, M, H)
+            store_by_column(h2, a2, r, h, M, H)
+        e2 = product(g, U3 if SUMS == "inside" else backward(W3, H, H, H, P), P) * k2
+        if SUMS == "inside":
+            D2 += outer(e2, a1, P)
+            d2 += outer(e2, ones_column(BLOCK), P)
+        elif SUMS == "outside":
+            store_by_column(g2, e2, r, h, M, H)
+        _, k1 = silu(z1)
+        e1 = product(e2, U2 if SUMS == "inside" else backward(W2, H, H, H, P), P) * k1
+        if SUMS == "inside":
+            D1 += outer(e1, with_ones(inputs, 12), P)
+        elif SUMS == "outside":
+            store_by_column(g1, e1, r, h, M, H)
+        store_input_adjoint(gw, gs, scale * product(e1, U1 if SUMS == "inside" else backward(W1, H, 12, 12, P), P), r, M)
+    if SUMS == "inside":
+        at = partial + tl.program_id(0) * size + start
+        store_columns(at, D1, 12, 1, 0, 12, H)
+        at += H * 12
+        store_columns(at, D1, 1, 0, 12, 1, H)
+        at += H
+        store_square(at, D2, H, H)
+        at += H * H
+        store_columns(at, d2, 1, 0, 0, 1, H)
+        at += H
+        store_square(at, D3, H, H)
+        at += H * H
+        store_columns(at, d3, 1, 0, 0, 1, H)
+        at += H
+        tl.store(at + planes[:, None] * H + h[None, :], Dp, mask=planes[:, None] < 36)
+        at += 36 * H
+        tl.store(at + planes[:, None] + 0 * c[None, :], dp, mask=(c[None, :] == 0) & (planes[:, None] < 36))
 
 
-@triton.jit(do_not_specialize=["N"])
+@triton.jit(do_not_specialize=["N", "start"])
 def phi_backward(
-    w, s, pre, gpre, extra, gs1, gsn, gsx, gwx, gwt, W1, b1, W2, b2, W3, b3, h1, h2, g1, g2, x, gout, gw, gs, N, M, scale, bound,
-    BOUNDED: tl.constexpr, EXTRA: tl.constexpr, WEIGHTS: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
+    w, s, unit, pre, gpre, extra, gs1, gsx, gwx, gwt, W1, b1, W2, b2, W3, b3, h1, h2, g1, g2, x, gout, partial, gw, gs, start, size,
+    N, M, scale, bound, BOUNDED: tl.constexpr, EXTRA: tl.constexpr, SUMS: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr,
+    P: tl.constexpr,
 ):  # fmt: skip
-    """gw, gs (N, 6), everything added up: gs1, gsn, gsx (6, M) reach s1 from the assembly, the normals and Psi1; gpre (6, M) and
-    extra (N, 6) reach pre, as s1 does; gwx, gwt (6, M) reach w from Psi1 and Theta. x (12, M), gout (6, M)."""
-    r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    """gw, gs (N, 6), everything added up: gs1, gsx (6, M) reach s1 from the assembly with the normals, and from Psi1; gpre (6, M)
+    and extra (N, 6) reach pre, as s1 does; gwx, gwt (6, M) reach w from Psi1 and Theta. x (12, M), gout (6, M)."""
     h, c = tl.arange(0, H), tl.arange(0, 16)
-    inputs = network_input(w, s, r, N, M, scale, True)
-    g = by_column(gs1, r, c, M, 6) + by_column(gsn, r, c, M, 6) + by_column(gsx, r, c, M, 6) + by_column(gpre, r, c, M, 6)
-    if EXTRA:
-        g += by_row(extra, r, c, N)
-    if BOUNDED:
-        y = by_column(pre, r, c, M, 6)
-        g *= bound - y * y / bound
-    if WEIGHTS:
-        store_by_column(gout, g, r, c, M, 6)
-        store_by_column(x, inputs, r, c, M, 12)
-    g = product(g, matrix(W3, c, h, H, 6, H), P)
-    z1 = dense(inputs, matrix(W1, h, c, 12, H, 12), tl.load(b1 + h), P)
-    e1 = hidden_adjoint(g, z1, W2, b2, h1, h2, g1, g2, r, M, WEIGHTS, H, P)
-    gx = scale * product(e1, matrix(W1, h, c, 12, H, 12), P)
-    row, column = r[:, None], c[None, :]
-    direct = by_column(gwx, r, c, M, 6) + by_column(gwt, r, c, M, 6)
-    tl.store(gw + row * 6 + column, gx + direct, mask=(row < N) & (column < 6))
-    of_s = (row < N) & (column >= 6) & (column < 12)
-    at = (column - 6) * M + row
-    direct = tl.load(gs1 + at, mask=of_s, other=0.0) + tl.load(gsn + at, mask=of_s, other=0.0)
-    direct += tl.load(gsx + at, mask=of_s, other=0.0)
-    tl.store(gs + row * 6 + column - 6, gx + direct, mask=of_s)
+    if SUMS == "inside":
+        V1, U1 = forward(W1, H, 12, 12, P), backward(W1, H, 12, 12, P)
+        V2, U2 = forward(W2, H, H, H, P), backward(W2, H, H, H, P)
+        U3 = backward(W3, 6, H, H, P)
+    D2 = tl.zeros((H, H), tl.float32)
+    D1, d2, D3 = tl.zeros((H, 16), tl.float32), tl.zeros((H, 16), tl.float32), tl.zeros((H, 16), tl.float32)
+    d3 = tl.zeros((BLOCK, 16), tl.float32)
+    column = c[None, :]
+    for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
+        r = tile * BLOCK + tl.arange(0, BLOCK)
+        row = r[:, None]
+        inputs = network_input(w, s, unit, r, N, M, scale, True)
+        g = by_column(gs1, r, c, M, 6) + by_column(gsx, r, c, M, 6) + by_column(gpre, r, c, M, 6)
+        if EXTRA:
+            g += by_row(extra, r, c, N)
+        if BOUNDED:
+            y = by_column(pre, r, c, M, 6)
+            g *= bound - y * y / bound
+        z1 = product(inputs, V1 if SUMS == "inside" else forward(W1, H, 12, 12, P), P) + tl.load(b1 + h)[None, :]
+        a1, _ = silu(z1)
+        a2, k2 = silu(product(a1, V2 if SUMS == "inside" else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :])
+        if SUMS == "inside":
+            d3 += g
+            D3 += outer(a2, g, P)
+        elif SUMS == "outside":
+            store_by_column(gout, g, r, c, M, 6)
+            store_by_column(x, inputs, r, c, M, 12)
+            store_by_column(h1, a1, r, h, M, H)
+            store_by_column(h2, a2, r, h, M, H)
+        e2 = product(g, U3 if SUMS == "inside" else backward(W3, 6, H, H, P), P) * k2
+        if SUMS == "inside":
+            D2 += outer(e2, a1, P)
+            d2 += outer(e2, ones_column(BLOCK), P)
+        elif SUMS == "outside":
+            store_by_column(g2, e2, r, h, M, H)
+        _, k1 = silu(z1)
+        e1 = product(e2, U2 if SUMS == "inside" else backward(W2, H, H, H, P), P) * k1
+        if SUMS == "inside":
+            D1 += outer(e1, with_ones(inputs, 12), P)
+        elif SUMS == "outside":
+            store_by_column(g1, e1, r, h, M, H)
+        gx = scale * product(e1, U1 if SUMS == "inside" else backward(W1, H, 12, 12, P), P)
+        direct = by_column(gwx, r, c, M, 6) + by_column(gwt, r, c, M, 6)
+        tl.store(gw + row * 6 + column, gx + direct, mask=(row < N) & (column < 6))
+        of_s = (row < N) & (column >= 6) & (column < 12)
+        at = (column - 6) * M + row
+        direct = tl.load(gs1 + at, mask=of_s, other=0.0) + tl.load(gsx + at, mask=of_s, other=0.0)
+        tl.store(gs + row * 6 + column - 6, (gx + direct) / tl.load(unit), mask=of_s)
+    if SUMS == "inside":
+        at = partial + tl.program_id(0) * size + start
+        store_columns(at, D1, 12, 1, 0, 12, H)
+        at += H * 12
+        store_columns(at, D1, 1, 0, 12, 1, H)
+        at += H
+        store_square(at, D2, H, H)
+        at += H * H
+        store_columns(at, d2, 1, 0, 0, 1, H)
+        at += H
+        store_columns(at, D3, 1, H, 0, 6, H)
+        tl.store(at + 6 * H + c, tl.sum(d3, 0), mask=c < 6)
 
 
 @triton.jit
@@ -210,7 +354,7 @@ def layer_gradient(
     for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
         r = tile * BLOCK + k
         e = tl.load(g + out[:, None] * M + r[None, :], mask=out[:, None] < OUT, other=0.0)
-        weight += product(e, by_column(x, r, into, M, IN), P)
+        weight += product(e, factor(by_column(x, r, into, M, IN), P), P)
         bias += tl.sum(e, 1)
     inside = (out[:, None] < OUT) & (into[None, :] < IN)
     tl.store(at + out[:, None] * IN + into[None, :], weight, mask=inside)
@@ -230,16 +374,16 @@ def weight_gradients(
     at2 = at + H * IN1 + H
     at3 = at2 + H * H + H
     if which == 0:
-        layer_gradient(g1, x1, at, M, H, IN1, 0, 0, TILE, BLOCK, P)
-    elif which == 1:
-        layer_gradient(g2, h1, at2, M, H, H, 0, 0, TILE, BLOCK, P)
-    elif which == 2:
         layer_gradient(g3, h2, at3, M, OUT3, H, 0, 0, TILE, BLOCK, P)
+    elif which == 1:
+        if OUT3 > TILE:
+            layer_gradient(g3, h2, at3, M, OUT3, H, TILE, 0, TILE, BLOCK, P)
+    elif which == 2:
+        layer_gradient(g2, h1, at2, M, H, H, 0, 0, TILE, BLOCK, P)
     elif which == 3:
+        layer_gradient(g1, x1, at, M, H, IN1, 0, 0, TILE, BLOCK, P)
+    elif which == 4:
         if IN1 > TILE:
             layer_gradient(g1, x1, at, M, H, IN1, 0, TILE, TILE, BLOCK, P)
         if OUT4 > 0:
             layer_gradient(g4, x4, at3 + OUT3 * H + OUT3, M, OUT4, H, 0, 0, TILE, BLOCK, P)
-    elif which == 4:
-        if OUT3 > TILE:
-            layer_gradient(g3, h2, at3, M, OUT3, H, TILE, 0, TILE, BLOCK, P)

@@ -1,9 +1,10 @@
-"""Triton kernels of the assembly (paper, eq. 5 to 7; `microplane`), one lane per particle, with hand-written adjoints.
+"""Triton kernels between the networks (paper, eq. 5 to 7; `microplane`), one lane per particle, with hand-written adjoints.
 
 Plane p has the components (p, c1, c2) of vech: (xx, xy, zx), (yy, yz, xy), (zz, zx, yz). Each shear is the second component of one
 plane and the third of the next, and their mean; so with planes in cyclic order all three are treated alike.
 t: (48, M) bounded numbers, 12 a matrix, C_x, C_y, C_z, C_xyz; s1, pre: (6, M). The 6x6 operator G = A - I and its action on s1 and
-on pre are made in one pass.
+on pre are made in one pass. `finish` turns b (6, M), row N the state at rest, into h = unit (b - b at rest); gh (N, 6): adjoint of
+h, rest (6,): its sum over the particles.
 """
 
 import triton
@@ -88,29 +89,28 @@ def store_moved(out, r, M, K, x, y, z):
 
 
 @triton.jit
-def entry(G, r, N, row: tl.constexpr, column: tl.constexpr, value):
-    tl.store(G + r * 36 + row * 6 + column, value, mask=r < N)
+def normal_columns(X, p: tl.constexpr, k0, k1, k2):
+    """Column p of the normal rows of G; X: correction of plane p, k: column p of C_xyz."""
+    x = 1.0 + X[0]
+    return k0 * x + (X[0] if p == 0 else 0.0), k1 * x + (X[0] if p == 1 else 0.0), k2 * x + (X[0] if p == 2 else 0.0)
 
 
 @triton.jit
-def store_operator(
-    G, r, N, p: tl.constexpr, q: tl.constexpr, third: tl.constexpr, sp: tl.constexpr, sq: tl.constexpr, s3: tl.constexpr,
-    C, D, k0, k1, k2, m0, m1, m2,
-):  # fmt: skip
-    """Columns p and sp of the normal rows and the row sp of G. Planes p and q = p + 1 have the corrections C and D; sp, sq, s3: the
-    shears that are the second components of p, q and the third plane; k, m: columns p and q of C_xyz."""
-    entry(G, r, N, 0, p, k0 * (1.0 + C[0]) + (C[0] if p == 0 else 0.0))
-    entry(G, r, N, 1, p, k1 * (1.0 + C[0]) + (C[0] if p == 1 else 0.0))
-    entry(G, r, N, 2, p, k2 * (1.0 + C[0]) + (C[0] if p == 2 else 0.0))
-    entry(G, r, N, 0, sp, k0 * C[1] + m0 * D[2] + (C[1] if p == 0 else 0.0) + (D[2] if q == 0 else 0.0))
-    entry(G, r, N, 1, sp, k1 * C[1] + m1 * D[2] + (C[1] if p == 1 else 0.0) + (D[2] if q == 1 else 0.0))
-    entry(G, r, N, 2, sp, k2 * C[1] + m2 * D[2] + (C[1] if p == 2 else 0.0) + (D[2] if q == 2 else 0.0))
-    entry(G, r, N, sp, p, 0.5 * C[3])
-    entry(G, r, N, sp, sp, 0.5 * (C[4] + D[8]))
-    entry(G, r, N, sp, s3, 0.5 * C[5])
-    entry(G, r, N, sp, q, 0.5 * D[6])
-    entry(G, r, N, sp, sq, 0.5 * D[7])
-    entry(G, r, N, sp, third, 0.0 * C[0])  # no plane holds both
+def shear_columns(C, D, p: tl.constexpr, k0, k1, k2, m0, m1, m2):
+    """The column of the normal rows of G at the shear that is the second component of plane p (correction C, column k of C_xyz) and
+    the third of plane p + 1 (D, m)."""
+    c, d = C[1], D[2]
+    own0 = c if p == 0 else (d if p == 2 else 0.0)
+    own1 = c if p == 1 else (d if p == 0 else 0.0)
+    own2 = c if p == 2 else (d if p == 1 else 0.0)
+    return k0 * c + m0 * d + own0, k1 * c + m1 * d + own1, k2 * c + m2 * d + own2
+
+
+@triton.jit
+def store_four(G, r, N, first: tl.constexpr, a, b, c, d, BLOCK: tl.constexpr):
+    """Entries first to first + 3 of G (N, 36), in one access: one by one, each would be a transaction of its own."""
+    value = tl.reshape(tl.join(tl.join(a, c), tl.join(b, d)), (BLOCK, 4))
+    tl.store(G + r[:, None] * 36 + first + tl.arange(0, 4)[None, :], value, mask=r[:, None] < N)
 
 
 @triton.jit(do_not_specialize=["N"])
@@ -123,33 +123,126 @@ def assemble(t, s1, pre, G, s2, moved, N, M, OPERATOR: tl.constexpr, BLOCK: tl.c
         store_moved(
             moved, r, M, K, on_plane(pre, r, M, 0, 5, 4, X), on_plane(pre, r, M, 1, 3, 5, Y), on_plane(pre, r, M, 2, 4, 3, Z)
         )
-        store_operator(G, r, N, 0, 1, 2, 5, 3, 4, X, Y, K[0], K[3], K[6], K[1], K[4], K[7])
-        store_operator(G, r, N, 1, 2, 0, 3, 4, 5, Y, Z, K[1], K[4], K[7], K[2], K[5], K[8])
-        store_operator(G, r, N, 2, 0, 1, 4, 5, 3, Z, X, K[2], K[5], K[8], K[0], K[3], K[6])
+        a00, a10, a20 = normal_columns(X, 0, K[0], K[3], K[6])
+        a01, a11, a21 = normal_columns(Y, 1, K[1], K[4], K[7])
+        a02, a12, a22 = normal_columns(Z, 2, K[2], K[5], K[8])
+        a05, a15, a25 = shear_columns(X, Y, 0, K[0], K[3], K[6], K[1], K[4], K[7])
+        a03, a13, a23 = shear_columns(Y, Z, 1, K[1], K[4], K[7], K[2], K[5], K[8])
+        a04, a14, a24 = shear_columns(Z, X, 2, K[2], K[5], K[8], K[0], K[3], K[6])
+        none = tl.zeros_like(a00)  # no plane holds both
+        store_four(G, r, N, 0, a00, a01, a02, a03, BLOCK)
+        store_four(G, r, N, 4, a04, a05, a10, a11, BLOCK)
+        store_four(G, r, N, 8, a12, a13, a14, a15, BLOCK)
+        store_four(G, r, N, 12, a20, a21, a22, a23, BLOCK)
+        store_four(G, r, N, 16, a24, a25, none, 0.5 * Y[3], BLOCK)
+        store_four(G, r, N, 20, 0.5 * Z[6], 0.5 * (Y[4] + Z[8]), 0.5 * Z[7], 0.5 * Y[5], BLOCK)
+        store_four(G, r, N, 24, 0.5 * X[6], none, 0.5 * Z[3], 0.5 * Z[5], BLOCK)
+        store_four(G, r, N, 28, 0.5 * (Z[4] + X[8]), 0.5 * X[7], 0.5 * X[3], 0.5 * Y[6], BLOCK)
+        store_four(G, r, N, 32, none, 0.5 * Y[7], 0.5 * X[5], 0.5 * (X[4] + Y[8]), BLOCK)
 
 
 @triton.jit
-def moved_adjoint(v, seed, r, N, M, p: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr, C, k0, k1, k2, ROWS: tl.constexpr):
-    """Of out = (I + G) v, seen from plane p. seed: adjoint of out, (N + 1, 6) where ROWS, else (6, M); k: column p of C_xyz.
+def normal(t, s1, r, M, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr):
+    """(v0, v1, v2, u00, u01, u02, l00) of n = (1 + l00) ((1 + u00) v0 + u01 v1 + u02 v2), the normal traction on a plane after its
+    correction: row 0 of (I + L)(I + U) on its components v of s1."""
+    first = t + 12 * plane * M + r
+    v0, v1, v2 = components(s1, r, M, plane, c1, c2)
+    return v0, v1, v2, tl.load(first), tl.load(first + M), tl.load(first + 2 * M), tl.load(first + 6 * M)
 
-    Returns the normal traction n, the seeds of the three normals, those of the plane's tractions, its components of v, and the
-    adjoints of these components.
+
+@triton.jit
+def store_normal(t, s1, out, r, M, scale, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr):
+    v0, v1, v2, u00, u01, u02, l00 = normal(t, s1, r, M, plane, c1, c2)
+    tl.store(out + plane * M + r, scale * (1.0 + l00) * (v0 + u00 * v0 + u01 * v1 + u02 * v2))
+
+
+@triton.jit
+def normals(t, s1, out, M, scale, BLOCK: tl.constexpr):
+    """The last three inputs of Psi2 (3, M): scaled normal tractions on the corrected planes."""
+    r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    store_normal(t, s1, out, r, M, scale, 0, 5, 4)
+    store_normal(t, s1, out, r, M, scale, 1, 3, 5)
+    store_normal(t, s1, out, r, M, scale, 2, 4, 3)
+
+
+@triton.jit
+def add(p, value):
+    tl.store(p, tl.load(p) + value)
+
+
+@triton.jit
+def normal_adjoint(t, s1, gn, gt, r, M, scale, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr):
+    """Adds to gt; returns the adjoints of the three components of s1."""
+    v0, v1, v2, u00, u01, u02, l00 = normal(t, s1, r, M, plane, c1, c2)
+    g = scale * tl.load(gn + plane * M + r)
+    k = g * (1.0 + l00)
+    first = gt + 12 * plane * M + r
+    add(first, k * v0)
+    add(first + M, k * v1)
+    add(first + 2 * M, k * v2)
+    add(first + 6 * M, g * (v0 + u00 * v0 + u01 * v1 + u02 * v2))
+    return k * (1.0 + u00), k * u01, k * u02
+
+
+@triton.jit
+def normals_adjoint(t, s1, gn, gt, gs1, M, scale, BLOCK: tl.constexpr):
+    """Adds the adjoints from those of the scaled normals, gn (3, M), to gt (48, M) and gs1 (6, M)."""
+    r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    xa, xb, xc = normal_adjoint(t, s1, gn, gt, r, M, scale, 0, 5, 4)
+    ya, yb, yc = normal_adjoint(t, s1, gn, gt, r, M, scale, 1, 3, 5)
+    za, zb, zc = normal_adjoint(t, s1, gn, gt, r, M, scale, 2, 4, 3)
+    add(gs1 + r, xa)
+    add(gs1 + M + r, ya)
+    add(gs1 + 2 * M + r, za)
+    add(gs1 + 3 * M + r, yb + zc)
+    add(gs1 + 4 * M + r, zb + xc)
+    add(gs1 + 5 * M + r, xb + yc)
+
+
+@triton.jit(do_not_specialize=["N"])
+def finish(b, w, s, unit, h, N, M, RESTED: tl.constexpr, BLOCK: tl.constexpr):
+    """h (N, 6) = unit (b - b at rest), exactly 0 at w = s = 0: a product may round one of its rows differently from another."""
+    r = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK))[:, None]
+    c = tl.arange(0, 8)[None, :]
+    inside = (r < N) & (c < 6)
+    y = tl.load(b + c * M + r, mask=inside, other=0.0)
+    if RESTED:
+        state = tl.abs(tl.load(w + r * 6 + c, mask=inside, other=0.0)) + tl.abs(tl.load(s + r * 6 + c, mask=inside, other=0.0))
+        y -= tl.load(b + c * M + N, mask=c < 6, other=0.0)
+        y = tl.where(tl.max(state, 1)[:, None] == 0.0, 0.0, y)
+    tl.store(h + r * 6 + c, tl.load(unit) * y, mask=inside)
+
+
+@triton.jit
+def seed_of_b(gh, rest, unit, r, N, i: tl.constexpr, RESTED: tl.constexpr):
+    """Adjoint of component i of b (BLOCK,)."""
+    g = tl.load(gh + r * 6 + i, mask=r < N, other=0.0)
+    if RESTED:
+        g = tl.where(r == N, -tl.load(rest + i), g)
+    return tl.load(unit) * g
+
+
+@triton.jit
+def moved_adjoint(v, r, M, p: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr, C, k0, k1, k2, g):
+    """Of out = (I + G) v, seen from plane p. g: adjoint of out; k: column p of C_xyz.
+
+    Returns the normal traction n, the seeds of the plane's tractions, its components of v, and the adjoints of these components.
     """
-    row = 1 if ROWS else M
-    at = seed + (r * 6 if ROWS else r)
-    known = (r <= N) if ROWS else (r >= 0)
-    g0 = tl.load(at, mask=known, other=0.0)
-    g1 = tl.load(at + row, mask=known, other=0.0)
-    g2 = tl.load(at + 2 * row, mask=known, other=0.0)
-    own = g0 if p == 0 else (g1 if p == 1 else g2)
-    y0 = own + k0 * g0 + k1 * g1 + k2 * g2
-    y1 = 0.5 * tl.load(at + c1 * row, mask=known, other=0.0)
-    y2 = 0.5 * tl.load(at + c2 * row, mask=known, other=0.0)
+    y0 = g[p] + k0 * g[0] + k1 * g[1] + k2 * g[2]
+    y1, y2 = 0.5 * g[c1], 0.5 * g[c2]
     a, b, c = components(v, r, M, p, c1, c2)
     n = a + C[0] * a + C[1] * b + C[2] * c
     return (
-        n, g0, g1, g2, y0, y1, y2, a, b, c,
+        n, y0, y1, y2, a, b, c,
         y0 + C[0] * y0 + C[3] * y1 + C[6] * y2, y1 + C[1] * y0 + C[4] * y1 + C[7] * y2, y2 + C[2] * y0 + C[5] * y1 + C[8] * y2,
+    )  # fmt: skip
+
+
+@triton.jit
+def six(p, r, M):
+    return (
+        tl.load(p + r), tl.load(p + M + r), tl.load(p + 2 * M + r),
+        tl.load(p + 3 * M + r), tl.load(p + 4 * M + r), tl.load(p + 5 * M + r),
     )  # fmt: skip
 
 
@@ -160,20 +253,19 @@ def seed_of(gG, r, N, row: tl.constexpr, column: tl.constexpr):
 
 @triton.jit
 def plane_adjoint(
-    t, s1, pre, gG, gb, gs2, gt, extra, r, N, M, p: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr, k0, k1, k2,
-    EXTRA: tl.constexpr,
-):  # fmt: skip
+    t, s1, pre, gG, S, B, gt, extra, r, N, M, p: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr, k0, k1, k2, EXTRA: tl.constexpr
+):
     """Stores the adjoints of the plane's numbers; returns those of column p of C_xyz (3), of the plane's components of s1 (3) and
-    of pre (3)."""
+    of pre (3). S, B: adjoints of s2 and moved (6)."""
     C = correction(t, r, M, 12 * p)
-    n, g0, g1, g2, y0, y1, y2, a, b, c, v0, v1, v2 = moved_adjoint(s1, gs2, r, N, M, p, c1, c2, C, k0, k1, k2, False)
-    j, f0, f1, f2, x0, x1, x2, d, e, f, p0, p1, p2 = moved_adjoint(pre, gb, r, N, M, p, c1, c2, C, k0, k1, k2, True)
+    n, y0, y1, y2, a, b, c, v0, v1, v2 = moved_adjoint(s1, r, M, p, c1, c2, C, k0, k1, k2, S)
+    j, x0, x1, x2, d, e, f, p0, p1, p2 = moved_adjoint(pre, r, M, p, c1, c2, C, k0, k1, k2, B)
     q00, q01, q02 = seed_of(gG, r, N, 0, p), seed_of(gG, r, N, 0, c1), seed_of(gG, r, N, 0, c2)
     q10, q11, q12 = seed_of(gG, r, N, 1, p), seed_of(gG, r, N, 1, c1), seed_of(gG, r, N, 1, c2)
     q20, q21, q22 = seed_of(gG, r, N, 2, p), seed_of(gG, r, N, 2, c1), seed_of(gG, r, N, 2, c2)
-    h0 = g0 * n + f0 * j + q00 + q00 * C[0] + q01 * C[1] + q02 * C[2]
-    h1 = g1 * n + f1 * j + q10 + q10 * C[0] + q11 * C[1] + q12 * C[2]
-    h2 = g2 * n + f2 * j + q20 + q20 * C[0] + q21 * C[1] + q22 * C[2]
+    h0 = S[0] * n + B[0] * j + q00 + q00 * C[0] + q01 * C[1] + q02 * C[2]
+    h1 = S[1] * n + B[1] * j + q10 + q10 * C[0] + q11 * C[1] + q12 * C[2]
+    h2 = S[2] * n + B[2] * j + q20 + q20 * C[0] + q21 * C[1] + q22 * C[2]
     o0 = q00 if p == 0 else (q10 if p == 1 else q20)
     o1 = q01 if p == 0 else (q11 if p == 1 else q21)
     o2 = q02 if p == 0 else (q12 if p == 1 else q22)
@@ -204,20 +296,21 @@ def store_six(out, r, M, a, b, c, d, e, f):
 
 @triton.jit(do_not_specialize=["N"])
 def assemble_adjoint(
-    t, s1, pre, gG, gb, gs2, extra, gt, gs1, gpre, N, M, EXTRA: tl.constexpr, BLOCK: tl.constexpr
+    t, s1, pre, gG, gh, rest, unit, gs2, extra, gt, gs1, gpre, N, M,
+    RESTED: tl.constexpr, EXTRA: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """From the adjoints gG (N, 6, 6) of G, gb (M, 6) of moved and gs2 (6, M) of s2: gt (48, M), gs1 and gpre (6, M)."""
+    """From the adjoints gG (N, 6, 6) of G, gh (N, 6) of h and gs2 (6, M) of s2: gt (48, M), gs1 and gpre (6, M)."""
     r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     K = correction(t, r, M, 36)
-    x0, x1, x2, xa, xb, xc, xd, xe, xf = plane_adjoint(
-        t, s1, pre, gG, gb, gs2, gt, extra, r, N, M, 0, 5, 4, K[0], K[3], K[6], EXTRA
-    )
-    y0, y1, y2, ya, yb, yc, yd, ye, yf = plane_adjoint(
-        t, s1, pre, gG, gb, gs2, gt, extra, r, N, M, 1, 3, 5, K[1], K[4], K[7], EXTRA
-    )
-    z0, z1, z2, za, zb, zc, zd, ze, zf = plane_adjoint(
-        t, s1, pre, gG, gb, gs2, gt, extra, r, N, M, 2, 4, 3, K[2], K[5], K[8], EXTRA
-    )
+    S = six(gs2, r, M)
+    B = (
+        seed_of_b(gh, rest, unit, r, N, 0, RESTED), seed_of_b(gh, rest, unit, r, N, 1, RESTED),
+        seed_of_b(gh, rest, unit, r, N, 2, RESTED), seed_of_b(gh, rest, unit, r, N, 3, RESTED),
+        seed_of_b(gh, rest, unit, r, N, 4, RESTED), seed_of_b(gh, rest, unit, r, N, 5, RESTED),
+    )  # fmt: skip
+    x0, x1, x2, xa, xb, xc, xd, xe, xf = plane_adjoint(t, s1, pre, gG, S, B, gt, extra, r, N, M, 0, 5, 4, K[0], K[3], K[6], EXTRA)
+    y0, y1, y2, ya, yb, yc, yd, ye, yf = plane_adjoint(t, s1, pre, gG, S, B, gt, extra, r, N, M, 1, 3, 5, K[1], K[4], K[7], EXTRA)
+    z0, z1, z2, za, zb, zc, zd, ze, zf = plane_adjoint(t, s1, pre, gG, S, B, gt, extra, r, N, M, 2, 4, 3, K[2], K[5], K[8], EXTRA)
     correction_adjoint(t, gt, extra, r, N, M, 36, EXTRA, x0, y0, z0, x1, y1, z1, x2, y2, z2)
     store_six(gs1, r, M, xa, ya, za, yb + zc, zb + xc, xb + yc)
     store_six(gpre, r, M, xd, yd, zd, ye + zf, ze + xf, xe + yf)

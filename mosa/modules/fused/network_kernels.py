@@ -1,29 +1,64 @@
 """Triton kernels of the four networks of `ProgressiveOperator`, forward (paper, eq. 4, 7 and 8).
 
-A program takes BLOCK rows through one network; nothing hidden leaves it. There are M = N + 1 rows: row N is the state at rest,
-which the loads of w and s fill with zeros. w and s are (N, 6) as the simulator hands them over; everything that one kernel leaves
-for another is stored by column, (columns, M), so that the kernels with one lane per particle read it in order.
+A program takes tiles of BLOCK rows through one network; nothing hidden leaves it. There are M > N rows: row N is the state at
+rest, which the loads of w and s fill with zeros, and so are those after it. w and s are (N, 6) as the simulator hands them over, s
+in multiples of `unit` (1,); everything that one kernel leaves for another is stored by column, (columns, M), so that the kernels
+with one lane per particle read it in order.
 
-H: hidden width, a power of two; P: precision of products (tf32x3 | tf32). Weights are those of torch's linear layers: (out, in).
+H: hidden width, a power of two; P: precision of products (tf32x3 | tf32); KEEP: weights stay in shared memory from tile to tile,
+where they fit. Weights are those of torch's linear layers: (out, in); V. is a weight as the second factor of the forward product.
 """
+
+import os
 
 import triton
 import triton.language as tl
+from triton.language.extra import libdevice
+
+if os.environ.get("TRITON_INTERPRET") == "1":  # the interpreter calls no device functions
+
+    @triton.jit
+    def cut(x):
+        """What the tensor cores do to factors in tf32."""
+        return (x.to(tl.int32, bitcast=True) & -0x2000).to(tl.float32, bitcast=True)
+
+    @triton.jit
+    def exp(z):
+        return tl.exp(tl.minimum(z, 88.0))
+
+    @triton.jit
+    def quotient(y, z):
+        return y / z
+
+else:
+
+    @triton.jit
+    def cut(x):
+        return x
+
+    @triton.jit
+    def exp(z):
+        """To two units in the last place, subnormal results cut to 0: a third of the instructions of tl.exp."""
+        return libdevice.fast_expf(z)
+
+    @triton.jit
+    def quotient(y, z):
+        """To two units in the last place; 0 for z from 2^126 to infinity."""
+        return libdevice.fast_dividef(y, z)
 
 
 @triton.jit
 def tanh(z):
     """Exactly 0 at 0, whatever the rounding of the division."""
-    e = tl.exp(-2.0 * tl.abs(z))
-    t = (1.0 - e) / (1.0 + e)
+    e = exp(-2.0 * tl.abs(z))
+    t = quotient(1.0 - e, 1.0 + e)
     return tl.where(z < 0.0, -t, t)
 
 
 @triton.jit
 def silu(z):
     """(silu(z), its derivative)."""
-    e = tl.exp(-tl.abs(z))
-    g = tl.where(z < 0.0, e, 1.0) / (1.0 + e)
+    g = quotient(1.0, 1.0 + exp(-z))  # far below 0 the exponential is infinite, and g is 0
     return z * g, g * (1.0 + z * (1.0 - g))
 
 
@@ -51,155 +86,131 @@ def store_by_column(p, value, r, c, M, count):
 
 
 @triton.jit
-def to_tf32(x):
-    """x to 10 bits after the point, to the nearest. The tensor cores cut instead, always towards zero: over 20 products in a row
-    that bias adds up to ten times the error of rounding."""
-    return ((x.to(tl.int32, bitcast=True) + 0x1000) & -0x2000).to(tl.float32, bitcast=True)
+def factor(x, P: tl.constexpr):
+    """x as a factor of `product`: where P is tf32, to 10 bits after the point, to the nearest. The tensor cores alone would cut,
+    always towards zero: over 20 products in a row that bias adds up to ten times the error of rounding."""
+    if P == "tf32":
+        x = cut((x.to(tl.int32, bitcast=True) + 0x1000).to(tl.float32, bitcast=True))
+    return x
 
 
 @triton.jit
 def product(x, y, P: tl.constexpr):
-    """x y, both factors rounded first where P is tf32."""
-    if P == "tf32":
-        x, y = to_tf32(x), to_tf32(y)
-    return tl.dot(x, y, input_precision=P)
+    """x y; y has been through `factor`."""
+    return tl.dot(factor(x, P), y, input_precision=P)
 
 
 @triton.jit
-def dense(x, W, b, P: tl.constexpr):
-    return product(x, tl.trans(W), P) + b[None, :]
-
-
-@triton.jit
-def network_input(w, s, r, N, M, scale, ROWS: tl.constexpr):
-    """(BLOCK, 16): scale (w, s) and four zeros. ROWS: s is (N, 6), else stored by column."""
+def network_input(w, s, unit, r, N, M, scale, ROWS: tl.constexpr):
+    """(BLOCK, 16): scale (w, s) and four zeros. ROWS: s is (N, 6) in multiples of unit, else stored by column."""
     c = tl.arange(0, 16)[None, :]
     row = r[:, None]
     first = tl.load(w + row * 6 + c, mask=(row < N) & (c < 6), other=0.0)
     of_s = (c >= 6) & (c < 12)
     if ROWS:
-        second = tl.load(s + row * 6 + c - 6, mask=(row < N) & of_s, other=0.0)
+        second = tl.load(s + row * 6 + c - 6, mask=(row < N) & of_s, other=0.0) / tl.load(unit)
     else:
         second = tl.load(s + (c - 6) * M + row, mask=of_s, other=0.0)
     return scale * (first + second)
 
 
 @triton.jit
-def normal(t, s1, r, M, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr):
-    """(BLOCK,) parts (v0, v1, v2, u00, u01, u02, l00) of n = (1 + l00) ((1 + u00) v0 + u01 v1 + u02 v2), the normal traction
-    on a plane after its correction: row 0 of (I + L)(I + U) on its components v of s1."""
-    first = t + 12 * plane * M + r
-    return (
-        tl.load(s1 + plane * M + r),
-        tl.load(s1 + c1 * M + r),
-        tl.load(s1 + c2 * M + r),
-        tl.load(first),
-        tl.load(first + M),
-        tl.load(first + 2 * M),
-        tl.load(first + 6 * M),
-    )
+def tile_of(W, OUT: tl.constexpr, IN: tl.constexpr, STRIDE: tl.constexpr):
+    """A weight (OUT, IN), or a part of one with rows of STRIDE numbers, padded with zeros to 16, 64 or more."""
+    rows: tl.constexpr = 16 if OUT <= 16 else (64 if OUT == 36 else OUT)
+    columns: tl.constexpr = 16 if IN <= 16 else IN
+    return matrix(W, tl.arange(0, rows), tl.arange(0, columns), STRIDE, OUT, IN)
 
 
 @triton.jit
-def normal_traction(t, s1, r, M, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr):
-    v0, v1, v2, u00, u01, u02, l00 = normal(t, s1, r, M, plane, c1, c2)
-    return (1.0 + l00) * (v0 + u00 * v0 + u01 * v1 + u02 * v2)
+def forward(W, OUT: tl.constexpr, IN: tl.constexpr, STRIDE: tl.constexpr, P: tl.constexpr):
+    return factor(tl.trans(tile_of(W, OUT, IN, STRIDE)), P)
 
 
 @triton.jit(do_not_specialize=["N"])
 def phi_forward(
-    w, s, W1, b1, W2, b2, W3, b3, pre, s1, N, M, scale, bound,
-    BOUNDED: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
+    w, s, unit, W1, b1, W2, b2, W3, b3, pre, s1, N, M, scale, bound,
+    BOUNDED: tl.constexpr, KEEP: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
 ):  # fmt: skip
-    """Step 1: pre (6, M) and s1 = s + pre (6, M)."""
-    r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    """Step 1: pre (6, M) and s1 = s / unit + pre (6, M)."""
     h, c = tl.arange(0, H), tl.arange(0, 16)
-    x = network_input(w, s, r, N, M, scale, True)
-    a, _ = silu(dense(x, matrix(W1, h, c, 12, H, 12), tl.load(b1 + h), P))
-    a, _ = silu(dense(a, matrix(W2, h, h, H, H, H), tl.load(b2 + h), P))
-    y = dense(a, matrix(W3, c, h, H, 6, H), vector(b3, c, 6), P)
-    if BOUNDED:
-        y = bound * tanh(y)
-    store_by_column(pre, y, r, c, M, 6)
-    own = tl.load(s + r[:, None] * 6 + c[None, :], mask=(r[:, None] < N) & (c[None, :] < 6), other=0.0)
-    store_by_column(s1, own + y, r, c, M, 6)
+    if KEEP:
+        V1, V2 = forward(W1, H, 12, 12, P), forward(W2, H, H, H, P)
+        V3 = forward(W3, 6, H, H, P)
+    for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
+        r = tile * BLOCK + tl.arange(0, BLOCK)
+        x = network_input(w, s, unit, r, N, M, scale, True)
+        z, _ = silu(product(x, V1 if KEEP else forward(W1, H, 12, 12, P), P) + tl.load(b1 + h)[None, :])
+        z, _ = silu(product(z, V2 if KEEP else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :])
+        y = product(z, V3 if KEEP else forward(W3, 6, H, H, P), P) + vector(b3, c, 6)[None, :]
+        if BOUNDED:
+            y = bound * tanh(y)
+        store_by_column(pre, y, r, c, M, 6)
+        own = tl.load(s + r[:, None] * 6 + c[None, :], mask=(r[:, None] < N) & (c[None, :] < 6), other=0.0)
+        store_by_column(s1, own / tl.load(unit) + y, r, c, M, 6)
 
 
 @triton.jit(do_not_specialize=["N"])
 def psi1_forward(
     w, s1, W1, b1, W2, b2, W3, b3, Wp, bp, l1, t, N, M, scale, alpha,
-    H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
+    KEEP: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
 ):  # fmt: skip
     """Step 2: l1 (H, M) and the 36 numbers of the planes, rows 0 to 35 of t (48, M)."""
-    r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    h, c, planes = tl.arange(0, H), tl.arange(0, 16), tl.arange(0, 64)
-    x = network_input(w, s1, r, N, M, scale, False)
-    a, _ = silu(dense(x, matrix(W1, h, c, 12, H, 12), tl.load(b1 + h), P))
-    a, _ = silu(dense(a, matrix(W2, h, h, H, H, H), tl.load(b2 + h), P))
-    y = dense(a, matrix(W3, h, h, H, H, H), tl.load(b3 + h), P)
-    store_by_column(l1, y, r, h, M, H)
-    numbers = alpha * tanh(dense(y, matrix(Wp, planes, h, H, 36, H), vector(bp, planes, 36), P))
-    store_by_column(t, numbers, r, planes, M, 36)
-
-
-@triton.jit
-def psi2_hidden(l1, t, s1, W1, b1, r, M, scale, H: tl.constexpr, P: tl.constexpr):
-    """(l1 (BLOCK, H), scaled normals (BLOCK,) three times, first pre-activations (BLOCK, H))."""
-    h = tl.arange(0, H)
-    x = by_column(l1, r, h, M, H)
-    nx = scale * normal_traction(t, s1, r, M, 0, 5, 4)
-    ny = scale * normal_traction(t, s1, r, M, 1, 3, 5)
-    nz = scale * normal_traction(t, s1, r, M, 2, 4, 3)
-    z = dense(x, matrix(W1, h, h, H + 3, H, H), tl.load(b1 + h), P)
-    # the three last columns by hand: a product of 3 would be padded to 16
-    z += nx[:, None] * tl.load(W1 + h * (H + 3) + H)[None, :]
-    z += ny[:, None] * tl.load(W1 + h * (H + 3) + H + 1)[None, :]
-    z += nz[:, None] * tl.load(W1 + h * (H + 3) + H + 2)[None, :]
-    return x, nx, ny, nz, z
+    h, planes = tl.arange(0, H), tl.arange(0, 64)
+    if KEEP:
+        V1, V2 = forward(W1, H, 12, 12, P), forward(W2, H, H, H, P)
+        V3, Vp = forward(W3, H, H, H, P), forward(Wp, 36, H, H, P)
+    for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
+        r = tile * BLOCK + tl.arange(0, BLOCK)
+        x = network_input(w, s1, w, r, N, M, scale, False)
+        z, _ = silu(product(x, V1 if KEEP else forward(W1, H, 12, 12, P), P) + tl.load(b1 + h)[None, :])
+        z, _ = silu(product(z, V2 if KEEP else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :])
+        y = product(z, V3 if KEEP else forward(W3, H, H, H, P), P) + tl.load(b3 + h)[None, :]
+        store_by_column(l1, y, r, h, M, H)
+        numbers = alpha * tanh(product(y, Vp if KEEP else forward(Wp, 36, H, H, P), P) + vector(bp, planes, 36)[None, :])
+        store_by_column(t, numbers, r, planes, M, 36)
 
 
 @triton.jit(do_not_specialize=["N"])
 def psi2_forward(
-    l1, t, s1, W1, b1, W2, b2, W3, b3, l2, N, M, scale, alpha,
-    H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
-):  # fmt: skip
-    """Step 4: the 12 numbers of C_xyz, rows 36 to 47 of t, and l2 (H, M)."""
-    r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    l1, W1, b1, W2, b2, W3, b3, t, l2, N, M, alpha, KEEP: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr
+):
+    """Step 4: the 12 numbers of C_xyz, rows 36 to 47 of t, and l2 (H, M), from l1 (H + 3, M), its last rows the normals."""
     h, c = tl.arange(0, H), tl.arange(0, 16)
-    _, _, _, _, z = psi2_hidden(l1, t, s1, W1, b1, r, M, scale, H, P)
-    a, _ = silu(z)
-    a, _ = silu(dense(a, matrix(W2, h, h, H, H, H), tl.load(b2 + h), P))
-    numbers = alpha * tanh(dense(a, matrix(W3, c, h, H, 12, H), vector(b3, c, 12), P))
-    store_by_column(t + 36 * M, numbers, r, c, M, 12)
-    y = alpha * tanh(dense(a, matrix(W3 + 12 * H, h, h, H, H, H), tl.load(b3 + 12 + h), P))
-    store_by_column(l2, y, r, h, M, H)
-
-
-@triton.jit
-def theta_hidden(l2, w, s2, W1, b1, r, N, M, scale, H: tl.constexpr, P: tl.constexpr):
-    """(l2 (BLOCK, H), scaled (w, s2) (BLOCK, 16), first pre-activations (BLOCK, H))."""
-    h, c = tl.arange(0, H), tl.arange(0, 16)
-    x = by_column(l2, r, h, M, H)
-    rest = network_input(w, s2, r, N, M, scale, False)
-    z = dense(x, matrix(W1, h, h, H + 12, H, H), tl.load(b1 + h), P)
-    z += product(rest, tl.trans(matrix(W1 + H, h, c, H + 12, H, 12)), P)
-    return x, rest, z
+    if KEEP:
+        V1, Vx = forward(W1, H, H, H + 3, P), forward(W1 + H, H, 3, H + 3, P)
+        V2, V3 = forward(W2, H, H, H, P), forward(W3, 12, H, H, P)
+        V4 = forward(W3 + 12 * H, H, H, H, P)
+    for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
+        r = tile * BLOCK + tl.arange(0, BLOCK)
+        z = product(by_column(l1, r, h, M, H), V1 if KEEP else forward(W1, H, H, H + 3, P), P) + tl.load(b1 + h)[None, :]
+        x = by_column(l1 + H * M, r, c, M, 3)
+        z, _ = silu(z + product(x, Vx if KEEP else forward(W1 + H, H, 3, H + 3, P), P))
+        z, _ = silu(product(z, V2 if KEEP else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :])
+        y = product(z, V3 if KEEP else forward(W3, 12, H, H, P), P) + vector(b3, c, 12)[None, :]
+        store_by_column(t + 36 * M, alpha * tanh(y), r, c, M, 12)
+        y = product(z, V4 if KEEP else forward(W3 + 12 * H, H, H, H, P), P) + tl.load(b3 + 12 + h)[None, :]
+        store_by_column(l2, alpha * tanh(y), r, h, M, H)
 
 
 @triton.jit(do_not_specialize=["N"])
 def theta_forward(
     l2, w, s2, moved, W1, b1, W2, b2, W3, b3, post, b, N, M, scale, bound,
-    BOUNDED: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
+    BOUNDED: tl.constexpr, KEEP: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
 ):  # fmt: skip
-    """Step 5: post (6, M); b (M, 6) = moved + post."""
-    r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    """Step 5: post (6, M); b (6, M) = moved + post."""
     h, c = tl.arange(0, H), tl.arange(0, 16)
-    _, _, z = theta_hidden(l2, w, s2, W1, b1, r, N, M, scale, H, P)
-    a, _ = silu(z)
-    a, _ = silu(dense(a, matrix(W2, h, h, H, H, H), tl.load(b2 + h), P))
-    y = dense(a, matrix(W3, c, h, H, 6, H), vector(b3, c, 6), P)
-    if BOUNDED:
-        y = bound * tanh(y)
-    store_by_column(post, y, r, c, M, 6)
-    y += by_column(moved, r, c, M, 6)
-    tl.store(b + r[:, None] * 6 + c[None, :], y, mask=(r[:, None] <= N) & (c[None, :] < 6))
+    if KEEP:
+        V1, Vx = forward(W1, H, H, H + 12, P), forward(W1 + H, H, 12, H + 12, P)
+        V2, V3 = forward(W2, H, H, H, P), forward(W3, 6, H, H, P)
+    for tile in range(tl.program_id(0), M // BLOCK, tl.num_programs(0)):
+        r = tile * BLOCK + tl.arange(0, BLOCK)
+        z = product(by_column(l2, r, h, M, H), V1 if KEEP else forward(W1, H, H, H + 12, P), P) + tl.load(b1 + h)[None, :]
+        x = network_input(w, s2, w, r, N, M, scale, False)
+        z, _ = silu(z + product(x, Vx if KEEP else forward(W1 + H, H, 12, H + 12, P), P))
+        z, _ = silu(product(z, V2 if KEEP else forward(W2, H, H, H, P), P) + tl.load(b2 + h)[None, :])
+        y = product(z, V3 if KEEP else forward(W3, 6, H, H, P), P) + vector(b3, c, 6)[None, :]
+        if BOUNDED:
+            y = bound * tanh(y)
+        store_by_column(post, y, r, c, M, 6)
+        store_by_column(b, y + by_column(moved, r, c, M, 6), r, c, M, 6)

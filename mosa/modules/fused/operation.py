@@ -14,28 +14,33 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mosa.modules.fused.adjoint_kernels import phi_backward, psi1_backward, psi2_backward, theta_backward, weight_gradients
-from mosa.modules.fused.assembly_kernels import assemble, assemble_adjoint
+from mosa.modules.fused.assembly_kernels import assemble, assemble_adjoint, finish, normals, normals_adjoint
 from mosa.modules.fused.network_kernels import phi_forward, psi1_forward, psi2_forward, theta_forward
 from mosa.physics.activations import backward_at_hand
 
 LANES = 128
 """Particles a program of the assembly; rows are padded to a multiple, so that arrays stored by column need no mask."""
+BLOCK = 64
+"""Rows a program takes at once."""
 INTERPRETED_PROGRAMS = 2
+REGISTERS, PROGRAMS = 168, 3
+"""Of a thread in the forward kernels, and programs a multiprocessor, which that many registers leave room for."""
 
 
 class Settings(NamedTuple):
-    """alpha, l_max, scale: as `ProgressiveOperator`; precision: of products, tf32x3 | tf32; block: rows a program takes at once."""
+    """alpha, l_max, scale: as `ProgressiveOperator`; rest_free: as `StressAdapter`; precision: of products, tf32x3 | tf32."""
 
     alpha: float
     l_max: float | None
     scale: float
+    rest_free: bool
     precision: str = "tf32x3"
-    block: int = 64
 
 
 class _Buffers(NamedTuple):
-    """What the kernels leave for one another, by column, M rows each. s1, pre, s2, moved = (I + G) pre: (6, M); l1 (H + 3, M) and
-    l2 (H + 12, M), with room for what else the next network reads; t (48, M): the bounded numbers of C_x, C_y, C_z, C_xyz."""
+    """What the kernels leave for one another, by column, M rows each. s1, pre, s2, moved = (I + G) pre: (6, M); l1 (H + 3, M), its
+    last rows the scaled normals; l2 (H + 12, M), with room for what else Theta reads; t (48, M): the bounded numbers of C_x, C_y,
+    C_z, C_xyz."""
 
     pre: Tensor
     s1: Tensor
@@ -46,153 +51,180 @@ class _Buffers(NamedTuple):
     moved: Tensor
 
 
-def _rows(n: int) -> int:
-    """M: the particles, the state at rest, and as many more of these as fill the last program."""
-    return -(-(n + 1) // LANES) * LANES
+def hopper(device: torch.device) -> bool:
+    return torch.cuda.get_device_capability(device)[0] == 9
 
 
-def _warps(hidden: int) -> int:
-    """A warp group for 64 rows of 64 columns."""
-    return 8 if hidden > 64 else 4
+class _Launch:
+    """How the kernels of networks of one width are launched for one number of particles."""
+
+    def __init__(self, settings: Settings, n: int, hidden: int, device: torch.device) -> None:
+        self.n, self.hidden, self.device = n, hidden, device
+        self.rows = -(-(n + 1) // LANES) * LANES  # the particles, the state at rest, and as many more of these as fill the last one
+        self.lanes = (self.rows // LANES,)
+        # whether all weights of a network fit beside its activations in a multiprocessor's shared memory (200 of Hopper's 227 kB)
+        self.small = settings.precision == "tf32" and hidden <= 64 and (device.type != "cuda" or hopper(device))
+        self.size = {"H": hidden, "P": settings.precision}
+        self.warps = 8 if hidden > 64 else 4  # a warp group for 64 rows of 64 columns
+
+    def programs(self, block: int, per_multiprocessor: int) -> int:
+        """Programs that go through all tiles of `block` rows."""
+        tiles = self.rows // block
+        if self.device.type != "cuda":
+            return min(tiles, INTERPRETED_PROGRAMS)
+        return min(tiles, per_multiprocessor * torch.cuda.get_device_properties(self.device).multi_processor_count)
+
+    def forward(self) -> tuple[tuple[int], dict]:
+        tiles = self.programs(BLOCK, PROGRAMS) if self.small else self.rows // BLOCK
+        options = {"KEEP": self.small, "BLOCK": BLOCK, "num_warps": self.warps, "num_stages": 1}
+        return (tiles,), self.size | options | ({"maxnreg": REGISTERS} if self.hidden <= 64 else {})
+
+    def backward(self, wanted: bool) -> tuple[tuple[int], dict]:
+        if not (self.small and wanted):
+            options = {"SUMS": "outside" if wanted else "none", "BLOCK": BLOCK, "num_warps": self.warps, "num_stages": 1}
+            return (self.rows // BLOCK,), self.size | options
+        options = {"SUMS": "inside", "BLOCK": 2 * BLOCK, "num_warps": 8, "num_stages": 1}
+        return (self.programs(2 * BLOCK, 1),), self.size | options
 
 
-def _programs(device: torch.device, tiles: int) -> int:
-    """Programs of a backward kernel, each with its own sums of weight gradients: one a multiprocessor."""
-    if device.type != "cuda":
-        return min(tiles, INTERPRETED_PROGRAMS)
-    return min(tiles, torch.cuda.get_device_properties(device).multi_processor_count)
-
-
-def _evaluate(w: Tensor, s: Tensor, settings: Settings, weights: Sequence[Tensor], G: Tensor | None) -> _Buffers:
+def _evaluate(launch: _Launch, w: Tensor, s: Tensor, unit: Tensor, settings: Settings, weights: Sequence[Tensor], G: Tensor | None):
     """Steps 1 to 4, and G (N, 6, 6) where it is given to be filled."""
-    n, hidden = len(w), weights[0].shape[0]
-    m = _rows(n)
-    buffers = _Buffers(*(w.new_empty(k, m) for k in (6, 6, hidden + 3, 48, hidden + 12, 6, 6)))
+    n, m = launch.n, launch.rows
+    b = _Buffers(*(w.new_empty(k, m) for k in (6, 6, launch.hidden + 3, 48, launch.hidden + 12, 6, 6)))
     phi, psi1, psi2 = weights[:6], weights[6:14], weights[14:20]
     bound, scale, alpha = settings.l_max or 0.0, settings.scale, settings.alpha
-    size = {"H": hidden, "BLOCK": settings.block, "P": settings.precision, "num_warps": _warps(hidden)}
-    tiles = (m // settings.block,)
-    b = buffers
-    phi_forward[tiles](w, s, *phi, b.pre, b.s1, n, m, scale, bound, BOUNDED=settings.l_max is not None, **size)
-    psi1_forward[tiles](w, b.s1, *psi1, b.l1, b.t, n, m, scale, alpha, **size)
-    psi2_forward[tiles](b.l1, b.t, b.s1, *psi2, b.l2, n, m, scale, alpha, **size)
-    lanes = (m // LANES,)
+    grid, size = launch.forward()
+    phi_forward[grid](w, s, unit, *phi, b.pre, b.s1, n, m, scale, bound, BOUNDED=settings.l_max is not None, **size)
+    psi1_forward[grid](w, b.s1, *psi1, b.l1, b.t, n, m, scale, alpha, **size)
+    normals[launch.lanes](b.t, b.s1, b.l1[launch.hidden :], m, scale, BLOCK=LANES)
+    psi2_forward[grid](b.l1, *psi2, b.t, b.l2, n, m, alpha, **size)
     operator = G is not None
-    assemble[lanes](b.t, b.s1, b.pre, G if operator else b.t, b.s2, b.moved, n, m, OPERATOR=operator, BLOCK=LANES)
-    return buffers
+    assemble[launch.lanes](b.t, b.s1, b.pre, G if operator else b.t, b.s2, b.moved, n, m, OPERATOR=operator, BLOCK=LANES)
+    return b
 
 
 class _FusedOperator(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, settings: Settings, w: Tensor, s: Tensor, *weights: Tensor):
+    def forward(ctx, settings: Settings, unit: Tensor, w: Tensor, s: Tensor, *weights: Tensor):
         w, s = w.contiguous(), s.contiguous()
         weights = tuple(weight.contiguous() for weight in weights)
         n = len(w)
-        G, b = w.new_empty(n, 6, 6), w.new_empty(n + 1, 6)
+        launch = _Launch(settings, n, weights[0].shape[0], w.device)
+        G, h = w.new_empty(n, 6, 6), w.new_empty(n, 6)
         with torch.cuda.device_of(w):
-            buffers = _evaluate(w, s, settings, weights, G)
-            post = torch.empty_like(buffers.pre)
-            theta_forward[(post.shape[1] // settings.block,)](
-                buffers.l2, w, buffers.s2, buffers.moved, *weights[20:], post, b, n, post.shape[1], settings.scale,
-                settings.l_max or 0.0, BOUNDED=settings.l_max is not None, H=weights[0].shape[0], BLOCK=settings.block,
-                P=settings.precision, num_warps=_warps(weights[0].shape[0]),
+            buffers = _evaluate(launch, w, s, unit, settings, weights, G)
+            post, b = torch.empty_like(buffers.pre), torch.empty_like(buffers.pre)
+            grid, size = launch.forward()
+            theta_forward[grid](
+                buffers.l2, w, buffers.s2, buffers.moved, *weights[20:], post, b, n, launch.rows, settings.scale,
+                settings.l_max or 0.0, BOUNDED=settings.l_max is not None, **size,
             )  # fmt: skip
-        ctx.settings = settings
+            finish[launch.lanes](b, w, s, unit, h, n, launch.rows, RESTED=settings.rest_free, BLOCK=LANES)
+        ctx.settings, ctx.launch = settings, launch
         ctx.buffers = buffers if backward_at_hand() else None
-        ctx.save_for_backward(w, s, post, *weights)
+        ctx.save_for_backward(unit, w, s, post, *weights)
         ctx.set_materialize_grads(False)
-        return G, b, buffers.t.T[:n], buffers.pre.T[:n], post.T[:n]
+        return G, h, buffers.t.T[:n], buffers.pre.T[:n], post.T[:n]
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, gG, gb, gt, gpre, gpost):
-        w, s, post, *weights = ctx.saved_tensors
-        settings, n = ctx.settings, len(w)
+    def backward(ctx, gG, gh, gt, gpre, gpost):
+        unit, w, s, post, *weights = ctx.saved_tensors
+        n = len(w)
         extra = any(g is not None for g in (gt, gpre, gpost))
-        shapes = {"G": (n, 36), "b": (n + 1, 6), "t": (n, 48), "pre": (n, 6), "post": (n, 6)}
+        shapes = {"G": (n, 36), "h": (n, 6), "t": (n, 48), "pre": (n, 6), "post": (n, 6)}
         seeds = {}
-        for (name, shape), seed in zip(shapes.items(), (gG, gb, gt, gpre, gpost)):
-            if seed is None and (extra or name in "Gb"):
+        for (name, shape), seed in zip(shapes.items(), (gG, gh, gt, gpre, gpost)):
+            if seed is None and (extra or name in "Gh"):
                 seed = w.new_zeros(shape)
             seeds[name] = w if seed is None else seed.contiguous()  # w: never read
-        needs = ctx.needs_input_grad[3:]
+        needs = ctx.needs_input_grad[4:]
         with torch.cuda.device_of(w):
-            gw, gs, gradients = _backward(w, s, post, settings, weights, seeds, extra, any(needs), ctx.buffers)
+            gw, gs, gradients = _backward(
+                ctx.launch, unit, w, s, post, ctx.settings, weights, seeds, extra, any(needs), ctx.buffers
+            )  # fmt: skip
         gradients = [g if need else None for g, need in zip(gradients, needs, strict=True)]
-        return None, gw, gs, *gradients
+        return None, None, gw, gs, *gradients
 
 
 def _backward(
-    w: Tensor, s: Tensor, post: Tensor, settings: Settings, weights: Sequence[Tensor], seeds: dict[str, Tensor], extra: bool,
-    wanted: bool, buffers: _Buffers | None,
+    launch: _Launch, unit: Tensor, w: Tensor, s: Tensor, post: Tensor, settings: Settings, weights: Sequence[Tensor],
+    seeds: dict[str, Tensor], extra: bool, wanted: bool, buffers: _Buffers | None,
 ) -> tuple[Tensor, Tensor, Sequence[Tensor | None]]:  # fmt: skip
     """Adjoints of w, s (N, 6) and, where wanted, of the weights. post: (6, M) of the forward pass; seeds: adjoints of the outputs;
     extra: of the last three too; buffers: of the forward pass, None where they are to be computed again."""
-    n, hidden = len(w), weights[0].shape[0]
-    m = _rows(n)
-    b = _evaluate(w, s, settings, weights, None) if buffers is None else buffers
-    h1, h2, g1, g2 = (w.new_empty(hidden if wanted else 0, m) for _ in range(4))  # of one network after the other
-    grid = (m // settings.block,)
+    n, m, hidden = launch.n, launch.rows, launch.hidden
+    b = _evaluate(launch, w, s, unit, settings, weights, None) if buffers is None else buffers
+    grid, size = launch.backward(wanted)
+    inside = size["SUMS"] == "inside"
+    h1, h2, g1, g2 = (w.new_empty(hidden if wanted and not inside else 0, m) for _ in range(4))  # of one network after the other
     scale, bound, alpha = settings.scale, settings.l_max or 0.0, settings.alpha
-    size = {"H": hidden, "BLOCK": settings.block, "P": settings.precision, "num_warps": _warps(hidden)}
-    flags = {"BOUNDED": settings.l_max is not None, "EXTRA": extra, "WEIGHTS": wanted}
-    programs = _programs(w.device, m // settings.block)
+    flags = {"BOUNDED": settings.l_max is not None, "EXTRA": extra}
+    programs = grid[0] if inside else launch.programs(BLOCK, 1)
     partial = w.new_empty(programs, sum(p.numel() for p in weights) if wanted else 0)
-    tile = max(64, hidden)
+    first = [sum(p.numel() for p in weights[:k]) for k in range(len(weights))]
 
     def empty(rows: int) -> Tensor:
         return w.new_empty(rows, m)
 
-    def sums(first: int, inputs: Tensor, outputs: Tensor, more: tuple[Tensor, Tensor] | None = None) -> None:
-        """Gradients of the network whose first weight is weights[first]."""
-        if wanted:
-            start = sum(p.numel() for p in weights[:first])
-            g4, x4 = more or (g1, h1)
-            weight_gradients[(programs, 5)](
-                g1, inputs, g2, h1, outputs, h2, g4, x4, partial, start, partial.shape[1], m, IN1=weights[first].shape[1],
-                OUT3=weights[first + 4].shape[0], OUT4=len(g4) if more else 0, H=hidden, TILE=tile, BLOCK=settings.block // 2,
-                P=settings.precision, num_warps=_warps(hidden),
-            )  # fmt: skip
+    def sums(layer: int, inputs: Tensor, outputs: Tensor, more: tuple[Tensor, Tensor] | None = None, jobs: int = 5) -> None:
+        """Gradients of the network whose first weight is weights[layer]; jobs=2: of its last layer."""
+        g4, x4 = more or (outputs, inputs)
+        weight_gradients[(programs, jobs)](
+            g1, inputs, g2, h1, outputs, h2, g4, x4, partial, first[layer], partial.shape[1], m, IN1=weights[layer].shape[1],
+            OUT3=weights[layer + 4].shape[0], OUT4=len(g4) if more else 0, H=hidden, TILE=max(64, hidden), BLOCK=BLOCK // 2,
+            P=settings.precision, num_warps=launch.warps,
+        )  # fmt: skip
 
+    outside = wanted and not inside
+    rest = seeds["h"].sum(0) if settings.rest_free else seeds["h"]
     gl2, gw_theta, gs2, out = empty(hidden), empty(6), empty(6), empty(6)
     theta_backward[grid](
-        b.l2, w, b.s2, post, seeds["b"], seeds["post"], *weights[20:], h1, h2, g1, g2, out, gl2, gw_theta, gs2, n, m, scale, bound,
-        **flags, **size,
+        b.l2, w, b.s2, post, seeds["h"], rest, unit, seeds["post"], *weights[20:], h1, h2, g1, g2, out, partial, gl2, gw_theta, gs2,
+        first[20], partial.shape[1], n, m, scale, bound, RESTED=settings.rest_free, **flags, **size,
     )  # fmt: skip
-    sums(20, b.l2, out)
+    if outside:
+        sums(20, b.l2, out)
     gt, gs1, gmoved = torch.empty_like(b.t), empty(6), empty(6)
-    assemble_adjoint[(m // LANES,)](
-        b.t, b.s1, b.pre, seeds["G"], seeds["b"], gs2, seeds["t"], gt, gs1, gmoved, n, m, EXTRA=extra, BLOCK=LANES
-    )
-    gl1, gt_normals, gs_normals, out = empty(hidden), empty(12), empty(6), empty(12 + hidden)
-    psi2_backward[grid](
-        b.l1, b.t, b.s1, b.l2, gt, gl2, *weights[14:20], h1, h2, g1, g2, out, gl1, gt_normals, gs_normals, n, m, scale, alpha,
-        WEIGHTS=wanted, **size,
+    assemble_adjoint[launch.lanes](
+        b.t, b.s1, b.pre, seeds["G"], seeds["h"], rest, unit, gs2, seeds["t"], gt, gs1, gmoved, n, m, RESTED=settings.rest_free,
+        EXTRA=extra, BLOCK=LANES,
     )  # fmt: skip
-    sums(14, b.l1, out)
+    gl1, out = empty(hidden + 3), empty(12 + hidden)
+    h2 = empty(hidden) if inside else h2
+    psi2_backward[grid](
+        b.l1, b.t, b.l2, gt, gl2, *weights[14:20], h1, h2, g1, g2, out, partial, gl1, first[14], partial.shape[1], n, m, alpha,
+        **size,
+    )  # fmt: skip
+    if wanted:
+        sums(14, b.l1, out, jobs=2 if inside else 5)
+    normals_adjoint[launch.lanes](b.t, b.s1, gl1[hidden:], gt, gs1, m, scale, BLOCK=LANES)
     x, gplanes, out, gw_psi, gs_psi = empty(12), empty(36), empty(hidden), empty(6), empty(6)
     psi1_backward[grid](
-        w, b.s1, b.t, gt, gt_normals, gl1, *weights[6:14], h1, h2, g1, g2, x, gplanes, out, gw_psi, gs_psi, n, m, scale, alpha,
-        WEIGHTS=wanted, **size,
+        w, b.s1, b.t, gt, gl1, b.l1, *weights[6:14], h1, h2, g1, g2, x, gplanes, out, partial, gw_psi, gs_psi, first[6],
+        partial.shape[1], n, m, scale, alpha, **size,
     )  # fmt: skip
-    sums(6, x, out, (gplanes, b.l1))
+    if outside:
+        sums(6, x, out, (gplanes, b.l1))
     gw, gs, out = torch.empty_like(w), torch.empty_like(s), empty(6)
     phi_backward[grid](
-        w, s, b.pre, gmoved, seeds["pre"], gs1, gs_normals, gs_psi, gw_psi, gw_theta, *weights[:6], h1, h2, g1, g2, x, out, gw, gs,
-        n, m, scale, bound, **flags, **size,
+        w, s, unit, b.pre, gmoved, seeds["pre"], gs1, gs_psi, gw_psi, gw_theta, *weights[:6], h1, h2, g1, g2, x, out, partial, gw,
+        gs, first[0], partial.shape[1], n, m, scale, bound, **flags, **size,
     )  # fmt: skip
-    sums(0, x, out)
+    if outside:
+        sums(0, x, out)
     if not wanted:
         return gw, gs, [None] * len(weights)
     parts = partial.sum(0).split([p.numel() for p in weights])
     return gw, gs, [part.view_as(p) for part, p in zip(parts, weights, strict=True)]
 
 
-def fused_operator(w: Tensor, s: Tensor, settings: Settings, weights: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    """(G (N, 6, 6), b (N + 1, 6), numbers (N, 48), pre (N, 6), post (N, 6)) of w and s, each (N, 6) float32.
+def fused_operator(w: Tensor, s: Tensor, unit: Tensor, settings: Settings, weights: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    """(G (N, 6, 6), h (N, 6), numbers (N, 48), pre (N, 6), post (N, 6)) of w and s, each (N, 6) float32.
 
-    b = (I + G) L_pre + L_post, its last row that of the state at rest; numbers: what `microplane.correction` takes, 12 for each of
-    C_x, C_y, C_z, C_xyz. weights: weight and bias of the layers of Phi, Psi1, the planes, Psi2 and Theta (26 tensors), all of one
-    hidden width, a power of two from 16.
+    s and h are in multiples of unit (1,), which gets no gradient: h = unit (b - b at rest), without the second where not rest_free,
+    b = (I + G) L_pre + L_post of s / unit. numbers: what `microplane.correction` takes, 12 for each of C_x, C_y, C_z, C_xyz.
+    weights: weight and bias of the layers of Phi, Psi1, the planes, Psi2 and Theta (26 tensors), all of one hidden width, a power
+    of two from 16.
     """
-    return _FusedOperator.apply(settings, w, s, *weights)
+    return _FusedOperator.apply(settings, unit, w, s, *weights)
