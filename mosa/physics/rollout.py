@@ -329,12 +329,12 @@ class Simulator:
 
     def _chain_memory(self, particles: int, frames: int) -> tuple[int, bool]:
         """(most substeps of a chain, whether to keep the states of all), by memory: a substep has 33 numbers a particle (42 where
-        the law yields) and 7 a node, of which there is about one a particle."""
+        the law yields) and 8 a node, of which there is about one a particle."""
         if self.device.type != "cuda":
             return SEGMENT, True
         free = torch.cuda.mem_get_info(self.device)[0]
         free += torch.cuda.memory_reserved(self.device) - torch.cuda.memory_allocated(self.device)
-        each = particles * (49 if self.law.plastic else 40) * torch.finfo(self.dtype).bits // 8
+        each = particles * (50 if self.law.plastic else 41) * torch.finfo(self.dtype).bits // 8
         most = max(1, min(SEGMENT, int(MEMORY_SHARE * free / each)))
         return most, (frames - 1) * self.substeps * each < KEPT_SHARE * free
 

@@ -140,12 +140,12 @@ class Workspace:
         self.dims, nodes = dims, dims[0] * dims[1] * dims[2]
         grids = self.substeps if self.with_adjoint else 1
         self.grid, self.grid_wp = self._per_slot(grids, (nodes, 4), self.kernels.vec4)
-        self.velocity, self.velocity_wp = self._per_slot(grids, (nodes, 3), self.kernels.vec3)
+        self.velocity, self.velocity_wp = self._per_slot(grids, (nodes, 4), self.kernels.vec4)
         if self.colliders is not None:
             self.colliders.set_nodes(nodes)
         if self.with_adjoint:
             self.adj_grid, self.adj_grid_wp = self._array((nodes, 4), self.kernels.vec4)
-            self.adj_velocity, self.adj_velocity_wp = self._array((nodes, 3), self.kernels.vec3)
+            self.adj_velocity, self.adj_velocity_wp = self._array((nodes, 4), self.kernels.vec4)
         self._graphs.clear()
 
     def load(
