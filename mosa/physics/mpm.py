@@ -5,6 +5,7 @@ reads, and the first advance of F under a return mapping.
 """
 
 import math
+from collections.abc import Iterable
 
 import torch
 import warp as wp
@@ -14,32 +15,30 @@ from mosa.errors import SimulationDiverged
 from mosa.physics.laws import Law
 from mosa.physics.material_kernels import field_types, return_kernel, state_kernel, stress_kernel
 from mosa.physics.mpm_kernels import INVERTED, NO_EVENT, NONFINITE, OUTSIDE, WINDOW
-from mosa.physics.workspace import SCALARS, Numerics, Steps, Workspace
+from mosa.physics.window import MAX_NODES, extent, grid_window, window_of
+from mosa.physics.workspace import SCALARS, Numerics, Steps, Workspace, copies, launch
 
 HELD = ("parameters", "G", "h", "plastic_G", "plastic_h")
-MAX_NODES = 2**23
-"""Nodes of the largest window: 200 cells across."""
+LONGEST = 256
+"""Most substeps of a segment of which no gradient is wanted, on CUDA: each segment costs a look at the host."""
+WIDENED = 32
+"""Most substeps of a segment whose window may be widened for particles of any speed; longer ones are cut instead."""
+ROOM, SMALL = 2, 2**16
+"""A window may have this many times the nodes that are needed now, or this many nodes, which cost CUDA no more than the launch:
+for a longer segment, and because another number of nodes costs a new capture."""
 
 
-def grid_window(x: Tensor, v: Tensor, dx: float, travel_time: float, margin: int) -> tuple[tuple, tuple]:
-    """(lowest node, nodes per axis) that hold the stencils of all particles for `travel_time` seconds.
+def _largest(dims: Iterable[tuple[int, int, int]]) -> tuple[int, int, int]:
+    return tuple(map(max, zip(*dims, strict=True)))
 
-    x, v: (N, 3). Node counts are multiples of 4, so that a moving body seldom changes them.
-    Errors: SimulationDiverged for non-finite input or particles spread over more than 2^23 nodes.
-    """
-    bounds = torch.cat([x.amin(0), x.amax(0), v.abs().amax().reshape(1)]).tolist()  # the only transfer to the host
-    if not all(math.isfinite(b) for b in bounds):
-        bad = int((~(torch.isfinite(x).all(1) & torch.isfinite(v).all(1))).nonzero()[0])
-        raise SimulationDiverged(f"particle {bad} has a non-finite position or velocity before the substep")
-    reach = math.ceil(bounds[6] * travel_time / dx) + margin
-    low = [math.floor(b / dx - 0.5) - reach for b in bounds[:3]]
-    high = [math.floor(b / dx - 0.5) + 2 + reach for b in bounds[3:6]]
-    dims = [-(-(h - l + 1) // 4) * 4 for l, h in zip(low, high)]
-    if math.prod(dims) > MAX_NODES:
-        raise SimulationDiverged(
-            f"particles spread over {dims} grid nodes of {dx} m (speeds to {bounds[6]:.3g} m/s): use more substeps, or a box"
-        )
-    return tuple(low), tuple(dims)
+
+def _allowed(nodes: int) -> int:
+    return min(max(ROOM * nodes, SMALL), MAX_NODES)
+
+
+def _identity(state: tuple[Tensor, ...]) -> tuple[int, int]:
+    """Tells x and v from others that are alive; detached aliases have the same."""
+    return state[0].data_ptr(), state[1].data_ptr()
 
 
 class SegmentSolver:
@@ -54,6 +53,7 @@ class SegmentSolver:
         self.mass = density * volume
         self._workspaces = workspaces
         self._dims = (0, 0, 0)
+        self._known: tuple | None = None
 
     def workspace(self, substeps: int, adapted: bool, plastic_adapted: bool, with_adjoint: bool) -> Workspace:
         key = (len(self.volume), substeps, adapted, plastic_adapted, with_adjoint)
@@ -87,15 +87,72 @@ class SegmentSolver:
         # allows, half a cell per substep
         steps = steps or Steps(self.numerics.dt, self.numerics.dt)
         for margin in (2, 3 + substeps // 2):
-            origin, dims = grid_window(state[0], state[1], self.numerics.dx, 2 * substeps * steps.dt, margin)
-            self._dims = dims = tuple(max(a, b) for a, b in zip(dims, self._dims))
-            work = self.prepare(state, held, poses, substeps, (origin, dims), with_adjoint=False, steps=steps)
-            work.advance()
-            flags = work.flags.tolist()
+            found, flags = self._attempt(state, held, poses, substeps, margin, steps)
             if not self.left_window(flags, first, steps.dt):
-                reaction = () if work.colliders is None else tuple(t.clone() for t in work.colliders.reaction)
-                return work.final(), reaction, (origin, dims)
+                return found
         raise self.left_behind(flags, first, steps.dt)
+
+    def advance_any(
+        self, state: tuple[Tensor, ...], held: dict, poses, substeps: int, first: int, steps: Steps | None = None
+    ) -> tuple[tuple, tuple]:
+        """(state, reactions) after any number of substeps, in as few pieces as windows of moderate size allow. No gradient."""
+        steps, done, reactions, most = steps or Steps(self.numerics.dt, self.numerics.dt), 0, [], LONGEST
+        while done < substeps:
+            count = self._piece(state, substeps - done, most, steps.dt)
+            along = None if poses is None else tuple(part[done : done + count] for part in poses)
+            if count <= WIDENED:
+                found = self.advance(state, held, along, count, first + done, steps)
+            else:
+                found, flags = self._attempt(state, held, along, count, 2, steps)
+                if self.left_window(flags, first + done, steps.dt):
+                    most = WIDENED
+                    continue
+            state, reaction, _ = found
+            reactions.append(reaction)
+            done, steps, most = done + count, Steps(steps.dt, steps.dt), LONGEST
+        return state, tuple(torch.cat(parts) for parts in zip(*reactions, strict=True))
+
+    def _piece(self, state: tuple[Tensor, ...], left: int, most: int, dt: float) -> int:
+        """How many of the `left` substeps the next window is to serve: at most `most`, and so few that it is not much larger than
+        the window of `WIDENED` substeps."""
+        bounds, pieces = self._bounds(state), -(-left // most)
+        if not all(math.isfinite(b) for b in bounds):
+            return min(left, WIDENED)
+        while (count := -(-left // pieces)) > WIDENED:
+            long, short = (math.prod(window_of(bounds, self.numerics.dx, 2 * n * dt, 2)[1]) for n in (count, WIDENED))
+            if long <= _allowed(short):
+                break
+            pieces *= 2
+        return count
+
+    def _attempt(
+        self, state: tuple[Tensor, ...], held: dict, poses, substeps: int, margin: int, steps: Steps
+    ) -> tuple[tuple[tuple, tuple, tuple], list[int]]:
+        """(what `advance` returns, flags), in a window for the speeds at the start and `margin` nodes more."""
+        x, v = state[:2]
+        origin, dims = grid_window(x, v, self.numerics.dx, 2 * substeps * steps.dt, margin, bounds=self._bounds(state))
+        self._dims = dims = self._kept(dims)
+        work = self.prepare(state, held, poses, substeps, (origin, dims), with_adjoint=False, steps=steps)
+        work.advance()
+        final = work.final()
+        # one transfer (float64 holds the flags exactly) tells the host also where the next segment starts
+        numbers = torch.cat([work.flags.double(), extent(*final[:2]).double()]).tolist()
+        self._known = (*_identity(final), numbers[4:], final)  # with `final`, so that its memory is not another tensor's
+        reaction = () if work.colliders is None else tuple(copies(work.colliders.reaction))
+        return (final, reaction, (origin, dims)), [int(n) for n in numbers[:4]]
+
+    def _bounds(self, state: tuple[Tensor, ...]) -> list[float]:
+        if self._known is None or self._known[:2] != _identity(state):
+            self._known = (*_identity(state), extent(*state[:2]).tolist(), state)
+        return self._known[2]
+
+    def _kept(self, dims: tuple[int, int, int]) -> tuple[int, int, int]:
+        """`dims` or those of an earlier segment: buffers of another size cost CUDA a new capture, nodes more cost a CPU time."""
+        least = _largest([dims, self._dims])
+        if self.numerics.device.type != "cuda":
+            return least
+        roomy = _largest([least, *(work.dims for work in self._workspaces.values())])
+        return roomy if math.prod(roomy) <= _allowed(math.prod(dims)) else least
 
     def left_behind(self, flags: list[int], first: int, dt: float) -> SimulationDiverged:
         """The error to raise for a particle that leaves even the widest window."""
@@ -152,10 +209,16 @@ class _Segment(torch.autograd.Function):
         for target, seed in zip(filled, seeds, strict=True):
             target.zero_() if seed is None else target.copy_(seed)
         work.adjoint()
-        gradients = [target[0].clone() for target in targets] + [None] * (5 - ctx.states)
-        gradients += [None if held[name] is None else work.adj_held[name].clone() for name in HELD]
-        gradients += [] if poses is None else [t.clone() for t in work.colliders.adj_poses]
+        found = iter(copies([*(target[0] for target in targets), *(work.adj_held[n] for n in HELD if held[n] is not None)]))
+        gradients = [next(found) for _ in targets] + [None] * (5 - ctx.states)
+        gradients += [None if held[name] is None else next(found) for name in HELD]
+        gradients += [] if poses is None else copies(work.colliders.adj_poses)
         return None, None, None, None, *gradients
+
+
+def wants_gradient(tensors: Iterable[Tensor | None]) -> bool:
+    """Whether torch would differentiate with respect to one of them."""
+    return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
 
 
 def advance_segment(
@@ -167,7 +230,10 @@ def advance_segment(
     poses: of K colliders at the segment's S substeps, as `collider_motion.Poses`, () where there are none; reactions: force [N]
     and torque about each collider's origin [N m], (S, K, 3), or (). steps: times of the substeps, the numerics' dt by default.
     """
-    result = _Segment.apply(solver, substeps, first, steps, *state, *(held[name] for name in HELD), *poses)
+    inputs = (*state, *(held[name] for name in HELD), *poses)
+    if not wants_gradient(inputs):
+        return solver.advance_any(tuple(t.detach().contiguous() for t in state), held, poses or None, substeps, first, steps)
+    result = _Segment.apply(solver, substeps, first, steps, *inputs)
     count = 5 if solver.numerics.law.plastic else 4
     final, reaction = result[:count], result[count:]
     return (final if count == 5 else (*final, final[3])), reaction
@@ -181,8 +247,16 @@ def warp_stream(device: torch.device):
     return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
 
 
-def _arrays(tensors: list[Tensor], kinds: list) -> list:
-    return [wp.from_torch(t.detach().contiguous(), dtype=kind) for t, kind in zip(tensors, kinds, strict=True)]
+def _arrays(tensors: list[Tensor | None], kinds: list) -> list:
+    return [
+        None if t is None else wp.from_torch(t.detach().contiguous(), dtype=kind) for t, kind in zip(tensors, kinds, strict=True)
+    ]
+
+
+def _zeros(tensors: list[Tensor]) -> list[Tensor]:
+    """Contiguous, of the tensors' shapes, made in one launch: what Warp's adjoints add gradients to."""
+    flat = tensors[0].new_zeros(sum(t.numel() for t in tensors))
+    return [part.view(t.shape) for part, t in zip(flat.split([t.numel() for t in tensors]), tensors)]
 
 
 @torch.no_grad()
@@ -191,10 +265,10 @@ def kirchhoff_stress(law: Law, F: Tensor, C_affine: Tensor, parameters: Tensor) 
     scalar = SCALARS[F.dtype]
     mat33, vec6, mat66, vecp = field_types(scalar)
     kernel = stress_kernel(law.stress, law.uses_rotation, scalar, False)
-    blank, tau = F.new_zeros(1, 6, 6), torch.zeros_like(F, memory_format=torch.contiguous_format)
+    blank, tau = F.new_zeros(1, 6, 6), torch.empty_like(F, memory_format=torch.contiguous_format)
     with warp_stream(F.device):
         arrays = _arrays([F, C_affine, parameters, blank, blank[0, :1], tau], [mat33, mat33, vecp, mat66, vec6, mat33])
-        wp.launch(kernel, len(F), inputs=arrays, device=arrays[0].device)
+        launch(kernel, len(F), arrays, arrays[0].device)
     return tau
 
 
@@ -206,27 +280,24 @@ class _MaterialState(torch.autograd.Function):
         ctx.kernel = state_kernel(law.stress, law.uses_rotation, scalar, law.plastic)
         ctx.kinds = [mat33, mat33, vecp, vec6, vec6, vec6]
         ctx.plastic = law.plastic
-        w, s, e = (F.new_zeros(len(F), 6) for _ in range(3))
+        ctx.set_materialize_grads(False)
+        # the kernel writes all of them; a law that does not yield has no e
+        w, s, e = (F.new_empty(rows, 6) for rows in (len(F), len(F), len(F) if law.plastic else 1))
         ctx.save_for_backward(F, C, parameters)
         with warp_stream(F.device):
             arrays = _arrays([F, C, parameters, w, s, e], ctx.kinds)
-            wp.launch(ctx.kernel, len(F), inputs=arrays, device=arrays[0].device)
+            launch(ctx.kernel, len(F), arrays, arrays[0].device)
         return (w, s, e) if law.plastic else (w, s)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, *seeds):
-        inputs = list(ctx.saved_tensors)
-        blank = inputs[0].new_zeros(len(inputs[0]), 6)
-        # the kernel may consume the seeds: never hand it torch's own
-        seeds = [blank.clone() if s is None else s.clone().contiguous() for s in seeds] + [blank.clone()] * (not ctx.plastic)
-        gradients = [torch.zeros_like(t, memory_format=torch.contiguous_format) for t in inputs]
+        # the adjoint leaves the outputs alone and only reads the seeds: Warp clears only those that are the grad of an array
+        inputs, seeds = list(ctx.saved_tensors), [*seeds] + [None] * (not ctx.plastic)
+        gradients, blank = _zeros(inputs), inputs[0].new_empty(1, 6)
         with warp_stream(blank.device):
             arrays = _arrays([*inputs, blank, blank, blank], ctx.kinds)
-            wp.launch(
-                ctx.kernel, len(blank), inputs=arrays, adj_inputs=_arrays([*gradients, *seeds], ctx.kinds), adjoint=True,
-                device=arrays[0].device,
-            )  # fmt: skip
+            launch(ctx.kernel, len(inputs[0]), arrays, arrays[0].device, _arrays([*gradients, *seeds], ctx.kinds))
         return None, *gradients
 
 
@@ -251,25 +322,22 @@ class _Return(torch.autograd.Function):
         if not adapted:
             G, h = F.new_zeros(1, 6, 6), F.new_zeros(1, 6)
         ctx.save_for_backward(F, C, parameters, G, h)
-        mapped = torch.zeros_like(F, memory_format=torch.contiguous_format)
+        mapped = torch.empty_like(F, memory_format=torch.contiguous_format)
         with warp_stream(F.device):
             arrays = _arrays([F, C, parameters, G, h], ctx.kinds)
-            inputs = [*arrays, *ctx.constants, *_arrays([mapped], [mat33])]
-            wp.launch(ctx.kernel, len(F), inputs=inputs, device=arrays[0].device)
+            launch(ctx.kernel, len(F), [*arrays, *ctx.constants, *_arrays([mapped], [mat33])], arrays[0].device)
         return mapped
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, seed):
         inputs = list(ctx.saved_tensors)
-        gradients = [torch.zeros_like(t, memory_format=torch.contiguous_format) for t in inputs]
+        gradients = _zeros(inputs)
         with warp_stream(seed.device):
             arrays = _arrays(inputs, ctx.kinds)
-            blank, seeds = _arrays([torch.zeros_like(seed), seed.clone()], ctx.kinds[:1] * 2)
-            wp.launch(
-                ctx.kernel, len(seed), inputs=[*arrays, *ctx.constants, blank],
-                adj_inputs=[*_arrays(gradients, ctx.kinds), 0.0, 0.0, 0, seeds], adjoint=True, device=arrays[0].device,
-            )  # fmt: skip
+            blank, seeds = _arrays([seed.new_empty(1, 3, 3), seed], ctx.kinds[:1] * 2)
+            adjoints = [*_arrays(gradients, ctx.kinds), 0.0, 0.0, 0, seeds]
+            launch(ctx.kernel, len(seed), [*arrays, *ctx.constants, blank], arrays[0].device, adjoints)
         return None, *gradients[:3], *(gradients[3:] if ctx.adapted else (None, None))
 
 
