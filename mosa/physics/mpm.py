@@ -36,6 +36,12 @@ def _allowed(nodes: int) -> int:
     return min(max(ROOM * nodes, SMALL), MAX_NODES)
 
 
+def substep_bytes(numerics: Numerics, particles: int) -> int:
+    """What the backward pass reads of a substep: 33 numbers a particle (42 where the law yields) and 8 a node, of which there is
+    about one a particle."""
+    return particles * (50 if numerics.law.plastic else 41) * torch.finfo(numerics.dtype).bits // 8
+
+
 def _identity(state: tuple[Tensor, ...]) -> tuple[int, int]:
     """Tells x and v from others that are alive; detached aliases have the same."""
     return state[0].data_ptr(), state[1].data_ptr()
@@ -46,12 +52,15 @@ class SegmentSolver:
     mass [kg].
 
     workspaces: buffers by shape, shared by the rollouts of one simulator (scratch only, nothing in them outlives a segment).
+    room: bytes for the states of all substeps, between the passes; segments that do not fit are run again in the backward pass.
     """
 
-    def __init__(self, numerics: Numerics, volume: Tensor, density: float | Tensor, cutoff: float, workspaces: dict) -> None:
+    def __init__(
+        self, numerics: Numerics, volume: Tensor, density: float | Tensor, cutoff: float, workspaces: dict, room: float = 0.0
+    ) -> None:
         self.numerics, self.volume, self.cutoff = numerics, volume, cutoff
         self.mass = density * volume
-        self._workspaces = workspaces
+        self._workspaces, self.room = workspaces, room
         self._dims = (0, 0, 0)
         self._known: tuple | None = None
 
@@ -75,11 +84,13 @@ class SegmentSolver:
         return work
 
     def advance(
-        self, state: tuple[Tensor, ...], held: dict, poses, substeps: int, first: int, steps: Steps | None = None
-    ) -> tuple[tuple, tuple, tuple]:
-        """(state after `substeps`, reactions (force, torque) of the colliders or (), grid window used).
+        self, state: tuple[Tensor, ...], held: dict, poses, substeps: int, first: int, steps: Steps | None = None,
+        kept: bool = False,
+    ) -> tuple[tuple, tuple, tuple, list[Tensor]]:  # fmt: skip
+        """(state after `substeps`, reactions (force, torque) of the colliders or (), grid window used, copy of `Workspace.tape`).
 
-        first: number of the first substep, for messages; steps: their times, the numerics' dt by default.
+        first: number of the first substep, for messages; steps: their times, the numerics' dt by default; kept: whether to make
+        the copy, [] otherwise.
 
         Errors: SimulationDiverged naming substep and particle.
         """
@@ -87,9 +98,9 @@ class SegmentSolver:
         # allows, half a cell per substep
         steps = steps or Steps(self.numerics.dt, self.numerics.dt)
         for margin in (2, 3 + substeps // 2):
-            found, flags = self._attempt(state, held, poses, substeps, margin, steps)
+            found, flags, work = self._attempt(state, held, poses, substeps, margin, steps, kept)
             if not self.left_window(flags, first, steps.dt):
-                return found
+                return *found, copies(work.tape()) if kept else []
         raise self.left_behind(flags, first, steps.dt)
 
     def advance_any(
@@ -103,11 +114,11 @@ class SegmentSolver:
             if count <= WIDENED:
                 found = self.advance(state, held, along, count, first + done, steps)
             else:
-                found, flags = self._attempt(state, held, along, count, 2, steps)
+                found, flags, _ = self._attempt(state, held, along, count, 2, steps)
                 if self.left_window(flags, first + done, steps.dt):
                     most = WIDENED
                     continue
-            state, reaction, _ = found
+            state, reaction = found[:2]
             reactions.append(reaction)
             done, steps, most = done + count, Steps(steps.dt, steps.dt), LONGEST
         return state, tuple(torch.cat(parts) for parts in zip(*reactions, strict=True))
@@ -126,20 +137,28 @@ class SegmentSolver:
         return count
 
     def _attempt(
-        self, state: tuple[Tensor, ...], held: dict, poses, substeps: int, margin: int, steps: Steps
-    ) -> tuple[tuple[tuple, tuple, tuple], list[int]]:
-        """(what `advance` returns, flags), in a window for the speeds at the start and `margin` nodes more."""
+        self, state: tuple[Tensor, ...], held: dict, poses, substeps: int, margin: int, steps: Steps, kept: bool = False
+    ) -> tuple[tuple[tuple, tuple, tuple], list[int], Workspace]:
+        """((state, reactions, window), flags, workspace), in a window for the speeds at the start and `margin` nodes more."""
         x, v = state[:2]
         origin, dims = grid_window(x, v, self.numerics.dx, 2 * substeps * steps.dt, margin, bounds=self._bounds(state))
         self._dims = dims = self._kept(dims)
-        work = self.prepare(state, held, poses, substeps, (origin, dims), with_adjoint=False, steps=steps)
+        work = self.prepare(state, held, poses, substeps, (origin, dims), with_adjoint=kept, steps=steps)
         work.advance()
         final = work.final()
         # one transfer (float64 holds the flags exactly) tells the host also where the next segment starts
         numbers = torch.cat([work.flags.double(), extent(*final[:2]).double()]).tolist()
         self._known = (*_identity(final), numbers[4:], final)  # with `final`, so that its memory is not another tensor's
         reaction = () if work.colliders is None else tuple(copies(work.colliders.reaction))
-        return (final, reaction, (origin, dims)), [int(n) for n in numbers[:4]]
+        return (final, reaction, (origin, dims)), [int(n) for n in numbers[:4]], work
+
+    def takes_room(self, substeps: int) -> bool:
+        """Whether the states of so many substeps may be kept; they have the room from then on."""
+        size = substeps * substep_bytes(self.numerics, len(self.volume))
+        if size > self.room:
+            return False
+        self.room -= size
+        return True
 
     def _bounds(self, state: tuple[Tensor, ...]) -> list[float]:
         if self._known is None or self._known[:2] != _identity(state):
@@ -190,7 +209,9 @@ class _Segment(torch.autograd.Function):
         """inputs: state (5), held (5), and, where there are colliders, their poses at the segment's substeps (4)."""
         state = tuple(t.detach().contiguous() for t in inputs[:5])
         held, poses = dict(zip(HELD, inputs[5:10], strict=True)), inputs[10:] or None
-        result, reaction, window = solver.advance(state, held, poses, substeps, first, steps)
+        ctx.set_materialize_grads(False)
+        kept = solver.takes_room(substeps)
+        result, reaction, window, ctx.tape = solver.advance(state, held, poses, substeps, first, steps, kept)
         ctx.solver, ctx.substeps, ctx.window, ctx.steps = solver, substeps, window, steps
         ctx.states = 5 if solver.numerics.law.plastic else 4
         ctx.save_for_backward(*state, *inputs[5:])
@@ -202,7 +223,11 @@ class _Segment(torch.autograd.Function):
         saved = ctx.saved_tensors
         state, held, poses = saved[:5], dict(zip(HELD, saved[5:10], strict=True)), saved[10:] or None
         work = ctx.solver.prepare(state, held, poses, ctx.substeps, ctx.window, with_adjoint=True, steps=ctx.steps)
-        work.advance()
+        tape, ctx.tape = ctx.tape, []  # freed as soon as it is used
+        if tape:
+            torch._foreach_copy_(work.tape(), tape)
+        else:
+            work.advance()
         slot = ctx.substeps % 2
         targets = [work.adj_x, work.adj_v, work.adj_C, work.adj_F, work.adj_A][: ctx.states]
         filled = [target[slot] for target in targets] + ([] if poses is None else work.colliders.adj_reaction)

@@ -22,7 +22,7 @@ from mosa.physics.chain import Chain, advance_chain, grouped
 from mosa.physics.collider_motion import Motion, Trajectory, sample_frame, sample_poses
 from mosa.physics.colliders import Collider, pack_colliders, reach
 from mosa.physics.laws import SLOTS, law_named
-from mosa.physics.mpm import LONGEST, SegmentSolver, advance_segment, first_advance, material_state, wants_gradient
+from mosa.physics.mpm import LONGEST, SegmentSolver, advance_segment, first_advance, material_state, substep_bytes, wants_gradient
 from mosa.physics.plasticity import yield_factor
 from mosa.physics.workspace import SCALARS, Numerics, Steps
 from mosa.types import Ground, ParticleState, Rollout
@@ -35,6 +35,8 @@ MEMORY_SHARE = 0.1
 """Of a GPU's free memory, for what the backward pass of a chain stores."""
 KEPT_SHARE = 0.25
 """Of a GPU's free memory, for the states of all substeps of a rollout, where that is enough for them."""
+KEPT_ON_CPU = 2**29
+"""Bytes, for the same on a CPU: 4000 particles over 800 substeps."""
 MAX_CHAINS = 8
 
 _UNBOUNDED = 1e30
@@ -249,9 +251,11 @@ class Simulator:
         most, kept = self._chain_memory(n, frames) if chained else (SEGMENT, False)
         current = (state.x, state.v, C, F, F_tot)
         poses = () if variable else self._poses(motions, frames, start_time)
-        reactions, most_alone = [], SEGMENT
-        if self._long and not variable and not wants_gradient((*current, *held.values(), *poses)):
-            most_alone = LONGEST
+        reactions = []
+        if torch.is_grad_enabled() and not chained:
+            solver.room = self._room()
+        wanted = wants_gradient((*current, *held.values(), *poses))
+        most_alone = LONGEST if self._long and not variable and not wanted else SEGMENT
         for frame in range(1, frames):
             if frame > 1:
                 taken.append(substeps_of(frame, current[1], current[2], current[3]))
@@ -335,15 +339,20 @@ class Simulator:
         return MaterialState(*material_state(self.law, F, C_affine, self.pack(parameters, len(F), rotation)))
 
     def _chain_memory(self, particles: int, frames: int) -> tuple[int, bool]:
-        """(most substeps of a chain, whether to keep the states of all), by memory: a substep has 33 numbers a particle (42 where
-        the law yields) and 8 a node, of which there is about one a particle."""
+        """(most substeps of a chain, whether to keep the states of all), by memory."""
         if self.device.type != "cuda":
             return SEGMENT, True
-        free = torch.cuda.mem_get_info(self.device)[0]
-        free += torch.cuda.memory_reserved(self.device) - torch.cuda.memory_allocated(self.device)
-        each = particles * (50 if self.law.plastic else 41) * torch.finfo(self.dtype).bits // 8
+        free, each = self._free_memory(), substep_bytes(self.numerics, particles)
         most = max(1, min(SEGMENT, int(MEMORY_SHARE * free / each)))
         return most, (frames - 1) * self.substeps * each < KEPT_SHARE * free
+
+    def _room(self) -> float:
+        """Bytes that a rollout may keep between the passes."""
+        return KEPT_SHARE * self._free_memory() if self.device.type == "cuda" else KEPT_ON_CPU
+
+    def _free_memory(self) -> int:
+        free = torch.cuda.mem_get_info(self.device)[0]
+        return free + torch.cuda.memory_reserved(self.device) - torch.cuda.memory_allocated(self.device)
 
     def _chain(
         self, adapter: nn.Module, lengths: tuple[int, ...], state: tuple[Tensor, ...], packed: Tensor, collects: bool
