@@ -22,7 +22,8 @@ from mosa.physics.chain import Chain, advance_chain, grouped
 from mosa.physics.collider_motion import Motion, Trajectory, sample_frame, sample_poses
 from mosa.physics.colliders import Collider, pack_colliders, reach
 from mosa.physics.laws import SLOTS, law_named
-from mosa.physics.mpm import LONGEST, SegmentSolver, advance_segment, first_advance, material_state, substep_bytes, wants_gradient
+from mosa.physics.mpm import LONGEST, SegmentSolver, advance_segment, substep_bytes, wants_gradient
+from mosa.physics.particle_operations import first_advance, material_state
 from mosa.physics.plasticity import yield_factor
 from mosa.physics.workspace import SCALARS, Numerics, Steps
 from mosa.types import Ground, ParticleState, Rollout
@@ -252,9 +253,9 @@ class Simulator:
         current = (state.x, state.v, C, F, F_tot)
         poses = () if variable else self._poses(motions, frames, start_time)
         reactions = []
-        if torch.is_grad_enabled() and not chained:
-            solver.room = self._room()
         wanted = wants_gradient((*current, *held.values(), *poses))
+        if not chained and (wanted or (adapter is not None and torch.is_grad_enabled())):
+            solver.room = self._room()
         most_alone = LONGEST if self._long and not variable and not wanted else SEGMENT
         for frame in range(1, frames):
             if frame > 1:
