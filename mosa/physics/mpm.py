@@ -114,7 +114,7 @@ class SegmentSolver:
                     continue
             state, reaction = found[:2]
             reactions.append(reaction)
-            done, steps, most = done + count, Steps(steps.dt, steps.dt), LONGEST
+            done, steps = done + count, Steps(steps.dt, steps.dt)
         return state, tuple(torch.cat(parts) for parts in zip(*reactions, strict=True))
 
     def _piece(self, state: tuple[Tensor, ...], left: int, most: int, dt: float) -> int:
@@ -142,7 +142,7 @@ class SegmentSolver:
         final = work.final()
         # one transfer (float64 holds the flags exactly) tells the host also where the next segment starts
         numbers = torch.cat([work.flags.double(), extent(*final[:2]).double()]).tolist()
-        self._known = (*_identity(final), numbers[4:], final)  # with `final`, so that its memory is not another tensor's
+        self._know(final, numbers[4:])
         reaction = () if work.colliders is None else tuple(copies(work.colliders.reaction))
         return (final, reaction, (origin, dims)), [int(n) for n in numbers[:4]], work
 
@@ -156,8 +156,12 @@ class SegmentSolver:
 
     def _bounds(self, state: tuple[Tensor, ...]) -> list[float]:
         if self._known is None or self._known[:2] != _identity(state):
-            self._known = (*_identity(state), extent(*state[:2]).tolist(), state)
+            self._know(state, extent(*state[:2]).tolist())
         return self._known[2]
+
+    def _know(self, state: tuple[Tensor, ...], bounds: list[float]) -> None:
+        # aliases hold the memory, so that it does not become another tensor's, but not the graph, which holds the solver
+        self._known = (*_identity(state), bounds, [t.detach() for t in state[:2]])
 
     def _kept(self, dims: tuple[int, int, int]) -> tuple[int, int, int]:
         """`dims` or those of an earlier segment: buffers of another size cost CUDA a new capture, nodes more cost a CPU time."""

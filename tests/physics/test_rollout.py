@@ -1,6 +1,8 @@
 """Rollouts: gradient over 200 substeps in what every frame holds, recomputation, invariances, precision, errors."""
 
+import gc
 import warnings
+import weakref
 from dataclasses import replace
 
 import pytest
@@ -8,7 +10,7 @@ import torch
 
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.physics.elasticity import lame
-from mosa.physics.mpm import grid_window, substep_bytes
+from mosa.physics.mpm import SegmentSolver, grid_window, substep_bytes
 from mosa.physics.rollout import AdapterOperator, MaterialState, Simulator
 from mosa.physics.workspace import Workspace
 from mosa.types import Ground, ParticleState
@@ -363,3 +365,25 @@ class TestErrors:
             simulator().rollout(state, self.PARAMETERS, volume_of(state), DENSITY, 2, adapter=lambda _: operator)
         with pytest.raises(ConfigError, match="volume"):
             simulator().rollout(state, self.PARAMETERS, 0 * volume_of(state), DENSITY, 2)
+
+
+def test_a_rollout_that_is_dropped_frees_what_it_kept(make_block, monkeypatch):
+    """Without the garbage collector: states of all substeps are too much to wait for it."""
+    solvers, state = [], make_block()
+
+    def remembered(*arguments):
+        solver = SegmentSolver(*arguments)
+        solvers.append(weakref.ref(solver))
+        return solver
+
+    monkeypatch.setattr("mosa.physics.rollout.SegmentSolver", remembered)
+    mu = torch.full((), 4e4).double().requires_grad_()
+    gc.collect()
+    gc.disable()
+    try:
+        rollout = simulator().rollout(state, {"mu": mu, "lam": 5e4}, volume_of(state), DENSITY, 3)
+        assert solvers[0]() is not None and rollout.x.requires_grad
+        del rollout
+        assert solvers[0]() is None
+    finally:
+        gc.enable()
