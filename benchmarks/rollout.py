@@ -1,20 +1,26 @@
 """Time and memory of rollouts, forward and forward + backward, without and with each adapter.
 
-    OMP_NUM_THREADS=1 python benchmarks/rollout.py [--device cpu|cuda] [--counts 10000 30000] [--substeps 40] [--repeats 5]
-                                                   [--variants none constant stride1 ...]
+    OMP_NUM_THREADS=1 python benchmarks/rollout.py [--device cpu|cuda] [--counts 10000 30000] [--substeps 40] [--frames 5]
+                                                   [--repeats 5] [--variants none constant stride1 ...] [--forward-only]
                                                    [--set precision=tf32 fused=true]
     python benchmarks/rollout.py --check           a small CPU run against benchmarks/rollout_ratios.json; --store rewrites it
 
-A block of corotated material falls for one frame. Variants: `none`; `constant`, the default adapter (one operator for the whole
-body); `stride1`, `mosa`: the paper's networks asked at every substep, at the default stride. Forward is timed without a graph;
-forward + backward gives gradients with respect to modulus, velocity and all weights, the networks' activations recomputed
+A block of corotated material falls for `--frames` intervals of `--substeps` (five on CUDA, one on a CPU where not given): what a
+rollout costs once, whatever its length, is spread over all of them. Variants: `none`; `constant`, the default adapter (one operator
+for the whole body); `stride1`, `mosa`: the paper's networks asked at every substep, at the default stride. Forward is timed without
+a graph; forward + backward gives gradients with respect to modulus, velocity and all weights, the networks' activations recomputed
 (`--store-activations` keeps them). Milliseconds per substep: median (least to most) of the repeats, wall time between
 synchronisations on CUDA, CPU time on one thread elsewhere. Memory: most that torch and Warp held at once on CUDA, most that the
 process held beyond its start on a CPU. The first runs compile kernels and capture graphs; they are not counted.
 
-The check compares ratios of times in one run, which the machine's speed cancels out of, and fails when one is more than a quarter
-above the stored one. `none forward / yardstick` has scattered sums of torch below it, as many as P2G has. Best CPU times are used,
-of rounds that go through all variants, so that other work on the machine disturbs them little.
+    python benchmarks/rollout.py --device cuda --counts 30000 --variants none constant --frames 50 --forward-only
+
+is the forward rollout of 30k particles over 2000 substeps, in seconds in the last column. `--block`: threads of a CUDA block in the
+substeps, in place of the program's own.
+
+The check compares ratios of times in one run, of one interval, which the machine's speed cancels out of, and fails when one is more
+than a quarter above the stored one. `none forward / yardstick` has scattered sums of torch below it, as many as P2G has. Best CPU
+times are used, of rounds that go through all variants, so that other work on the machine disturbs them little.
 """
 
 from __future__ import annotations
@@ -39,6 +45,7 @@ from omegaconf import OmegaConf
 from substep import body
 
 from mosa.modules.body import SimulationSettings
+from mosa.physics import workspace
 from mosa.physics.rollout import Simulator
 from mosa.types import Ground, ParticleState
 
@@ -77,7 +84,7 @@ class Case:
     both: Callable[[], None]
 
 
-def case(variant: str, particles: int, substeps: int, device: str, settings: dict) -> Case:
+def case(variant: str, particles: int, substeps: int, frames: int, device: str, settings: dict) -> Case:
     name, stride = VARIANTS[variant]
     adapter = adapter_of(name, device, settings)
     state = ParticleState(*(t.to(device) for t in body(particles, DX, torch.float32)))
@@ -88,7 +95,7 @@ def case(variant: str, particles: int, substeps: int, device: str, settings: dic
 
     def rollout(mu, velocity):
         start = ParticleState(state.x, state.v + velocity, state.C_affine, state.F, state.F_tot)
-        return sim.rollout(start, {"mu": mu, "lam": LAM}, volume, DENSITY, 2, adapter=adapter, stride=stride)
+        return sim.rollout(start, {"mu": mu, "lam": LAM}, volume, DENSITY, frames + 1, adapter=adapter, stride=stride)
 
     def forward() -> None:
         with torch.no_grad():
@@ -158,25 +165,28 @@ def spread(seconds: list[float], substeps: int) -> str:
 
 
 def table(options: argparse.Namespace, settings: dict) -> None:
-    unit = "ms" if options.device == "cuda" else "CPU-ms"
-    print(f"\n{unit} per substep, median (least to most) of {options.repeats} rollouts of {options.substeps} substeps")
-    print("| particles | adapter | forward | forward + backward | over none | peak GiB |\n|---|---|---|---|---|---|")
+    unit, total = "ms" if options.device == "cuda" else "CPU-ms", options.frames * options.substeps
+    length = f"{options.frames} x {options.substeps} substeps"
+    print(f"\n{unit} per substep, median (least to most) of {options.repeats} rollouts of {length}")
+    names = ["forward"] if options.forward_only else ["forward", "forward + backward"]
+    columns = ["particles", "adapter", *names, "over none", "peak GiB", "forward of all [s]"]
+    print(f"| {' | '.join(columns)} |\n|{'---|' * len(columns)}")
     memory = PeakMemory(options.device)
     for particles in options.counts:
         bases: list[float] = []
         for variant in options.variants:
-            run = case(variant, particles, options.substeps, options.device, settings)
+            run = case(variant, particles, options.substeps, options.frames, options.device, settings)
             figures = []
             with memory:
-                for call in (run.forward, run.both):
+                for call in (run.forward, run.both)[: len(names)]:
                     for _ in range(3 if options.device == "cuda" else 1):
                         call()
                     figures.append([timed(call, options.device) for _ in range(options.repeats)])
             medians = [statistics.median(f) for f in figures]
             bases = medians if variant == "none" else bases
             over = ", ".join(f"{a / b:.2f}" for a, b in zip(medians, bases)) if bases else "-"
-            shown = " | ".join(spread(f, options.substeps) for f in figures)
-            print(f"| {particles} | {variant} | {shown} | {over} | {memory.peak:.2f} |", flush=True)
+            shown = " | ".join(spread(f, total) for f in figures)
+            print(f"| {particles} | {variant} | {shown} | {over} | {memory.peak:.2f} | {medians[0]:.3f} |", flush=True)
 
 
 def yardstick(particles: int, substeps: int) -> Callable[[], None]:
@@ -208,7 +218,7 @@ class Check:
         particles, substeps = CHECK["particles"], CHECK["substeps"]
         self.calls = {"yardstick": yardstick(particles, substeps)}
         for variant in VARIANTS:
-            run = case(variant, particles, substeps, "cpu", {"recompute": True})
+            run = case(variant, particles, substeps, 1, "cpu", {"recompute": True})
             self.calls |= {f"{variant} forward": run.forward, f"{variant} both": run.both}
         for call in self.calls.values():
             call()
@@ -252,6 +262,9 @@ def main() -> None:
     parser.add_argument("--counts", type=int, nargs="+", help="particles; 10k to 1M on CUDA, 10k on a CPU where not given")
     parser.add_argument("--variants", nargs="+", choices=tuple(VARIANTS), default=list(VARIANTS))
     parser.add_argument("--substeps", type=int, default=40)
+    parser.add_argument("--frames", type=int, help="intervals of a rollout; 5 on CUDA, 1 on a CPU where not given")
+    parser.add_argument("--forward-only", action="store_true", help="no backward pass")
+    parser.add_argument("--block", type=int, default=workspace.BLOCK, help="threads of a CUDA block in the substeps")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--store-activations", action="store_true", help="no recomputation of the networks")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="settings of the paper's adapter")
@@ -260,6 +273,7 @@ def main() -> None:
     options = parser.parse_args()
     wp.config.quiet = True
     torch.set_num_threads(1)
+    workspace.BLOCK = options.block
     print(versions())
     if options.store:
         found = {name: round(value, 3) for name, value in Check().measure(3 * CHECK["rounds"]).items()}
@@ -276,6 +290,7 @@ def main() -> None:
         if options.device == "cpu":
             options.counts = options.counts or [10_000]
         options.counts = options.counts or [10_000, 30_000, 100_000, 1_000_000]
+        options.frames = options.frames or (5 if options.device == "cuda" else 1)
         settings = OmegaConf.to_container(OmegaConf.from_dotlist(options.set))
         table(options, {"recompute": not options.store_activations, **settings})
 

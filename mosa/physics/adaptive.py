@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.physics.laws import Law
-from mosa.physics.mpm import kirchhoff_stress
+from mosa.physics.particle_operations import kirchhoff_stress
 from mosa.physics.time_step import VISCOUS_NUMBER, step_rate
 from mosa.physics.workspace import Numerics
 

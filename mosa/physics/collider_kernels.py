@@ -15,6 +15,7 @@ import warp as wp
 from mosa.physics.boundary import make_normal_adjoint, make_plane_functions
 from mosa.physics.collider_shapes import shape_functions
 from mosa.physics.mpm_kernels import transfer_kernels
+from mosa.physics.vector_memory import vector_memory
 
 
 @cache
@@ -28,6 +29,7 @@ def collider_kernels(scalar) -> SimpleNamespace:
     shape = shape_functions(scalar)
     signed_distance, curvature = shape.signed_distance, shape.curvature
     node_position = transfer_kernels(scalar).node_position
+    load3, store3 = vector_memory(scalar).load3, vector_memory(scalar).store3
     module = f"mosa.physics.colliders_{scalar.__name__}"
 
     @wp.func
@@ -69,14 +71,15 @@ def collider_kernels(scalar) -> SimpleNamespace:
         grid: wp.array(dtype=vec4), cutoff: scalar, origin: wp.array(dtype=wp.vec3i), dims: wp.vec3i, dx: scalar,
         inv_dt: scalar, count: int, substep: int, shapes: wp.array2d(dtype=scalar), codes: wp.array2d(dtype=int),
         fields: wp.array(dtype=scalar), position: wp.array2d(dtype=vec3), rotation: wp.array2d(dtype=mat33),
-        linear: wp.array2d(dtype=vec3), angular: wp.array2d(dtype=vec3), velocity: wp.array(dtype=vec3),
+        linear: wp.array2d(dtype=vec3), angular: wp.array2d(dtype=vec3), velocity: wp.array(dtype=vec4),
         force: wp.array2d(dtype=vec3), torque: wp.array2d(dtype=vec3),
     ):  # fmt: skip
         """Changes velocity in place, adds to force and torque of the substep."""
         node = wp.tid()
         m = grid[node][3]
         if m > cutoff:
-            u = velocity[node]
+            now = velocity[node]  # changed in place, which `load3` is not for
+            u = vec3(now[0], now[1], now[2])
             y = node_position(node, origin[0], dims, dx)
             for k in range(count):
                 after = respond(u, y, k, substep, shapes, codes, fields, position, rotation, linear, angular)
@@ -85,15 +88,15 @@ def collider_kernels(scalar) -> SimpleNamespace:
                     wp.atomic_add(force, substep, k, f)
                     wp.atomic_add(torque, substep, k, wp.cross(y - position[substep, k], f))
                 u = after
-            velocity[node] = u
+            store3(velocity, node, u)
 
     @wp.kernel(module=module, enable_backward=False)
     def adj_collide_nodes(
         grid: wp.array(dtype=vec4), cutoff: scalar, origin: wp.array(dtype=wp.vec3i), dims: wp.vec3i, dx: scalar,
         inv_dt: scalar, count: int, substep: int, shapes: wp.array2d(dtype=scalar), codes: wp.array2d(dtype=int),
         fields: wp.array(dtype=scalar), position: wp.array2d(dtype=vec3), rotation: wp.array2d(dtype=mat33),
-        linear: wp.array2d(dtype=vec3), angular: wp.array2d(dtype=vec3), before: wp.array(dtype=vec3),
-        adj_force: wp.array2d(dtype=vec3), adj_torque: wp.array2d(dtype=vec3), adj_velocity: wp.array(dtype=vec3),
+        linear: wp.array2d(dtype=vec3), angular: wp.array2d(dtype=vec3), before: wp.array(dtype=vec4),
+        adj_force: wp.array2d(dtype=vec3), adj_torque: wp.array2d(dtype=vec3), adj_velocity: wp.array(dtype=vec4),
         adj_mass: wp.array(dtype=scalar), adj_position: wp.array2d(dtype=vec3), adj_rotation: wp.array2d(dtype=mat33),
         adj_linear: wp.array2d(dtype=vec3), adj_angular: wp.array2d(dtype=vec3),
     ):  # fmt: skip
@@ -103,7 +106,8 @@ def collider_kernels(scalar) -> SimpleNamespace:
         m = grid[node][3]
         am = scalar(0.0)
         if m > cutoff:
-            a = adj_velocity[node]
+            now = adj_velocity[node]
+            a = vec3(now[0], now[1], now[2])
             y = node_position(node, origin[0], dims, dx)
             for reverse in range(count):
                 k = count - 1 - reverse
@@ -113,7 +117,7 @@ def collider_kernels(scalar) -> SimpleNamespace:
                 phi, g = signed_distance(q, k, shapes, codes, fields)
                 w, slope = weight(phi, shapes[k, 3])
                 if w > scalar(0.0):
-                    u = before[node]
+                    u = load3(before, node)
                     for j in range(k):
                         u = respond(u, y, j, substep, shapes, codes, fields, position, rotation, linear, angular)
                     omega = angular[substep, k]
@@ -146,7 +150,7 @@ def collider_kernels(scalar) -> SimpleNamespace:
                     wp.atomic_add(adj_angular, substep, k, wp.cross(r, aV))
                     wp.atomic_add(adj_rotation, substep, k, wp.outer(an, local) + wp.outer(r, aq))
                     wp.atomic_add(adj_position, substep, k, -ar)
-            adj_velocity[node] = a
+            store3(adj_velocity, node, a)
         adj_mass[node] = am
 
     @wp.kernel(module=module, enable_backward=False)
@@ -157,5 +161,5 @@ def collider_kernels(scalar) -> SimpleNamespace:
         adj_grid[node] = adj_grid[node] + vec4(z, z, z, adj_mass[node])
 
     return SimpleNamespace(
-        collide_nodes=collide_nodes, adj_collide_nodes=adj_collide_nodes, add_mass=add_mass, vec3=vec3, mat33=mat33
+        collide_nodes=collide_nodes, adj_collide_nodes=adj_collide_nodes, add_mass=add_mass, vec3=vec3, vec4=vec4, mat33=mat33
     )

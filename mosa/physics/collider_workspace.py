@@ -39,7 +39,7 @@ class ColliderBuffers:
     def set_nodes(self, nodes: int) -> None:
         """Buffers of the size of the grid window, for the adjoint."""
         if self.with_adjoint:
-            self.before, self.before_wp = self._allocate((nodes, 3), self.kernels.vec3)
+            self.before, self.before_wp = self._allocate((nodes, 4), self.kernels.vec4)
             self.adj_mass, self._adj_mass = self._allocate((nodes,), self._scalar)
 
     def load(self, poses: tuple[Tensor, ...]) -> None:

@@ -1,45 +1,44 @@
-"""The differentiable segment: some substeps of MLS-MPM as one torch operation, recomputed in the backward pass.
+"""The differentiable segment: some substeps of MLS-MPM as one torch operation.
 
-Only a segment's inputs are kept between the passes. Also the two per-particle operations around it: the state that an adapter
-reads, and the first advance of F under a return mapping.
+Between the passes the states of all substeps are kept where there is room for them, else only a segment's inputs.
 """
 
 import math
+from collections.abc import Iterable
 
 import torch
 import warp as wp
 from torch import Tensor
 
 from mosa.errors import SimulationDiverged
-from mosa.physics.laws import Law
-from mosa.physics.material_kernels import field_types, return_kernel, state_kernel, stress_kernel
 from mosa.physics.mpm_kernels import INVERTED, NO_EVENT, NONFINITE, OUTSIDE, WINDOW
-from mosa.physics.workspace import SCALARS, Numerics, Steps, Workspace
+from mosa.physics.window import MAX_NODES, extent, grid_window, window_of
+from mosa.physics.workspace import Numerics, Steps, Workspace, copies
 
 HELD = ("parameters", "G", "h", "plastic_G", "plastic_h")
-MAX_NODES = 2**23
-"""Nodes of the largest window: 200 cells across."""
+LONGEST = 256
+"""Most substeps of a segment of which no gradient is wanted, on CUDA: each segment costs a look at the host."""
+WIDENED = 32
+"""Most substeps of a segment whose window may be widened for particles of any speed; longer ones are cut instead."""
+SMALL = 2**16
+"""Nodes that a long segment's window may have more than a short one's: over the substeps they cost about what it saves."""
+SPARE = 1.5
+"""A window keeps the size of an earlier, larger one up to this factor: another number of nodes costs CUDA a new capture."""
 
 
-def grid_window(x: Tensor, v: Tensor, dx: float, travel_time: float, margin: int) -> tuple[tuple, tuple]:
-    """(lowest node, nodes per axis) that hold the stencils of all particles for `travel_time` seconds.
+def _largest(dims: Iterable[tuple[int, int, int]]) -> tuple[int, int, int]:
+    return tuple(map(max, zip(*dims, strict=True)))
 
-    x, v: (N, 3). Node counts are multiples of 4, so that a moving body seldom changes them.
-    Errors: SimulationDiverged for non-finite input or particles spread over more than 2^23 nodes.
-    """
-    bounds = torch.cat([x.amin(0), x.amax(0), v.abs().amax().reshape(1)]).tolist()  # the only transfer to the host
-    if not all(math.isfinite(b) for b in bounds):
-        bad = int((~(torch.isfinite(x).all(1) & torch.isfinite(v).all(1))).nonzero()[0])
-        raise SimulationDiverged(f"particle {bad} has a non-finite position or velocity before the substep")
-    reach = math.ceil(bounds[6] * travel_time / dx) + margin
-    low = [math.floor(b / dx - 0.5) - reach for b in bounds[:3]]
-    high = [math.floor(b / dx - 0.5) + 2 + reach for b in bounds[3:6]]
-    dims = [-(-(h - l + 1) // 4) * 4 for l, h in zip(low, high)]
-    if math.prod(dims) > MAX_NODES:
-        raise SimulationDiverged(
-            f"particles spread over {dims} grid nodes of {dx} m (speeds to {bounds[6]:.3g} m/s): use more substeps, or a box"
-        )
-    return tuple(low), tuple(dims)
+
+def substep_bytes(numerics: Numerics, particles: int) -> int:
+    """What the backward pass reads of a substep: 33 numbers a particle (42 where the law yields) and 8 a node, of which there is
+    about one a particle."""
+    return particles * (50 if numerics.law.plastic else 41) * torch.finfo(numerics.dtype).bits // 8
+
+
+def _identity(state: tuple[Tensor, ...]) -> tuple[int, int]:
+    """Tells x and v from others that are alive; detached aliases have the same."""
+    return state[0].data_ptr(), state[1].data_ptr()
 
 
 class SegmentSolver:
@@ -47,13 +46,17 @@ class SegmentSolver:
     mass [kg].
 
     workspaces: buffers by shape, shared by the rollouts of one simulator (scratch only, nothing in them outlives a segment).
+    room: bytes for the states of all substeps, between the passes; segments that do not fit are run again in the backward pass.
     """
 
-    def __init__(self, numerics: Numerics, volume: Tensor, density: float | Tensor, cutoff: float, workspaces: dict) -> None:
+    def __init__(
+        self, numerics: Numerics, volume: Tensor, density: float | Tensor, cutoff: float, workspaces: dict, room: float = 0.0
+    ) -> None:
         self.numerics, self.volume, self.cutoff = numerics, volume, cutoff
         self.mass = density * volume
-        self._workspaces = workspaces
+        self._workspaces, self.room = workspaces, room
         self._dims = (0, 0, 0)
+        self._known: tuple | None = None
 
     def workspace(self, substeps: int, adapted: bool, plastic_adapted: bool, with_adjoint: bool) -> Workspace:
         key = (len(self.volume), substeps, adapted, plastic_adapted, with_adjoint)
@@ -75,11 +78,13 @@ class SegmentSolver:
         return work
 
     def advance(
-        self, state: tuple[Tensor, ...], held: dict, poses, substeps: int, first: int, steps: Steps | None = None
-    ) -> tuple[tuple, tuple, tuple]:
-        """(state after `substeps`, reactions (force, torque) of the colliders or (), grid window used).
+        self, state: tuple[Tensor, ...], held: dict, poses, substeps: int, first: int, steps: Steps | None = None,
+        kept: bool = False,
+    ) -> tuple[tuple, tuple, tuple, list[Tensor]]:  # fmt: skip
+        """(state after `substeps`, reactions (force, torque) of the colliders or (), grid window used, copy of `Workspace.tape`).
 
-        first: number of the first substep, for messages; steps: their times, the numerics' dt by default.
+        first: number of the first substep, for messages; steps: their times, the numerics' dt by default; kept: whether to make
+        the copy, [] otherwise.
 
         Errors: SimulationDiverged naming substep and particle.
         """
@@ -87,15 +92,84 @@ class SegmentSolver:
         # allows, half a cell per substep
         steps = steps or Steps(self.numerics.dt, self.numerics.dt)
         for margin in (2, 3 + substeps // 2):
-            origin, dims = grid_window(state[0], state[1], self.numerics.dx, 2 * substeps * steps.dt, margin)
-            self._dims = dims = tuple(max(a, b) for a, b in zip(dims, self._dims))
-            work = self.prepare(state, held, poses, substeps, (origin, dims), with_adjoint=False, steps=steps)
-            work.advance()
-            flags = work.flags.tolist()
+            found, flags, work = self._attempt(state, held, poses, substeps, margin, steps, kept)
             if not self.left_window(flags, first, steps.dt):
-                reaction = () if work.colliders is None else tuple(t.clone() for t in work.colliders.reaction)
-                return work.final(), reaction, (origin, dims)
+                return *found, copies(work.tape()) if kept else []
         raise self.left_behind(flags, first, steps.dt)
+
+    def advance_any(
+        self, state: tuple[Tensor, ...], held: dict, poses, substeps: int, first: int, steps: Steps | None = None
+    ) -> tuple[tuple, tuple]:
+        """(state, reactions) after any number of substeps, in as few pieces as windows of moderate size allow. No gradient."""
+        steps, done, reactions, most = steps or Steps(self.numerics.dt, self.numerics.dt), 0, [], LONGEST
+        while done < substeps:
+            count = self._piece(state, substeps - done, most, steps.dt)
+            along = None if poses is None else tuple(part[done : done + count] for part in poses)
+            if count <= WIDENED:
+                found = self.advance(state, held, along, count, first + done, steps)
+            else:
+                found, flags, _ = self._attempt(state, held, along, count, 2, steps)
+                if self.left_window(flags, first + done, steps.dt):
+                    most = WIDENED
+                    continue
+            state, reaction = found[:2]
+            reactions.append(reaction)
+            done, steps = done + count, Steps(steps.dt, steps.dt)
+        return state, tuple(torch.cat(parts) for parts in zip(*reactions, strict=True))
+
+    def _piece(self, state: tuple[Tensor, ...], left: int, most: int, dt: float) -> int:
+        """How many of the `left` substeps the next window is to serve: at most `most`, and so few that it is not much larger than
+        the window of `WIDENED` substeps."""
+        bounds, pieces = self._bounds(state), -(-left // most)
+        if not all(math.isfinite(b) for b in bounds):
+            return min(left, WIDENED)
+        while (count := -(-left // pieces)) > WIDENED:
+            long, short = (math.prod(window_of(bounds, self.numerics.dx, 2 * n * dt, 2)[1]) for n in (count, WIDENED))
+            if long <= min(short + SMALL, MAX_NODES):
+                break
+            pieces *= 2
+        return count
+
+    def _attempt(
+        self, state: tuple[Tensor, ...], held: dict, poses, substeps: int, margin: int, steps: Steps, kept: bool = False
+    ) -> tuple[tuple[tuple, tuple, tuple], list[int], Workspace]:
+        """((state, reactions, window), flags, workspace), in a window for the speeds at the start and `margin` nodes more."""
+        x, v = state[:2]
+        origin, dims = grid_window(x, v, self.numerics.dx, 2 * substeps * steps.dt, margin, bounds=self._bounds(state))
+        self._dims = dims = self._kept(dims)
+        work = self.prepare(state, held, poses, substeps, (origin, dims), with_adjoint=kept, steps=steps)
+        work.advance()
+        final = work.final()
+        # one transfer (float64 holds the flags exactly) tells the host also where the next segment starts
+        numbers = torch.cat([work.flags.double(), extent(*final[:2]).double()]).tolist()
+        self._know(final, numbers[4:])
+        reaction = () if work.colliders is None else tuple(copies(work.colliders.reaction))
+        return (final, reaction, (origin, dims)), [int(n) for n in numbers[:4]], work
+
+    def takes_room(self, substeps: int) -> bool:
+        """Whether the states of so many substeps may be kept; they have the room from then on."""
+        size = substeps * substep_bytes(self.numerics, len(self.volume))
+        if size > self.room:
+            return False
+        self.room -= size
+        return True
+
+    def _bounds(self, state: tuple[Tensor, ...]) -> list[float]:
+        if self._known is None or self._known[:2] != _identity(state):
+            self._know(state, extent(*state[:2]).tolist())
+        return self._known[2]
+
+    def _know(self, state: tuple[Tensor, ...], bounds: list[float]) -> None:
+        # aliases hold the memory, so that it does not become another tensor's, but not the graph, which holds the solver
+        self._known = (*_identity(state), bounds, [t.detach() for t in state[:2]])
+
+    def _kept(self, dims: tuple[int, int, int]) -> tuple[int, int, int]:
+        """`dims` or those of an earlier segment: buffers of another size cost CUDA a new capture, nodes more cost a CPU time."""
+        least = _largest([dims, self._dims])
+        if self.numerics.device.type != "cuda":
+            return least
+        roomy = _largest([least, *(work.dims for work in self._workspaces.values())])
+        return roomy if math.prod(roomy) <= max(SPARE * math.prod(dims), SMALL) else least
 
     def left_behind(self, flags: list[int], first: int, dt: float) -> SimulationDiverged:
         """The error to raise for a particle that leaves even the widest window."""
@@ -133,7 +207,9 @@ class _Segment(torch.autograd.Function):
         """inputs: state (5), held (5), and, where there are colliders, their poses at the segment's substeps (4)."""
         state = tuple(t.detach().contiguous() for t in inputs[:5])
         held, poses = dict(zip(HELD, inputs[5:10], strict=True)), inputs[10:] or None
-        result, reaction, window = solver.advance(state, held, poses, substeps, first, steps)
+        ctx.set_materialize_grads(False)
+        kept = solver.takes_room(substeps)
+        result, reaction, window, ctx.tape = solver.advance(state, held, poses, substeps, first, steps, kept)
         ctx.solver, ctx.substeps, ctx.window, ctx.steps = solver, substeps, window, steps
         ctx.states = 5 if solver.numerics.law.plastic else 4
         ctx.save_for_backward(*state, *inputs[5:])
@@ -145,17 +221,27 @@ class _Segment(torch.autograd.Function):
         saved = ctx.saved_tensors
         state, held, poses = saved[:5], dict(zip(HELD, saved[5:10], strict=True)), saved[10:] or None
         work = ctx.solver.prepare(state, held, poses, ctx.substeps, ctx.window, with_adjoint=True, steps=ctx.steps)
-        work.advance()
+        tape, ctx.tape = ctx.tape, []  # freed as soon as it is used
+        if tape:
+            torch._foreach_copy_(work.tape(), tape)
+        else:
+            work.advance()
         slot = ctx.substeps % 2
         targets = [work.adj_x, work.adj_v, work.adj_C, work.adj_F, work.adj_A][: ctx.states]
         filled = [target[slot] for target in targets] + ([] if poses is None else work.colliders.adj_reaction)
         for target, seed in zip(filled, seeds, strict=True):
             target.zero_() if seed is None else target.copy_(seed)
         work.adjoint()
-        gradients = [target[0].clone() for target in targets] + [None] * (5 - ctx.states)
-        gradients += [None if held[name] is None else work.adj_held[name].clone() for name in HELD]
-        gradients += [] if poses is None else [t.clone() for t in work.colliders.adj_poses]
+        found = iter(copies([*(target[0] for target in targets), *(work.adj_held[n] for n in HELD if held[n] is not None)]))
+        gradients = [next(found) for _ in targets] + [None] * (5 - ctx.states)
+        gradients += [None if held[name] is None else next(found) for name in HELD]
+        gradients += [] if poses is None else copies(work.colliders.adj_poses)
         return None, None, None, None, *gradients
+
+
+def wants_gradient(tensors: Iterable[Tensor | None]) -> bool:
+    """Whether torch would differentiate with respect to one of them."""
+    return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
 
 
 def advance_segment(
@@ -167,7 +253,10 @@ def advance_segment(
     poses: of K colliders at the segment's S substeps, as `collider_motion.Poses`, () where there are none; reactions: force [N]
     and torque about each collider's origin [N m], (S, K, 3), or (). steps: times of the substeps, the numerics' dt by default.
     """
-    result = _Segment.apply(solver, substeps, first, steps, *state, *(held[name] for name in HELD), *poses)
+    inputs = (*state, *(held[name] for name in HELD), *poses)
+    if not wants_gradient(inputs):
+        return solver.advance_any(tuple(t.detach().contiguous() for t in state), held, poses or None, substeps, first, steps)
+    result = _Segment.apply(solver, substeps, first, steps, *inputs)
     count = 5 if solver.numerics.law.plastic else 4
     final, reaction = result[:count], result[count:]
     return (final if count == 5 else (*final, final[3])), reaction
@@ -179,103 +268,3 @@ def warp_stream(device: torch.device):
         return wp.ScopedDevice("cpu")
     # without waiting for Warp's own stream: nothing is left on it, and a stream that is being captured could not
     return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
-
-
-def _arrays(tensors: list[Tensor], kinds: list) -> list:
-    return [wp.from_torch(t.detach().contiguous(), dtype=kind) for t, kind in zip(tensors, kinds, strict=True)]
-
-
-@torch.no_grad()
-def kirchhoff_stress(law: Law, F: Tensor, C_affine: Tensor, parameters: Tensor) -> Tensor:
-    """tau (N, 3, 3) [Pa] of the law alone, without an adapter. No gradient."""
-    scalar = SCALARS[F.dtype]
-    mat33, vec6, mat66, vecp = field_types(scalar)
-    kernel = stress_kernel(law.stress, law.uses_rotation, scalar, False)
-    blank, tau = F.new_zeros(1, 6, 6), torch.zeros_like(F, memory_format=torch.contiguous_format)
-    with warp_stream(F.device):
-        arrays = _arrays([F, C_affine, parameters, blank, blank[0, :1], tau], [mat33, mat33, vecp, mat66, vec6, mat33])
-        wp.launch(kernel, len(F), inputs=arrays, device=arrays[0].device)
-    return tau
-
-
-class _MaterialState(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, law: Law, F, C, parameters):
-        scalar = SCALARS[F.dtype]
-        mat33, vec6, _, vecp = field_types(scalar)
-        ctx.kernel = state_kernel(law.stress, law.uses_rotation, scalar, law.plastic)
-        ctx.kinds = [mat33, mat33, vecp, vec6, vec6, vec6]
-        ctx.plastic = law.plastic
-        w, s, e = (F.new_zeros(len(F), 6) for _ in range(3))
-        ctx.save_for_backward(F, C, parameters)
-        with warp_stream(F.device):
-            arrays = _arrays([F, C, parameters, w, s, e], ctx.kinds)
-            wp.launch(ctx.kernel, len(F), inputs=arrays, device=arrays[0].device)
-        return (w, s, e) if law.plastic else (w, s)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, *seeds):
-        inputs = list(ctx.saved_tensors)
-        blank = inputs[0].new_zeros(len(inputs[0]), 6)
-        # the kernel may consume the seeds: never hand it torch's own
-        seeds = [blank.clone() if s is None else s.clone().contiguous() for s in seeds] + [blank.clone()] * (not ctx.plastic)
-        gradients = [torch.zeros_like(t, memory_format=torch.contiguous_format) for t in inputs]
-        with warp_stream(blank.device):
-            arrays = _arrays([*inputs, blank, blank, blank], ctx.kinds)
-            wp.launch(
-                ctx.kernel, len(blank), inputs=arrays, adj_inputs=_arrays([*gradients, *seeds], ctx.kinds), adjoint=True,
-                device=arrays[0].device,
-            )  # fmt: skip
-        return None, *gradients
-
-
-def material_state(law: Law, F: Tensor, C_affine: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-    """(w, s, e) that an adapter reads, differentiable.
-
-    w: (N, 6) vech(W - I); s: (N, 6) vech(R^T tau R) [Pa] of the prior; e: (N, 6) vech(dev log W), None for elastic laws.
-    """
-    result = _MaterialState.apply(law, F, C_affine, parameters)
-    return result if law.plastic else (*result, None)
-
-
-class _Return(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, numerics: Numerics, F, C, parameters, G, h):
-        scalar = SCALARS[F.dtype]
-        mat33, vec6, mat66, vecp = field_types(scalar)
-        adapted = G is not None
-        ctx.kernel = return_kernel(numerics.law.return_map, scalar, adapted)
-        ctx.kinds, ctx.adapted = [mat33, mat33, vecp, mat66, vec6], adapted
-        ctx.constants = [numerics.dt, numerics.norm_eps, int(numerics.rebuild)]
-        if not adapted:
-            G, h = F.new_zeros(1, 6, 6), F.new_zeros(1, 6)
-        ctx.save_for_backward(F, C, parameters, G, h)
-        mapped = torch.zeros_like(F, memory_format=torch.contiguous_format)
-        with warp_stream(F.device):
-            arrays = _arrays([F, C, parameters, G, h], ctx.kinds)
-            inputs = [*arrays, *ctx.constants, *_arrays([mapped], [mat33])]
-            wp.launch(ctx.kernel, len(F), inputs=inputs, device=arrays[0].device)
-        return mapped
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, seed):
-        inputs = list(ctx.saved_tensors)
-        gradients = [torch.zeros_like(t, memory_format=torch.contiguous_format) for t in inputs]
-        with warp_stream(seed.device):
-            arrays = _arrays(inputs, ctx.kinds)
-            blank, seeds = _arrays([torch.zeros_like(seed), seed.clone()], ctx.kinds[:1] * 2)
-            wp.launch(
-                ctx.kernel, len(seed), inputs=[*arrays, *ctx.constants, blank],
-                adj_inputs=[*_arrays(gradients, ctx.kinds), 0.0, 0.0, 0, seeds], adjoint=True, device=arrays[0].device,
-            )  # fmt: skip
-        return None, *gradients[:3], *(gradients[3:] if ctx.adapted else (None, None))
-
-
-def first_advance(numerics: Numerics, F: Tensor, C_affine: Tensor, parameters: Tensor, G: Tensor | None = None,
-                  h: Tensor | None = None) -> Tensor:  # fmt: skip
-    """map((I + dt C_affine) F), (N, 3, 3): the advance of F with which a rollout starts. Differentiable."""
-    if not numerics.law.plastic:
-        return F + numerics.dt * (C_affine @ F)
-    return _Return.apply(numerics, F, C_affine, parameters, G, h)

@@ -1,7 +1,7 @@
 """Transfers between particles and grid, with hand-written adjoints: MLS-MPM, APIC, quadratic B-splines.
 
 A node (i, j, k) sits at dx (i, j, k). The grid is a window of `dims` nodes from `origin`, flat, z fastest; it holds
-(momentum, mass) as one 4-vector, and the node velocity after gravity and contact.
+(momentum, mass) as one 4-vector, and the node velocity after gravity and contact as another, of which the fourth is unused.
 The adjoint of P2G is a pure gather; the adjoint of G2P scatters three numbers per node.
 Stencils are nested static loops over 3: a single loop over 27 nodes compiles to a dynamic loop.
 """
@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from mosa.physics.boundary import make_plane_functions
+from mosa.physics.vector_memory import vector_memory
 
 # slots of the flag array: the first substep * N + particle at which the event happened
 WINDOW, NONFINITE, OUTSIDE, INVERTED = 0, 1, 2, 3
@@ -33,6 +34,10 @@ def transfer_kernels(scalar) -> SimpleNamespace:
     vec4 = wp.types.vector(length=4, dtype=scalar)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
     collide, adj_collide = make_plane_functions(scalar)
+    memory = vector_memory(scalar)
+    load3, load4, store3, store4, add3, add4 = (
+        memory.load3, memory.load4, memory.store3, memory.store4, memory.add3, memory.add4
+    )  # fmt: skip
     module = f"mosa.physics.transfers_{scalar.__name__}"
 
     # `steps` in the kernels holds the node offsets as scalars: Warp 1.19 retypes a loop variable that is cast to float64
@@ -107,7 +112,7 @@ def transfer_kernels(scalar) -> SimpleNamespace:
                 for k in range(3):
                     w = wij * wz[k]
                     q = w * (qij + steps[k] * bz)
-                    wp.atomic_add(grid, row + k, vec4(q[0], q[1], q[2], w * m))
+                    add4(grid, row + k, vec4(q[0], q[1], q[2], w * m))
 
     @wp.func
     def free_velocity(g: vec4, impulse: vec3):
@@ -141,27 +146,27 @@ def transfer_kernels(scalar) -> SimpleNamespace:
     def grid_update(
         grid: wp.array(dtype=vec4), impulse: vec3, cutoff: scalar, origin: wp.array(dtype=wp.vec3i), dims: wp.vec3i,
         dx: scalar, planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int,
-        velocity: wp.array(dtype=vec3),
+        velocity: wp.array(dtype=vec4),
     ):  # fmt: skip
         node = wp.tid()
-        g = grid[node]
+        g = load4(grid, node)
         u = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
         if g[3] > cutoff:
             u = free_velocity(g, impulse)
             if count > 0:
                 u = contact(u, node_position(node, origin[0], dims, dx), planes, modes, count)
-        velocity[node] = u
+        store3(velocity, node, u)
 
     @wp.kernel(module=module, enable_backward=False)
     def adj_grid(
         grid: wp.array(dtype=vec4), impulse: vec3, cutoff: scalar, origin: wp.array(dtype=wp.vec3i), dims: wp.vec3i,
         dx: scalar, planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int,
-        adj_velocity: wp.array(dtype=vec3), adj_grid: wp.array(dtype=vec4),
+        adj_velocity: wp.array(dtype=vec4), adj_grid: wp.array(dtype=vec4),
     ):  # fmt: skip
         node = wp.tid()
-        g = grid[node]
+        g = load4(grid, node)
         if g[3] > cutoff:
-            a = adj_velocity[node]
+            a = load3(adj_velocity, node)
             u = free_velocity(g, impulse)
             if count > 0:
                 y = node_position(node, origin[0], dims, dx)
@@ -173,14 +178,14 @@ def transfer_kernels(scalar) -> SimpleNamespace:
                         a = adj_collide(before, normal, modes[i], planes[i, 4], a)
             a = a / g[3]
             # v = p/m: dL/dm = -a.(p/m)/m
-            adj_grid[node] = vec4(a[0], a[1], a[2], -(a[0] * g[0] + a[1] * g[1] + a[2] * g[2]) / g[3])
+            store4(adj_grid, node, vec4(a[0], a[1], a[2], -(a[0] * g[0] + a[1] * g[1] + a[2] * g[2]) / g[3]))
         else:
             z = scalar(0.0)
-            adj_grid[node] = vec4(z, z, z, z)
+            store4(adj_grid, node, vec4(z, z, z, z))
 
     @wp.kernel(module=module, enable_backward=False)
     def g2p(
-        x: wp.array(dtype=vec3), A: wp.array(dtype=mat33), velocity: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3), A: wp.array(dtype=mat33), velocity: wp.array(dtype=vec4),
         origin: wp.array(dtype=wp.vec3i), dims: wp.vec3i, dx: scalar, inv_dx: scalar, dt: scalar,
         low: vec3, high: vec3, substep: int, flags: wp.array(dtype=wp.int64),
         x_new: wp.array(dtype=vec3), v_new: wp.array(dtype=vec3), C_new: wp.array(dtype=mat33),
@@ -208,9 +213,9 @@ def transfer_kernels(scalar) -> SimpleNamespace:
             layer = zero
             for j in range(3):
                 row = n + (i * dims[1] + j) * dims[2]
-                a = wz[0] * velocity[row]
-                b = wz[1] * velocity[row + 1]
-                c = wz[2] * velocity[row + 2]
+                a = wz[0] * load3(velocity, row)
+                b = wz[1] * load3(velocity, row + 1)
+                c = wz[2] * load3(velocity, row + 2)
                 line = wy[j] * (a + b + c)
                 layer = layer + line
                 cy = cy + (wx[i] * steps[j]) * line
@@ -242,11 +247,11 @@ def transfer_kernels(scalar) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def adj_g2p(
-        x: wp.array(dtype=vec3), A: wp.array(dtype=mat33), velocity: wp.array(dtype=vec3), C_new: wp.array(dtype=mat33),
+        x: wp.array(dtype=vec3), A: wp.array(dtype=mat33), velocity: wp.array(dtype=vec4), C_new: wp.array(dtype=mat33),
         origin: wp.array(dtype=wp.vec3i), dims: wp.vec3i, dx: scalar, inv_dx: scalar, dt: scalar,
         adj_x_new: wp.array(dtype=vec3), adj_v_new: wp.array(dtype=vec3), adj_C_new: wp.array(dtype=mat33),
         adj_A_new: wp.array(dtype=mat33),
-        adj_x: wp.array(dtype=vec3), adj_A: wp.array(dtype=mat33), adj_velocity: wp.array(dtype=vec3),
+        adj_x: wp.array(dtype=vec3), adj_A: wp.array(dtype=mat33), adj_velocity: wp.array(dtype=vec4),
     ):  # fmt: skip
         """Writes adj_x and adj_A, adds to adj_velocity."""
         p = wp.tid()
@@ -285,10 +290,10 @@ def transfer_kernels(scalar) -> SimpleNamespace:
                 wij = wx[i] * wy[j]
                 flat = scalar(0.0)
                 for k in range(3):
-                    u = velocity[row + k]
+                    u = load3(velocity, row + k)
                     r = rij + steps[k] * rz
                     w = wij * wz[k]
-                    wp.atomic_add(adj_velocity, row + k, w * r)
+                    add3(adj_velocity, row + k, w * r)
                     e = wp.dot(u, r)
                     flat = flat + wz[k] * e
                     gz = gz + wij * sz[k] * e
@@ -345,7 +350,7 @@ def transfer_kernels(scalar) -> SimpleNamespace:
                 flat = scalar(0.0)
                 line = zero
                 for k in range(3):
-                    g = adj_grid[row + k]
+                    g = load4(adj_grid, row + k)
                     a = vec3(g[0], g[1], g[2])
                     e = wp.dot(qij + steps[k] * bz, a) + m * g[3]
                     flat = flat + wz[k] * e

@@ -22,18 +22,22 @@ from mosa.physics.chain import Chain, advance_chain, grouped
 from mosa.physics.collider_motion import Motion, Trajectory, sample_frame, sample_poses
 from mosa.physics.colliders import Collider, pack_colliders, reach
 from mosa.physics.laws import SLOTS, law_named
-from mosa.physics.mpm import SegmentSolver, advance_segment, first_advance, material_state
+from mosa.physics.mpm import LONGEST, SegmentSolver, advance_segment, substep_bytes, wants_gradient
+from mosa.physics.particle_operations import first_advance, material_state
 from mosa.physics.plasticity import yield_factor
 from mosa.physics.workspace import SCALARS, Numerics, Steps
 from mosa.types import Ground, ParticleState, Rollout
 
 SEGMENT = 32
-"""Most substeps in a segment when no adapter cuts it, and in a chain: what the backward pass stores at once."""
+"""Most substeps in a segment when no adapter cuts it, and in a chain: what the backward pass stores at once. On CUDA a segment of
+which no gradient is wanted has up to `mpm.LONGEST`."""
 
 MEMORY_SHARE = 0.1
 """Of a GPU's free memory, for what the backward pass of a chain stores."""
 KEPT_SHARE = 0.25
 """Of a GPU's free memory, for the states of all substeps of a rollout, where that is enough for them."""
+KEPT_ON_CPU = 2**29
+"""Bytes, for the same on a CPU: 4000 particles over 800 substeps."""
 MAX_CHAINS = 8
 
 _UNBOUNDED = 1e30
@@ -134,6 +138,7 @@ class Simulator:
             colliders=packed_colliders,
         )  # fmt: skip
         self._workspaces: dict = {}
+        self._long = self.device.type == "cuda"  # a CPU gains nothing
         self.chained = self.device.type == "cuda" if chained is None else chained
         self._chains: dict[tuple, Chain] = {}
 
@@ -152,7 +157,10 @@ class Simulator:
             if name == self.law.reference:
                 columns.append(rotation.detach().reshape(particles, 9))
                 continue
-            value = torch.as_tensor(parameters[name], dtype=self.dtype, device=self.device)
+            value = parameters[name]
+            if isinstance(value, int | float):
+                value = torch.full((), value, dtype=self.dtype, device=self.device)  # a copy from the host would wait for CUDA
+            value = torch.as_tensor(value, dtype=self.dtype, device=self.device)
             if name == "yield_stress" and "von_mises" in self.law.name.split("+"):
                 value = value * self.yield_factor  # the other laws that yield have their radius fixed
             try:
@@ -203,15 +211,15 @@ class Simulator:
             raise ConfigError(f"frames and stride: expected at least 1, found {frames} and {stride}")
         n = len(state.x)
         self._check(state, volume)
-        density = self._density(density, volume)
+        volume = volume.detach().contiguous()
+        density, mean_mass = self._density(density, volume)
         C = state.C_affine if started or self.init_affine == "spin" else torch.zeros_like(state.C_affine)
         F, F_tot = state.F, state.F_tot if self.law.plastic else state.F
         rotation = _polar(F) if self.law.reference is not None else None
         packed = self.pack(parameters, n, rotation)
-        volume = volume.detach().contiguous()
         cutoff = self.mass_cutoff
         if cutoff is None:
-            cutoff = 0.0 if self.dtype == torch.float64 else 1e-12 * float((density * volume).mean())
+            cutoff = 0.0 if self.dtype == torch.float64 else 1e-12 * mean_mass
         solver = SegmentSolver(self.numerics, volume, density, cutoff, self._workspaces)
         held = {"parameters": packed, "G": None, "h": None, "plastic_G": None, "plastic_h": None}
         recorded = {"x": [state.x], "v": [state.v], "F": [F], "F_tot": [F_tot]}
@@ -245,6 +253,10 @@ class Simulator:
         current = (state.x, state.v, C, F, F_tot)
         poses = () if variable else self._poses(motions, frames, start_time)
         reactions = []
+        wanted = wants_gradient((*current, *held.values(), *poses))
+        if not chained and (wanted or (adapter is not None and torch.is_grad_enabled())):
+            solver.room = self._room()
+        most_alone = LONGEST if self._long and not variable and not wanted else SEGMENT
         for frame in range(1, frames):
             if frame > 1:
                 taken.append(substeps_of(frame, current[1], current[2], current[3]))
@@ -256,7 +268,7 @@ class Simulator:
                 lengths = _segments(count, SEGMENT if adapter is None else stride)  # sizes that many counts share
             else:
                 steps, along = None, tuple(part[first : first + count] for part in poses)
-                lengths = _segments(count, None if adapter is None else stride)
+                lengths = _segments(count, None if adapter is None else stride, most_alone)
             if chained:
                 forces = None
                 for group in grouped(lengths, most):
@@ -279,7 +291,7 @@ class Simulator:
         stacked = {name: torch.stack(values) for name, values in recorded.items() if name != "F_tot"}
         stacked["F_tot"] = torch.stack(recorded["F_tot"]) if self.law.plastic else stacked["F"]
         times = self.frame_dt * torch.arange(frames, dtype=self.dtype, device=self.device)
-        inverted = int((torch.linalg.det(stacked["F"].detach()) <= 0).sum())
+        inverted = int((_determinant(stacked["F"].detach()) <= 0).sum())
         if inverted and self.on_inversion == "warn":
             warnings.warn(f"{inverted} particle states with det F <= 0 in {frames} frames", stacklevel=2)
         per_frame = torch.stack(reactions) if reactions else None
@@ -328,15 +340,20 @@ class Simulator:
         return MaterialState(*material_state(self.law, F, C_affine, self.pack(parameters, len(F), rotation)))
 
     def _chain_memory(self, particles: int, frames: int) -> tuple[int, bool]:
-        """(most substeps of a chain, whether to keep the states of all), by memory: a substep has 33 numbers a particle (42 where
-        the law yields) and 7 a node, of which there is about one a particle."""
+        """(most substeps of a chain, whether to keep the states of all), by memory."""
         if self.device.type != "cuda":
             return SEGMENT, True
-        free = torch.cuda.mem_get_info(self.device)[0]
-        free += torch.cuda.memory_reserved(self.device) - torch.cuda.memory_allocated(self.device)
-        each = particles * (49 if self.law.plastic else 40) * torch.finfo(self.dtype).bits // 8
+        free, each = self._free_memory(), substep_bytes(self.numerics, particles)
         most = max(1, min(SEGMENT, int(MEMORY_SHARE * free / each)))
         return most, (frames - 1) * self.substeps * each < KEPT_SHARE * free
+
+    def _room(self) -> float:
+        """Bytes that a rollout may keep between the passes."""
+        return KEPT_SHARE * self._free_memory() if self.device.type == "cuda" else KEPT_ON_CPU
+
+    def _free_memory(self) -> int:
+        free = torch.cuda.mem_get_info(self.device)[0]
+        return free + torch.cuda.memory_reserved(self.device) - torch.cuda.memory_allocated(self.device)
 
     def _chain(
         self, adapter: nn.Module, lengths: tuple[int, ...], state: tuple[Tensor, ...], packed: Tensor, collects: bool
@@ -383,28 +400,34 @@ class Simulator:
                     f"{name}: expected shape {shape} of {self.dtype} on {self.device}, found {tuple(value.shape)} of "
                     f"{value.dtype} on {value.device}"
                 )
-        if not bool((volume > 0).all()):
-            raise ConfigError("volume: expected positive numbers [m^3] for all particles")
 
-    def _density(self, density: float | Tensor, volume: Tensor) -> float | Tensor:
-        """A number stays one: arithmetic, and so every bit, is that of a body of one material."""
+    def _density(self, density: float | Tensor, volume: Tensor) -> tuple[float | Tensor, float]:
+        """(density, mean mass of a particle [kg]), also checks the volumes: one look at the host for all.
+
+        A number stays one: arithmetic, and so every bit, is that of a body of one material."""
         if not isinstance(density, Tensor) or density.ndim == 0:
             density = float(density)
             if not (math.isfinite(density) and density > 0):
                 raise ConfigError(f"density: expected a positive number [kg/m^3], found {density}")
-            return density
-        if density.shape != volume.shape:
-            raise ConfigError(f"density: expected a number or shape {tuple(volume.shape)}, found {tuple(density.shape)}")
-        density = density.detach().to(volume)
-        if not bool((torch.isfinite(density) & (density > 0)).all()):
+            valid = torch.ones((), dtype=torch.bool, device=volume.device)
+        else:
+            if density.shape != volume.shape:
+                raise ConfigError(f"density: expected a number or shape {tuple(volume.shape)}, found {tuple(density.shape)}")
+            density = density.detach().to(volume)
+            valid = (torch.isfinite(density) & (density > 0)).all()
+        numbers = [(volume > 0).all(), valid, (density * volume).mean()]
+        volumes, densities, mass = torch.stack([n.double() for n in numbers]).tolist()
+        if not volumes:
+            raise ConfigError("volume: expected positive numbers [m^3] for all particles")
+        if not densities:
             raise ConfigError("density: expected positive numbers [kg/m^3] for all particles")
-        return density
+        return density, mass
 
 
-def _segments(substeps: int, stride: int | None) -> list[int]:
-    """Lengths of a frame's segments: `stride` each (the last may be shorter), or nearly equal ones of at most SEGMENT."""
+def _segments(substeps: int, stride: int | None, most: int = 0) -> list[int]:
+    """Lengths of a frame's segments: `stride` each (the last may be shorter), or nearly equal ones of at most `most`."""
     if stride is None:
-        count = -(-substeps // SEGMENT)
+        count = -(-substeps // most)
         return [substeps // count + (i < substeps % count) for i in range(count)]
     return [min(stride, substeps - i) for i in range(0, substeps, stride)]
 
@@ -413,6 +436,11 @@ def _mean_force(forces: Tensor, steps: Steps) -> Tensor:
     """(1, K, 6) of (S, K, 6): the impulse over the time in which it acted, the first substep's being its kick."""
     longer = steps.kick / steps.dt - 1
     return (longer * forces[:1] + forces.sum(0, keepdim=True)) / (len(forces) + longer)
+
+
+def _determinant(F: Tensor) -> Tensor:
+    """Of (..., 3, 3), as a triple product: a factorisation of each matrix takes CUDA longer than a substep."""
+    return (F[..., 0, :] * torch.linalg.cross(F[..., 1, :], F[..., 2, :])).sum(-1)
 
 
 def _polar(F: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ Everything is allocated once per (particles, slots, grid window); nothing alloca
 launches of a segment are captured as one graph the second time they are asked for with the same time step.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -56,6 +57,24 @@ class Steps(NamedTuple):
 
 MAX_GRAPHS = 64
 """Captured graphs a workspace keeps: one per pass and time step."""
+BLOCK = 64
+"""Threads of a CUDA block: small ones, so that ten thousand particles are spread over all multiprocessors."""
+
+
+def launch(kernel, dim: int, inputs: list, device, adj_inputs: list | None = None) -> None:
+    """On Warp's current stream. adj_inputs: launch the adjoint."""
+    block = BLOCK if device.is_cuda else None
+    if adj_inputs is None:
+        wp.launch(kernel, dim, inputs=inputs, device=device, block_dim=block)
+    else:
+        wp.launch(kernel, dim, inputs=inputs, adj_inputs=adj_inputs, adjoint=True, device=device, block_dim=block)
+
+
+def copies(tensors: Sequence[Tensor]) -> list[Tensor]:
+    """Contiguous copies, in one launch on CUDA."""
+    made = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in tensors]
+    torch._foreach_copy_(made, list(tensors))
+    return made
 
 
 class Workspace:
@@ -133,19 +152,20 @@ class Workspace:
 
     def set_window(self, origin: tuple[int, int, int], dims: tuple[int, int, int]) -> None:
         """Place the grid: lowest node and number of nodes per axis. Reallocates (and forgets graphs) when dims change."""
-        self.lowest = origin
-        self.origin.copy_(torch.tensor([origin], dtype=torch.int32))
+        if origin != self.lowest:
+            self.lowest = origin
+            self.origin.copy_(torch.tensor([origin], dtype=torch.int32), non_blocking=True)  # CUDA stages it before it returns
         if dims == self.dims:
             return
         self.dims, nodes = dims, dims[0] * dims[1] * dims[2]
         grids = self.substeps if self.with_adjoint else 1
         self.grid, self.grid_wp = self._per_slot(grids, (nodes, 4), self.kernels.vec4)
-        self.velocity, self.velocity_wp = self._per_slot(grids, (nodes, 3), self.kernels.vec3)
+        self.velocity, self.velocity_wp = self._per_slot(grids, (nodes, 4), self.kernels.vec4)
         if self.colliders is not None:
             self.colliders.set_nodes(nodes)
         if self.with_adjoint:
             self.adj_grid, self.adj_grid_wp = self._array((nodes, 4), self.kernels.vec4)
-            self.adj_velocity, self.adj_velocity_wp = self._array((nodes, 3), self.kernels.vec3)
+            self.adj_velocity, self.adj_velocity_wp = self._array((nodes, 4), self.kernels.vec4)
         self._graphs.clear()
 
     def load(
@@ -158,22 +178,18 @@ class Workspace:
         self.steps = steps or Steps(self.numerics.dt, self.numerics.dt)
         if self.colliders is not None:
             self.colliders.load(poses)
-        for slots, value in zip((self.x, self.v, self.C, self.F), state[:4], strict=True):
-            slots[0].copy_(value)
-        if self.plastic:
-            self.A[0].copy_(state[4])
+        slots = (self.x, self.v, self.C, self.F) + ((self.A,) if self.plastic else ())
+        targets = [*(slot[0] for slot in slots), self.volume, self.mass]
+        torch._foreach_copy_(targets, [*state[: len(slots)], volume, mass])
         self.hold(held)
-        self.volume.copy_(volume)
-        self.mass.copy_(mass)
         if cutoff != self.cutoff:
             self.cutoff = cutoff
             self._graphs.clear()
 
     def hold(self, held: dict[str, Tensor | None]) -> None:
         """Copy parameters and the adapter's operator in, those that are given."""
-        for name, value in held.items():
-            if value is not None:
-                self.held[name].copy_(value)
+        given = {name: value for name, value in held.items() if value is not None}
+        torch._foreach_copy_([self.held[name] for name in given], list(given.values()))
 
     def point(self, held: dict[str, Tensor | None]) -> None:
         """As `hold`, without a copy: the next launches read these tensors. The caller keeps them."""
@@ -184,10 +200,8 @@ class Workspace:
     def final(self) -> tuple[Tensor, ...]:
         """Copies of (x, v, C_affine, F, F_tot) after the segment; F_tot is F itself where the law does not yield."""
         last = self.substeps % len(self.x)
-        F = self.F[last].clone()
-        return (
-            self.x[last].clone(), self.v[last].clone(), self.C[last].clone(), F, self.A[last].clone() if self.plastic else F
-        )  # fmt: skip
+        found = copies([part[last] for part in (self.x, self.v, self.C, self.F, *((self.A,) if self.plastic else ()))])
+        return tuple(found) if self.plastic else (*found, found[3])
 
     def advance(self) -> None:
         """All substeps of the segment; events are left in `flags` for the caller to read."""
@@ -220,11 +234,7 @@ class Workspace:
             wp.capture_launch(graph, stream=stream)
 
     def _run(self, kernel, dim: int, inputs: list, adj_inputs: list | None = None) -> None:
-        device = self.origin_wp.device
-        if adj_inputs is None:
-            wp.launch(kernel, dim, inputs=inputs, device=device)
-        else:
-            wp.launch(kernel, dim, inputs=inputs, adj_inputs=adj_inputs, adjoint=True, device=device)
+        launch(kernel, dim, inputs, self.origin_wp.device, adj_inputs)
 
     def _geometry(self, dt: float) -> list:
         return [self.origin_wp, wp.vec3i(*self.dims), self.numerics.dx, 1.0 / self.numerics.dx, dt]

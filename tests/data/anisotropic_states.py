@@ -2,7 +2,7 @@
 
 import torch
 
-from mosa.physics.mpm import first_advance
+from mosa.physics.particle_operations import first_advance
 from mosa.physics.reference import polar, unvech
 from mosa.physics.rollout import Simulator
 

@@ -56,27 +56,33 @@ def arguments(colliders, mass, poses):
     ]  # fmt: skip
 
 
+def padded(u):
+    """Node vectors (n, 3) as the kernels have them, with an unused fourth number."""
+    return torch.cat([u, torch.full_like(u[:, :1], torch.nan)], 1)
+
+
 def forward(colliders, u, mass, poses):
     """(velocity, force, torque) of the kernel."""
-    velocity = u.clone()
+    velocity = padded(u)
     force, torque = (torch.zeros(3, len(colliders), 3).double() for _ in range(2))
-    inputs = [*arguments(colliders, mass, poses), *(wp.from_torch(t, dtype=VEC3) for t in (velocity, force, torque))]
+    inputs = [*arguments(colliders, mass, poses), wp.from_torch(velocity, dtype=VEC4),
+              *(wp.from_torch(t, dtype=VEC3) for t in (force, torque))]  # fmt: skip
     wp.launch(KERNELS.collide_nodes, COUNT, inputs=inputs, device="cpu")
     assert float(force[:2].abs().sum() + torque[:2].abs().sum()) == 0
-    return velocity, force[2], torque[2]
+    return velocity[:, :3], force[2], torque[2]
 
 
 def backward(colliders, u, mass, poses, seeds):
     """Gradients in (u, mass, position, rotation, linear, angular) of the kernel."""
-    a = seeds[0].clone()
+    a = padded(seeds[0])
     adj_force, adj_torque = (torch.stack([torch.full_like(s, 3.0)] * 2 + [s]).contiguous() for s in seeds[1:])
     adj_mass = torch.zeros(COUNT).double()
     adj_poses = [torch.zeros(3, *p.shape).double() for p in poses]
-    kinds = [VEC3] * 4 + [wp.float64, VEC3, MAT33, VEC3, VEC3]
-    arrays = [u.clone(), adj_force, adj_torque, a, adj_mass, *adj_poses]
+    kinds = [VEC4, VEC3, VEC3, VEC4, wp.float64, VEC3, MAT33, VEC3, VEC3]
+    arrays = [padded(u), adj_force, adj_torque, a, adj_mass, *adj_poses]
     inputs = [*arguments(colliders, mass, poses), *(wp.from_torch(t, dtype=kind) for t, kind in zip(arrays, kinds))]
     wp.launch(KERNELS.adj_collide_nodes, COUNT, inputs=inputs, device="cpu")
-    return [a, adj_mass, *(p[2] for p in adj_poses)]
+    return [a[:, :3], adj_mass, *(p[2] for p in adj_poses)]
 
 
 CASES = [(name, mode, friction, thickness)

@@ -1,10 +1,12 @@
-"""CUDA against CPU: one substep in float64, 100 in float32, gradients and graph replays."""
+"""CUDA against CPU: one substep in float64, 100 in float32, gradients and graph replays; long segments, and looks at the host."""
 
+import warnings
 from dataclasses import replace
 
 import pytest
 import torch
 
+from mosa.physics import rollout as rollout_module
 from mosa.physics.rollout import AdapterOperator, Simulator
 from mosa.types import Ground, ParticleState
 
@@ -39,4 +41,65 @@ def test_cuda_against_cpu(law, dtype, substeps, frames, tolerance, adapted, make
     state = make_block(n=6)
     results = [run(state, law, device, dtype, substeps, frames, adapted) for device in ("cuda", "cpu")]
     for found, expected in zip(*results):
+        assert (found - expected).abs().max() <= tolerance * max(1.0, float(expected.abs().max()))
+
+
+def simulator(device, dtype, substeps, **options):
+    options = {"ground": Ground(0.0), **options}
+    return Simulator("corotated", dx=0.04, substeps=substeps, frame_dt=4e-4 * substeps, dtype=dtype, device=device, **options)
+
+
+def on(device, dtype, state):
+    names = ("x", "v", "C_affine", "F", "F_tot")
+    state = ParticleState(*(getattr(state, name).to(device=device, dtype=dtype) for name in names))
+    return state, torch.full((len(state.x),), 8e-6, device=device, dtype=dtype)
+
+
+@pytest.mark.parametrize("dtype, substeps, tolerance", [(torch.float64, 40, 1e-9), (torch.float32, 40, 1e-4)])
+@pytest.mark.parametrize("kept", [True, False])
+def test_gradients_with_states_kept_and_run_again(dtype, substeps, tolerance, kept, make_block, monkeypatch):
+    """An operator that is asked for once, as the default adapter is; three times: passes run eagerly, captured, replayed."""
+    monkeypatch.setattr(rollout_module, "KEPT_SHARE", 0.25 if kept else 0.0)
+    monkeypatch.setattr(rollout_module, "KEPT_ON_CPU", 0)
+    results = {}
+    for device in ("cuda", "cpu"):
+        state, volume = on(device, dtype, make_block(n=6))
+        sim, n = simulator(device, dtype, substeps), len(volume)
+        leaf = torch.zeros(6, 6, device=device, dtype=dtype, requires_grad=True)
+        for _ in range(3 if device == "cuda" else 1):
+
+            def adapter(_, leaf=leaf, n=n):
+                return AdapterOperator(leaf.expand(n, 6, 6), leaf[0].expand(n, 6))
+
+            rollout = sim.rollout(state, {"mu": 4e4, "lam": 5e4}, volume, 1000.0, 4, adapter=adapter, stride=None)
+            (gradient,) = torch.autograd.grad((rollout.x**2).sum(), leaf)
+            results.setdefault(device, []).append([t.detach().cpu().double() for t in (rollout.x, rollout.F, gradient)])
+    (expected,) = results["cpu"]
+    for found in results["cuda"]:
+        for a, b in zip(found, expected):
+            assert (a - b).abs().max() <= tolerance * max(1.0, float(b.abs().max()))
+
+
+@pytest.mark.parametrize("dtype, tolerance", [(torch.float64, 1e-9), (torch.float32, 1e-4)])
+def test_long_segments_without_gradients(dtype, tolerance, make_block):
+    """70 substeps in one, and what they cost in looks at the host: two for the arguments, one a frame, one at the end."""
+    frames, results = 8, {}
+    for device in ("cuda", "cpu"):
+        state, volume = on(device, dtype, make_block(n=6))
+        sim = simulator(device, dtype, 70)
+        for _ in range(3 if device == "cuda" else 1):
+            results[device] = sim.rollout(state, {"mu": 4e4, "lam": 5e4}, volume, 1000.0, frames)
+        if device == "cuda":
+            assert {key[1] for key in sim._workspaces} == {70}
+            torch.cuda.set_sync_debug_mode("warn")
+            try:
+                with warnings.catch_warnings(record=True) as caught:
+                    warnings.simplefilter("always")
+                    sim.rollout(state, {"mu": 4e4, "lam": 5e4}, volume, 1000.0, frames)
+            finally:
+                torch.cuda.set_sync_debug_mode("default")
+            looks = [str(w.message) for w in caught if "synchroniz" in str(w.message)]
+            assert 0 < len(looks) <= 2 + (frames - 1) + 1, (len(looks), looks[:3])
+    for name in ("x", "v", "F"):
+        found, expected = getattr(results["cuda"], name).cpu().double(), getattr(results["cpu"], name).double()
         assert (found - expected).abs().max() <= tolerance * max(1.0, float(expected.abs().max()))

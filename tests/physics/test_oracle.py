@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mosa.physics.boundary import Plane
-from mosa.physics.mpm import first_advance
+from mosa.physics.particle_operations import first_advance
 from mosa.physics.reference import unvech
 from mosa.physics.rollout import Simulator
 from mosa.types import Ground, ParticleState

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError
-from mosa.physics.mpm import first_advance
+from mosa.physics.particle_operations import first_advance
 from mosa.physics.plasticity import friction_alpha
 from mosa.physics.rollout import Simulator
 

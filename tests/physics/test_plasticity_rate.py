@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from mosa.physics.mpm import first_advance
+from mosa.physics.particle_operations import first_advance
 from mosa.physics.reference import deviator, hencky_material
 from mosa.physics.rollout import Simulator
 

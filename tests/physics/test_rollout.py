@@ -1,6 +1,8 @@
 """Rollouts: gradient over 200 substeps in what every frame holds, recomputation, invariances, precision, errors."""
 
+import gc
 import warnings
+import weakref
 from dataclasses import replace
 
 import pytest
@@ -8,8 +10,9 @@ import torch
 
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.physics.elasticity import lame
-from mosa.physics.mpm import grid_window
+from mosa.physics.mpm import SegmentSolver, grid_window, substep_bytes
 from mosa.physics.rollout import AdapterOperator, MaterialState, Simulator
+from mosa.physics.workspace import Workspace
 from mosa.types import Ground, ParticleState
 
 DX, DENSITY, SPACING = 0.04, 1000.0, 0.02
@@ -106,17 +109,23 @@ def test_gradient_against_differences(law, substeps, tolerance, make_block):
 
 @pytest.mark.parametrize("law", ["corotated", "von_mises"])
 def test_segments_recomputed_give_the_gradient_of_one_segment(law, make_block, monkeypatch):
-    """The cut into segments changes neither values nor gradients, bit for bit."""
-    results = []
-    for length in (32, 7, 1):
+    """The cut into segments changes neither values nor gradients, bit for bit, whether states are kept or made again."""
+    results, state = [], make_block()
+    each = substep_bytes(simulator(law).numerics, len(state.x))
+    run_again, advance = [], Workspace.advance
+    monkeypatch.setattr(Workspace, "advance", lambda work: (run_again.append(work.with_adjoint), advance(work)))
+    for length, kept, expected in ((32, 0, 2), (32, 100, 0), (7, 20, 5), (7, 0, 8), (1, 100, 0)):
         monkeypatch.setattr("mosa.physics.rollout.SEGMENT", length)
+        monkeypatch.setattr("mosa.physics.rollout.KEPT_ON_CPU", kept * each)
         state = make_block()
         leaves = [t.clone().requires_grad_() for t in (state.x, state.v, state.C_affine, state.F)]
         mu = torch.full((len(state.x),), 4e4).double().requires_grad_()
         rollout = simulator(law).rollout(ParticleState(*leaves, leaves[3]), {"mu": mu, "lam": 5e4, **stationary(law)},
                                          volume_of(state), DENSITY, 3)  # fmt: skip
         loss = (rollout.x[1:] ** 2).sum() + (rollout.F_tot**2).sum() + rollout.v[1].sum()
+        run_again.clear()
         results.append((rollout, torch.autograd.grad(loss, [*leaves, mu])))
+        assert len(run_again) == expected, (length, kept)
     for rollout, gradients in results[1:]:
         assert torch.equal(rollout.x, results[0][0].x) and torch.equal(rollout.F, results[0][0].F)
         for a, b in zip(gradients[:4], results[0][1][:4]):
@@ -262,9 +271,9 @@ def test_acceleration_within_a_segment_widens_the_window(make_block, monkeypatch
     state = replace(state, F=0.5 * state.F, C_affine=0 * state.C_affine)
     results, margins = [], []
 
-    def spy(*arguments):
-        margins.append(arguments[-1])
-        return grid_window(*arguments)
+    def spy(*arguments, **more):
+        margins.append(arguments[4])
+        return grid_window(*arguments, **more)
 
     monkeypatch.setattr("mosa.physics.mpm.grid_window", spy)
     for stride in (32, 1):
@@ -356,3 +365,25 @@ class TestErrors:
             simulator().rollout(state, self.PARAMETERS, volume_of(state), DENSITY, 2, adapter=lambda _: operator)
         with pytest.raises(ConfigError, match="volume"):
             simulator().rollout(state, self.PARAMETERS, 0 * volume_of(state), DENSITY, 2)
+
+
+def test_a_rollout_that_is_dropped_frees_what_it_kept(make_block, monkeypatch):
+    """Without the garbage collector: states of all substeps are too much to wait for it."""
+    solvers, state = [], make_block()
+
+    def remembered(*arguments):
+        solver = SegmentSolver(*arguments)
+        solvers.append(weakref.ref(solver))
+        return solver
+
+    monkeypatch.setattr("mosa.physics.rollout.SegmentSolver", remembered)
+    mu = torch.full((), 4e4).double().requires_grad_()
+    gc.collect()
+    gc.disable()
+    try:
+        rollout = simulator().rollout(state, {"mu": mu, "lam": 5e4}, volume_of(state), DENSITY, 3)
+        assert solvers[0]() is not None and rollout.x.requires_grad
+        del rollout
+        assert solvers[0]() is None
+    finally:
+        gc.enable()

@@ -14,7 +14,7 @@ from mosa.errors import ConfigError
 from mosa.modules.adapter import StressAdapter
 from mosa.physics import reference
 from mosa.physics.laws import law_named
-from mosa.physics.mpm import first_advance
+from mosa.physics.particle_operations import first_advance
 from mosa.physics.rollout import Simulator
 from mosa.types import Ground, ParticleState
 
