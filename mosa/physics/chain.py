@@ -4,7 +4,8 @@ An adapter of the state is asked every few substeps. Done one by one, each answe
 the host, which take longer than the arithmetic of 100 000 particles. A chain of K segments looks at the host once. Its backward
 pass goes back through the states of all substeps: the adapter is asked again at the start of a segment, this time with a graph,
 and what the segment's adjoint leaves on its answer goes through that graph to the state and to the adapter's weights. Between the
-passes all states are kept where there is memory for them (`kept`), else only the chain's start, from which they are made again.
+passes all states are kept where there is memory for them (`kept`), else only the chain's start, from which they are made again,
+and the graphs of the chain's evaluations with them.
 """
 
 from __future__ import annotations
@@ -13,21 +14,39 @@ import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import accumulate, pairwise
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
 from mosa.physics.activations import at_hand
-from mosa.physics.mpm import SegmentSolver, grid_window, warp_stream
+from mosa.physics.memory import free_memory, room
+from mosa.physics.mpm import SegmentSolver, substep_bytes, wants_gradient, warp_stream
 from mosa.physics.mpm_kernels import NO_EVENT
-from mosa.physics.workspace import Numerics, Workspace
+from mosa.physics.window import grid_window
+from mosa.physics.workspace import Numerics, Workspace, copies
 
 ANSWER = ("G", "h", "plastic_G", "plastic_h")
 COARSE = 8
 """Node counts of a chain's window are multiples of this: each change of them costs a new capture."""
+SEGMENT = 32
+"""Most substeps of a chain: what the backward pass stores at once."""
+WITHOUT_GRADIENT = 96
+"""The same where no gradient is wanted."""
+CHAIN_SHARE = 0.05
+"""Of a GPU's free memory, for what the backward pass of a chain stores."""
+MAX_CHAINS = 8
 ATTEMPTS = 3
 """Captures that may fail before a chain gives up: libraries that set themselves up when they are first captured spoil one."""
+
+
+class _Evaluation(NamedTuple):
+    """leaves: F, C, parameters and weights as the graph's ends, [] without a graph."""
+
+    leaves: list[Tensor]
+    answer: dict[str, Tensor | None]
+    statistics: tuple[Tensor, ...]
 
 
 class Chain:
@@ -71,17 +90,17 @@ class Chain:
         dx, dt, total = self.numerics.dx, self.numerics.dt, self.substeps
         work = self._full() if kept else self.light
         for margin in (4, 3 + total // 2):
-            origin, dims = grid_window(state[0], state[1], dx, 2 * total * dt, margin)
+            origin, dims = grid_window(state[0], state[1], dx, 2 * total * dt, margin, bounds=solver.bounds(state))
             self.dims = tuple(max(-(-a // COARSE) * COARSE, b) for a, b in zip(dims, self.dims))
             self._check_graphs(solver)
             work.set_window(origin, self.dims)
             work.load(state, {"parameters": packed}, solver.volume, solver.mass, solver.cutoff)
             self._capture(solver.cutoff)
             self._play(("forward", kept))
-            flags = work.flags.tolist()
+            final = work.final()
+            flags = solver.look(work.flags, final)
             if not solver.left_window(flags, first, dt):
-                statistics = tuple(t.clone() for t in self.statistics)
-                return work.final(), statistics, origin, [t.clone() for t in work.tape()] if kept else []
+                return final, tuple(copies(self.statistics)), origin, copies(work.tape()) if kept else []
         raise solver.left_behind(flags, first, dt)
 
     def adjoint(
@@ -96,16 +115,17 @@ class Chain:
         if tape and tape[-1].shape != work.tape()[-1].shape:
             tape = ()  # the window has grown since
         work.load(state, {"parameters": packed}, solver.volume, solver.mass, solver.cutoff)
-        for target, value in zip(work.tape(), tape):
-            target.copy_(value)
+        if tape:
+            torch._foreach_copy_(work.tape(), list(tape))
         slot = self.substeps % 2
         targets = self._targets(slot) + list(self.statistics_seeds)
         for target, seed in zip(targets, seeds, strict=True):
             target.zero_() if seed is None else target.copy_(seed)
         penalised = any(seed is not None for seed in seeds[len(self._targets(slot)) :])
         self._play(("adjoint", bool(tape), penalised))
-        found = [t.clone() for t in self._targets(0)]
-        return found, self.adj_packed.clone(), [t.clone() for t in self.adj_weights]
+        found = copies([*self._targets(0), self.adj_packed, *self.adj_weights])
+        states = len(self._targets(0))
+        return found[:states], found[states], found[states + 1 :]
 
     def named(self, statistics: Sequence[Tensor]) -> list:
         """One named tuple per evaluation, of tensors (K, ...)."""
@@ -146,38 +166,52 @@ class Chain:
         self._kind = type(statistics)
         return answer, tuple(statistics)
 
-    def _advance_all(self, work: Workspace, collects: bool) -> list[tuple[Tensor, ...]]:
-        """Launches all segments; statistics of the evaluations."""
+    def _evaluate(self, step: int, collects: bool) -> _Evaluation:
+        """The adapter's answer to the state in slot `step`, with a graph."""
+        work = self.full
+        with torch.enable_grad(), at_hand():
+            inputs = (work.F[step], work.C[step], work.held["parameters"], *self.weights)
+            # aliases: autograd ties a leaf to the stream it was first used on, which a capture on another one may not touch
+            leaves = [t.detach().requires_grad_() for t in inputs]
+            return _Evaluation(leaves, *self._ask(*leaves[:3], collects, leaves[3:]))
+
+    def _advance(self, work: Workspace, step: int, length: int, answer: dict[str, Tensor | None]) -> None:
+        """Launches a segment with the operator in `answer`."""
+        work.point({name: None if t is None else t.detach() for name, t in answer.items()})
+        with warp_stream(self.numerics.device):
+            work.advance_steps(step, length)
+
+    def _forward(self, kept: bool) -> None:
+        work = self._full() if kept else self.light
         work.flags.fill_(NO_EVENT)
         step, collected = 0, []
         with torch.no_grad():
             for length in self.lengths:
                 slot = step % len(work.x)
-                answer, statistics = self._ask(work.F[slot], work.C[slot], work.held["parameters"], collects)
+                answer, statistics = self._ask(work.F[slot], work.C[slot], work.held["parameters"], self.collects)
                 collected.append(statistics)
-                work.point(answer)
-                with warp_stream(self.numerics.device):
-                    work.advance_steps(step, length)
+                self._advance(work, step, length, answer)
                 step += length
-        return collected
-
-    def _forward(self, kept: bool) -> None:
-        collected = self._advance_all(self._full() if kept else self.light, self.collects)
         self.statistics = tuple(torch.stack(parts) for parts in zip(*collected))
+
+    def _advance_with_graphs(self, penalised: bool) -> list[_Evaluation]:
+        """Launches all segments again."""
+        self.full.flags.fill_(NO_EVENT)
+        step, made = 0, []
+        for length in self.lengths:
+            made.append(self._evaluate(step, penalised))
+            self._advance(self.full, step, length, made[-1].answer)
+            step += length
+        return made
 
     def _adjoint(self, kept: bool, penalised: bool) -> None:
         work, step = self.full, self.substeps
-        if not kept:
-            self._advance_all(work, False)
+        made = [] if kept else self._advance_with_graphs(penalised)
         self.adj_packed.zero_()
         torch._foreach_zero_(self.adj_weights)
         for index in reversed(range(len(self.lengths))):
             step -= self.lengths[index]
-            with torch.enable_grad(), at_hand():
-                inputs = (work.F[step], work.C[step], work.held["parameters"], *self.weights)
-                # aliases: autograd ties a leaf to the stream it was first used on, which a capture on another one may not touch
-                leaves = [t.detach().requires_grad_() for t in inputs]
-                answer, statistics = self._ask(*leaves[:3], penalised, leaves[3:])
+            leaves, answer, statistics = made.pop() if made else self._evaluate(step, penalised)
             work.point({name: None if t is None else t.detach() for name, t in answer.items()})
             with warp_stream(self.numerics.device):
                 work.adjoint_steps(step, self.lengths[index])
@@ -230,6 +264,56 @@ class Chain:
                     warnings.warn(f"{name} cannot be captured as a CUDA graph and runs uncaptured: {error}", stacklevel=2)
                 return
             self._graphs[name] = graph
+
+
+class Chains:
+    """The chains of one simulator. ask: as `Chain`."""
+
+    def __init__(self, numerics: Numerics, ask: Callable[..., dict[str, Tensor | None]]) -> None:
+        self.numerics, self.ask = numerics, ask
+        self.chains: dict[tuple, Chain] = {}
+        self._probes: dict[tuple, tuple[nn.Module, bool, int]] = {}
+
+    def plan(self, adapter: nn.Module, state: tuple[Tensor, ...], packed: Tensor, substeps: int, stride: int) -> tuple[int, bool]:
+        """(most substeps of a chain, whether to keep the states of all `substeps` of a rollout), by memory."""
+        if self.numerics.device.type != "cuda":
+            return SEGMENT, True
+        if not wants_gradient((*state, packed, *adapter.parameters())):
+            return WITHOUT_GRADIENT, False
+        each = substep_bytes(self.numerics, len(packed))
+        kept = room(self.numerics.device, substeps * each) > 0
+        if not kept:  # the graphs of a chain's evaluations live as long as its states
+            each += self._probe(adapter, state, packed)[2] // stride
+        return max(1, min(SEGMENT, int(CHAIN_SHARE * free_memory(self.numerics.device) / each))), kept
+
+    def chain(
+        self, adapter: nn.Module, lengths: tuple[int, ...], state: tuple[Tensor, ...], packed: Tensor, collects: bool
+    ) -> Chain:
+        learned = tuple(p.requires_grad for p in adapter.parameters())
+        key = (id(adapter), len(packed), lengths, collects, learned)  # the chain holds the adapter: its id stays its own
+        if key not in self.chains:
+            if len(self.chains) >= MAX_CHAINS:
+                self.chains.clear()
+            self.chains[key] = Chain(
+                self.numerics, adapter, self.ask, len(packed), lengths, collects=collects,
+                plastic_adapted=self._probe(adapter, state, packed)[1],
+            )  # fmt: skip
+        return self.chains[key]
+
+    def _probe(self, adapter: nn.Module, state: tuple[Tensor, ...], packed: Tensor) -> tuple[nn.Module, bool, int]:
+        """(the adapter, whether it corrects the yield function, bytes that an evaluation's graph holds), from one evaluation."""
+        device = self.numerics.device
+        key = (id(adapter), len(packed))
+        if key not in self._probes:
+            if len(self._probes) >= MAX_CHAINS:
+                self._probes.clear()
+            held = torch.cuda.memory_allocated(device) if device.type == "cuda" else 0
+            with torch.enable_grad(), at_hand():
+                leaves = [t.detach().requires_grad_() for t in (state[3], state[2], packed)]
+                answer = self.ask(adapter, *leaves)
+            held = torch.cuda.memory_allocated(device) - held if device.type == "cuda" else 0
+            self._probes[key] = adapter, answer["plastic_G"] is not None, held
+        return self._probes[key]
 
 
 class _Chained(torch.autograd.Function):

@@ -120,7 +120,7 @@ class SegmentSolver:
     def _piece(self, state: tuple[Tensor, ...], left: int, most: int, dt: float) -> int:
         """How many of the `left` substeps the next window is to serve: at most `most`, and so few that it is not much larger than
         the window of `WIDENED` substeps."""
-        bounds, pieces = self._bounds(state), -(-left // most)
+        bounds, pieces = self.bounds(state), -(-left // most)
         if not all(math.isfinite(b) for b in bounds):
             return min(left, WIDENED)
         while (count := -(-left // pieces)) > WIDENED:
@@ -135,16 +135,20 @@ class SegmentSolver:
     ) -> tuple[tuple[tuple, tuple, tuple], list[int], Workspace]:
         """((state, reactions, window), flags, workspace), in a window for the speeds at the start and `margin` nodes more."""
         x, v = state[:2]
-        origin, dims = grid_window(x, v, self.numerics.dx, 2 * substeps * steps.dt, margin, bounds=self._bounds(state))
+        origin, dims = grid_window(x, v, self.numerics.dx, 2 * substeps * steps.dt, margin, bounds=self.bounds(state))
         self._dims = dims = self._kept(dims)
         work = self.prepare(state, held, poses, substeps, (origin, dims), with_adjoint=kept, steps=steps)
         work.advance()
         final = work.final()
-        # one transfer (float64 holds the flags exactly) tells the host also where the next segment starts
-        numbers = torch.cat([work.flags.double(), extent(*final[:2]).double()]).tolist()
-        self._know(final, numbers[4:])
+        flags = self.look(work.flags, final)
         reaction = () if work.colliders is None else tuple(copies(work.colliders.reaction))
-        return (final, reaction, (origin, dims)), [int(n) for n in numbers[:4]], work
+        return (final, reaction, (origin, dims)), flags, work
+
+    def look(self, flags: Tensor, final: tuple[Tensor, ...]) -> list[int]:
+        """The events of a segment; the same transfer tells the host where the next one starts."""
+        numbers = torch.cat([flags.double(), extent(*final[:2]).double()]).tolist()  # float64 holds the flags exactly
+        self._known = (*_identity(final), numbers[4:], final)  # with `final`, so that its memory is not another tensor's
+        return [int(n) for n in numbers[:4]]
 
     def takes_room(self, substeps: int) -> bool:
         """Whether the states of so many substeps may be kept; they have the room from then on."""
@@ -154,7 +158,8 @@ class SegmentSolver:
         self.room -= size
         return True
 
-    def _bounds(self, state: tuple[Tensor, ...]) -> list[float]:
+    def bounds(self, state: tuple[Tensor, ...]) -> list[float]:
+        """`extent` of x and v, without a transfer where `look` has told it."""
         if self._known is None or self._known[:2] != _identity(state):
             self._know(state, extent(*state[:2]).tolist())
         return self._known[2]

@@ -18,27 +18,16 @@ from torch import Tensor, nn
 from mosa.errors import ConfigError
 from mosa.physics.adaptive import StepChooser, StepControl, check_counts
 from mosa.physics.boundary import Plane, ground_plane, pack_planes
-from mosa.physics.chain import Chain, advance_chain, grouped
+from mosa.physics.chain import SEGMENT, Chains, advance_chain, grouped
 from mosa.physics.collider_motion import Motion, Trajectory, sample_frame, sample_poses
 from mosa.physics.colliders import Collider, pack_colliders, reach
 from mosa.physics.laws import SLOTS, law_named
+from mosa.physics.memory import room
 from mosa.physics.mpm import LONGEST, SegmentSolver, advance_segment, substep_bytes, wants_gradient
 from mosa.physics.particle_operations import first_advance, material_state
 from mosa.physics.plasticity import yield_factor
 from mosa.physics.workspace import SCALARS, Numerics, Steps
 from mosa.types import Ground, ParticleState, Rollout
-
-SEGMENT = 32
-"""Most substeps in a segment when no adapter cuts it, and in a chain: what the backward pass stores at once. On CUDA a segment of
-which no gradient is wanted has up to `mpm.LONGEST`."""
-
-MEMORY_SHARE = 0.1
-"""Of a GPU's free memory, for what the backward pass of a chain stores."""
-KEPT_SHARE = 0.25
-"""Of a GPU's free memory, for the states of all substeps of a rollout, where that is enough for them."""
-KEPT_ON_CPU = 2**29
-"""Bytes, for the same on a CPU: 4000 particles over 800 substeps."""
-MAX_CHAINS = 8
 
 _UNBOUNDED = 1e30
 
@@ -140,7 +129,7 @@ class Simulator:
         self._workspaces: dict = {}
         self._long = self.device.type == "cuda"  # a CPU gains nothing
         self.chained = self.device.type == "cuda" if chained is None else chained
-        self._chains: dict[tuple, Chain] = {}
+        self._chains = Chains(self.numerics, self._ask)
 
     def pack(self, parameters: dict[str, Tensor], particles: int, rotation: Tensor | None = None) -> Tensor:
         """(N, SLOTS) parameters in the law's order. Values: numbers, (N,), () or, for vectors of k numbers, (N, k) or (k,).
@@ -249,13 +238,14 @@ class Simulator:
             held.update(self._ask(adapter, F, C, packed, collect))
             adapter = None  # answered: nothing cuts the segments
         chained = self.chained and isinstance(adapter, nn.Module) and not variable and not self.colliders
-        most, kept = self._chain_memory(n, frames) if chained else (SEGMENT, False)
         current = (state.x, state.v, C, F, F_tot)
+        if chained:
+            most, kept = self._chains.plan(adapter, current, packed, (frames - 1) * self.substeps, stride)
         poses = () if variable else self._poses(motions, frames, start_time)
         reactions = []
         wanted = wants_gradient((*current, *held.values(), *poses))
         if not chained and (wanted or (adapter is not None and torch.is_grad_enabled())):
-            solver.room = self._room()
+            solver.room = room(self.device, (frames - 1) * self.substeps * substep_bytes(self.numerics, n))
         most_alone = LONGEST if self._long and not variable and not wanted else SEGMENT
         for frame in range(1, frames):
             if frame > 1:
@@ -272,15 +262,13 @@ class Simulator:
             if chained:
                 forces = None
                 for group in grouped(lengths, most):
-                    chain = self._chain(adapter, group, current, packed, collect is not None)
+                    chain = self._chains.chain(adapter, group, current, packed, collect is not None)
                     current, statistics = advance_chain(chain, solver, current, packed, first, kept)
                     first += sum(group)
                     for each in statistics:
                         collect(each)
             else:
-                current, forces = self._frame(
-                    solver, adapter, packed, current, held, lengths, first, along, steps, collect
-                )
+                current, forces = self._frame(solver, adapter, packed, current, held, lengths, first, along, steps, collect)
             lag = dt
             if forces is not None:
                 reactions.append(_mean_force(forces, steps) if variable else forces)
@@ -339,38 +327,6 @@ class Simulator:
         rotation = torch.eye(3, dtype=self.dtype, device=self.device).expand(len(F), 3, 3)
         return MaterialState(*material_state(self.law, F, C_affine, self.pack(parameters, len(F), rotation)))
 
-    def _chain_memory(self, particles: int, frames: int) -> tuple[int, bool]:
-        """(most substeps of a chain, whether to keep the states of all), by memory."""
-        if self.device.type != "cuda":
-            return SEGMENT, True
-        free, each = self._free_memory(), substep_bytes(self.numerics, particles)
-        most = max(1, min(SEGMENT, int(MEMORY_SHARE * free / each)))
-        return most, (frames - 1) * self.substeps * each < KEPT_SHARE * free
-
-    def _room(self) -> float:
-        """Bytes that a rollout may keep between the passes."""
-        return KEPT_SHARE * self._free_memory() if self.device.type == "cuda" else KEPT_ON_CPU
-
-    def _free_memory(self) -> int:
-        free = torch.cuda.mem_get_info(self.device)[0]
-        return free + torch.cuda.memory_reserved(self.device) - torch.cuda.memory_allocated(self.device)
-
-    def _chain(
-        self, adapter: nn.Module, lengths: tuple[int, ...], state: tuple[Tensor, ...], packed: Tensor, collects: bool
-    ) -> Chain:
-        learned = tuple(p.requires_grad for p in adapter.parameters())
-        key = (id(adapter), len(packed), lengths, collects, learned)  # the chain holds the adapter: its id stays its own
-        if key not in self._chains:
-            if len(self._chains) >= MAX_CHAINS:
-                self._chains.clear()
-            with torch.no_grad():
-                answer = self._ask(adapter, state[3].detach(), state[2].detach(), packed.detach())
-            self._chains[key] = Chain(
-                self.numerics, adapter, self._ask, len(packed), lengths, collects=collects,
-                plastic_adapted=answer["plastic_G"] is not None,
-            )  # fmt: skip
-        return self._chains[key]
-
     def _ask(
         self, adapter: Callable, F: Tensor, C: Tensor, packed: Tensor, collect: Callable | None = None
     ) -> dict[str, Tensor | None]:
@@ -383,8 +339,7 @@ class Simulator:
             shape = (n, 6, 6) if name.endswith("G") else (n, 6)
             if value is not None and (tuple(value.shape) != shape or value.dtype != self.dtype):
                 raise ConfigError(
-                    f"adapter output {name}: expected shape {shape} of {self.dtype}, found {tuple(value.shape)} of "
-                    f"{value.dtype}"
+                    f"adapter output {name}: expected shape {shape} of {self.dtype}, found {tuple(value.shape)} of {value.dtype}"
                 )
         if collect is not None:
             collect(adapter.statistics())

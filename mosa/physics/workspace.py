@@ -73,7 +73,8 @@ def launch(kernel, dim: int, inputs: list, device, adj_inputs: list | None = Non
 def copies(tensors: Sequence[Tensor]) -> list[Tensor]:
     """Contiguous copies, in one launch on CUDA."""
     made = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in tensors]
-    torch._foreach_copy_(made, list(tensors))
+    if made:
+        torch._foreach_copy_(made, list(tensors))
     return made
 
 

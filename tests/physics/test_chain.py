@@ -36,7 +36,7 @@ def rolled(chained, law, device, dtype, state, adapter, *, stride=2, substeps=11
     parameters = {"mu": mu, "lam": 1e4, **({"yield_stress": 300.0} if law == "von_mises" else {})}
     sim = Simulator(law, dx=0.04, substeps=substeps, frame_dt=4e-4 * substeps, ground=Ground(0.0), dtype=dtype, device=device,
                     chained=chained, **options)
-    sim._chain_memory = lambda particles, frames: (SEGMENT, kept)
+    sim._chains.plan = lambda *_: (SEGMENT, kept)
     volume = torch.full((len(state.x),), 8e-6, device=device, dtype=dtype)
     weights = [p for p in adapter.parameters() if p.requires_grad]
 
@@ -125,10 +125,10 @@ def test_a_window_that_grows_between_the_passes_does_not_change_the_gradient(mak
 
         loss = end(near)
         if disturbed:
-            before = next(iter(sim._chains.values())).dims
+            before = next(iter(sim._chains.chains.values())).dims
             with torch.no_grad():
                 end(replace(far, v=30 * far.v))
-            assert next(iter(sim._chains.values())).dims != before
+            assert next(iter(sim._chains.chains.values())).dims != before
         gradients.append(torch.autograd.grad(loss, list(adapter.parameters())))
     assert_same(gradients[1], gradients[0], 1e-11)
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mosa.physics import rollout as rollout_module
 from mosa.physics.rollout import AdapterOperator, Simulator
 from mosa.types import Ground, ParticleState
 
@@ -59,8 +58,8 @@ def on(device, dtype, state):
 @pytest.mark.parametrize("kept", [True, False])
 def test_gradients_with_states_kept_and_run_again(dtype, substeps, tolerance, kept, make_block, monkeypatch):
     """An operator that is asked for once, as the default adapter is; three times: passes run eagerly, captured, replayed."""
-    monkeypatch.setattr(rollout_module, "KEPT_SHARE", 0.25 if kept else 0.0)
-    monkeypatch.setattr(rollout_module, "KEPT_ON_CPU", 0)
+    monkeypatch.setattr("mosa.physics.memory.KEPT_SHARE", 0.25 if kept else 0.0)
+    monkeypatch.setattr("mosa.physics.memory.KEPT_ON_CPU", 0)
     results = {}
     for device in ("cuda", "cpu"):
         state, volume = on(device, dtype, make_block(n=6))

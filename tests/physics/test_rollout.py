@@ -116,7 +116,7 @@ def test_segments_recomputed_give_the_gradient_of_one_segment(law, make_block, m
     monkeypatch.setattr(Workspace, "advance", lambda work: (run_again.append(work.with_adjoint), advance(work)))
     for length, kept, expected in ((32, 0, 2), (32, 100, 0), (7, 20, 5), (7, 0, 8), (1, 100, 0)):
         monkeypatch.setattr("mosa.physics.rollout.SEGMENT", length)
-        monkeypatch.setattr("mosa.physics.rollout.KEPT_ON_CPU", kept * each)
+        monkeypatch.setattr("mosa.physics.memory.KEPT_ON_CPU", kept * each)
         state = make_block()
         leaves = [t.clone().requires_grad_() for t in (state.x, state.v, state.C_affine, state.F)]
         mu = torch.full((len(state.x),), 4e4).double().requires_grad_()

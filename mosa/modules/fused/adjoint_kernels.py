@@ -151,8 +151,8 @@ def psi2_backward(
     l1, t, l2, gt, gl2, W1, b1, W2, b2, W3, b3, h1, h2, g1, g2, gout, partial, gl1, start, size, N, M, alpha,
     SUMS: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
 ):  # fmt: skip
-    """gl1 (H + 3, M), its last rows those of the scaled normals, from gt (48, M), its last 12 rows, and gl2 (H, M). The last layer's
-    sums are always made outside, from h2 (H, M) and gout (12 + H, M)."""
+    """gl1 (H + 3, M), its last rows those of the scaled normals, from gt (48, M), its last 12 rows, and gl2 (H, M). Sums of the
+    last layer are always made outside, from h2 (H, M) and gout (12 + H, M)."""
     h, c = tl.arange(0, H), tl.arange(0, 16)
     if SUMS == "inside":
         V1, Vx = forward(W1, H, H, H + 3, P), forward(W1 + H, H, 3, H + 3, P)
