@@ -147,7 +147,7 @@ class SegmentSolver:
     def look(self, flags: Tensor, final: tuple[Tensor, ...]) -> list[int]:
         """The events of a segment; the same transfer tells the host where the next one starts."""
         numbers = torch.cat([flags.double(), extent(*final[:2]).double()]).tolist()  # float64 holds the flags exactly
-        self._known = (*_identity(final), numbers[4:], final)  # with `final`, so that its memory is not another tensor's
+        self._know(final, numbers[4:])
         return [int(n) for n in numbers[:4]]
 
     def takes_room(self, substeps: int) -> bool:
