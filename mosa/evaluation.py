@@ -12,7 +12,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mosa import metrics
+from mosa.analysis.anisotropy import stiffest_axis
+from mosa.analysis.vibration import GROWTH_LIMIT, vibration_growth
+from mosa.errors import SimulationDiverged
 from mosa.modules.body import VARIANTS, Body, Start, World
+from mosa.modules.material import material_states
 from mosa.modules.observer import deformed_covariances, observe
 from mosa.rendering.cameras import crop_boxes
 from mosa.types import Rollout, Scene
@@ -203,4 +207,26 @@ def identification(body: Body, scene: Scene) -> dict[str, float]:
                 errors = metrics.identification_errors(name, figures[f"{prefix}/{name}"], scene.known_parameters[name])
                 figures |= {f"{prefix}/{key}": value for key, value in errors.items()}
         figures[f"{prefix}/contact_offset_m"] = float(contact().detach())
+    return figures
+
+
+def law_figures(body: Body) -> dict[str, float]:
+    """What the learned law is like by itself: its stiffest direction, and whether it makes energy (with a warning)."""
+    adapter, material = body.adapter, body.material
+    if adapter is None or not adapter.is_on:
+        return {}
+    figures = {}
+    growth = vibration_growth(material, adapter, density=body.density, stride=body.settings.stride, law_options=body.law_options)
+    if growth is not None:
+        figures["id/growth_per_period"] = growth
+        if growth > GROWTH_LIMIT:
+            print(f"warning: the learned law makes energy: a freely vibrating block grows by a factor of {growth:.3g} in a period; "
+                  "adapter.major_symmetry=true with adapter.state_dependence=constant gives it an energy")
+    if "E" in material.physical():
+        states = material_states(material.law, material.per_particle(), **body.law_options)
+        try:
+            axis, figures["id/stiffness_ratio"] = stiffest_axis(states, adapter)
+        except SimulationDiverged:  # a law without a tensile modulus
+            return figures
+        figures |= {f"id/stiffest_{name}": float(value) for name, value in zip("xyz", axis)}
     return figures

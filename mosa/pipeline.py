@@ -26,7 +26,7 @@ from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLas
 from mosa.config import build_body, build_stages, build_world, plain, rehearse, run_config, world_config
 from mosa.data.datamodule import MultiViewDataModule, training_observations
 from mosa.errors import ConfigError, MosaError
-from mosa.evaluation import Sequence, evaluate, floor_figures, identification, render
+from mosa.evaluation import Sequence, evaluate, floor_figures, identification, law_figures, render
 from mosa.modules.body import Body, Start
 from mosa.modules.lit_mosa import LitMosa, Take
 from mosa.reconstruction.starts import first_contact, sequence_start, splats_of
@@ -147,7 +147,7 @@ def train(cfg: DictConfig) -> float | None:
     with clock.measure("evaluation"):
         figures, kept = evaluate(body, sequences(body, scene, held_out, found), world,
                                  samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
-    figures |= identification(body, scene) | start_figures(found["train"])
+    figures |= identification(body, scene) | law_figures(body) | start_figures(found["train"])
     if cfg.evaluation.floor:
         figures |= floor_figures(body, sequences(body, scene, held_out, found), world,
                                  samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
@@ -324,7 +324,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         found = {k: Start.read(s, body.rest) for k, s in twin.config["starts"].items()}
     evaluated = sequences(body, scene, held_out, found)
     figures, kept = evaluate(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
-    figures |= identification(body, scene)
+    figures |= identification(body, scene) | law_figures(body)
     if cfg.evaluation.floor:
         figures |= floor_figures(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
     write_outputs(folder, cfg, body, evaluated, figures, kept)

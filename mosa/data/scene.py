@@ -132,6 +132,8 @@ def held_out_cameras(names, footage_names: tuple[str, ...]) -> tuple[int, ...]:
         if str(name) not in footage_names:
             raise ConfigError(f"scene.holdout_cameras: no camera {name!r}; the scene has {', '.join(footage_names)}")
         indices.append(footage_names.index(str(name)))
+    if len(footage_names) < 2:
+        raise ConfigError(f"scene: expected at least two cameras, found {len(footage_names)}")
     if len(footage_names) - len(set(indices)) < 2:
         raise ConfigError(
             f"scene.holdout_cameras: {len(set(indices))} of {len(footage_names)} held out; two must be left to learn from"
@@ -197,6 +199,11 @@ def assemble(
     up = vector(up, "up")
     if not up.norm() > 0:
         raise ConfigError("scene.up: expected a direction, found zero")
+    pull = vector(gravity, "gravity")
+    if ground is not None and bool(pull.norm() > 0) and not float(pull @ up) < 0:
+        raise ConfigError(
+            f"scene.gravity: expected a pull towards the ground, against scene.up = {up.tolist()}, found {pull.tolist()}; set both"
+        )
     try:
         low, high = box
     except (TypeError, ValueError) as error:
@@ -218,7 +225,7 @@ def assemble(
         last_free_frame = footage.frames.index(last_free_frame)
     scene = Scene(
         name=name, sequence=sequence, images=footage.images, mattes=footage.mattes, cameras=footage.cameras, times=times,
-        gravity=vector(gravity, "gravity"), up=up / up.norm(), ground=ground, box=box, density=float(density),
+        gravity=pull, up=up / up.norm(), ground=ground, box=box, density=float(density),
         background=footage.background, synthetic=synthetic, last_free_frame=last_free_frame,
         holdout_cameras=held_out_cameras(holdout_cameras, footage.cameras.names),
         holdout_frames=held_out_frames(holdout_frames, footage.frames), truth=truth,

@@ -226,6 +226,7 @@ KEYS = [
     ({"frames": [0, 9]}, "scene.frames: .* has no frame 9, only 0 to 4"),
     ({"frames": 3}, r"scene.frames: expected \[first, last\]"),
     ({"last_free_frame": 9}, "scene.last_free_frame: no frame 9"),
+    ({"up": [0, 0, 1]}, "scene.gravity: expected a pull towards the ground, against scene.up"),
     ({"ground": 0.0}, "scene.ground: expected the keys height, mode and friction"),
     ({"ground": {"height": 0.0, "friction": "some"}}, "scene.ground.friction"),
     ({"ground": {"height": 0.0, "mode": "slip", "friction": 0.2}}, "scene.ground.friction: acts with mode separate only"),

@@ -65,6 +65,7 @@ def test_a_run_leaves_its_outputs(run):
     # what two samplings of the body are apart: more than nothing, less than the body
     assert 0 < figures["floor/sampling/cd_m"] < 0.1 and 0 < figures["floor/sampling/emd_m"] < 0.1
     assert figures["id/E_ratio"] == pytest.approx(figures["id/E"] / 2e5)
+    assert 0 < figures["id/growth_per_period"] <= 1 and figures["id/stiffness_ratio"] > 1  # it has an energy, and learned something
     assert figures["time/device"] and figures["time/particle_substeps_per_s"] > 0
 
 
