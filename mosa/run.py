@@ -106,5 +106,6 @@ def log_outcome(folder: Path, cfg: dict, figures: dict) -> None:
     """The run's configuration beside its final figures, for TensorBoard's table of hyper-parameters, as `final/...`."""
     logger = TensorBoardLogger(folder, name="tensorboard", version="", default_hp_metric=False)
     final = {f"final/{k}": v for k, v in figures.items() if k in OUTCOME or k.startswith(("id/", "id_prior/"))}
+    (Path(logger.log_dir) / "hparams.yaml").unlink(missing_ok=True)  # the fit's logger left an empty one, which would be kept
     logger.log_hyperparams({k: v for k, v in cfg.items() if k not in ("evaluation", "logger", "hydra")}, final)
     logger.finalize("success")

@@ -62,6 +62,7 @@ def test_a_run_leaves_its_outputs(run):
     events.Reload()
     assert events.Scalars("final/test/rms_m")[-1].value == pytest.approx(figures["test/rms_m"], rel=1e-6)
     assert {"_hparams_/session_start_info", "_hparams_/experiment"} <= set(events.summary_metadata)
+    assert "seed: 0" in (run / "tensorboard" / "hparams.yaml").read_text()
     # what two samplings of the body are apart: more than nothing, less than the body
     assert 0 < figures["floor/sampling/cd_m"] < 0.1 and 0 < figures["floor/sampling/emd_m"] < 0.1
     assert figures["id/E_ratio"] == pytest.approx(figures["id/E"] / 2e5)
