@@ -6,8 +6,8 @@ A sphere rolls (friction) and slides (none) down an incline and bounces from the
 and the force on them is compared with the uniaxial neo-Hookean stress. About half a minute on one core.
 """
 
+import argparse
 import math
-import sys
 from pathlib import Path
 
 import matplotlib
@@ -153,4 +153,7 @@ def draw(path: Path) -> None:
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    draw(Path(sys.argv[1] if len(sys.argv) > 1 else Path(__file__).parents[1] / "docs" / "images" / "colliders.png"))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    picture = Path(__file__).parents[1] / "docs" / "images" / "colliders.png"
+    parser.add_argument("output", type=Path, nargs="?", default=picture, help="PNG")
+    draw(parser.parse_args().output)

@@ -1,11 +1,11 @@
 """What contact costs: seconds per substep, forward and backward, with planes only and with moving colliders.
 
-    python benchmarks/colliders.py [particles per edge] [repeats]
+    python benchmarks/colliders.py [--edge 21] [--repeats 5]
 
 The variants take turns, so that a machine's changing load meets them alike; the fastest repeat counts.
 """
 
-import sys
+import argparse
 import time
 
 import torch
@@ -72,4 +72,8 @@ def main(edge: int = 21, repeats: int = 5) -> None:
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    main(*(int(a) for a in sys.argv[1:3]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--edge", type=int, default=21, help="particles along an edge of the body")
+    parser.add_argument("--repeats", type=int, default=5)
+    options = parser.parse_args()
+    main(options.edge, options.repeats)

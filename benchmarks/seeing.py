@@ -30,6 +30,7 @@ import numpy as np
 import torch
 from cues_pictures import outlines, save
 from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
 from omegaconf import DictConfig
 from PIL import Image
 from torch import Tensor
@@ -37,7 +38,9 @@ from torch import Tensor
 from mosa.analysis.figures import label, to_uint8
 from mosa.analysis.flow_colors import color_wheel, flow_colors
 from mosa.config import plain, run_config
+from mosa.data.footage import read_json
 from mosa.data.scene import under
+from mosa.errors import MosaError
 from mosa.evaluation import image_metrics
 from mosa.modules.observer import Views, observe
 from mosa.pipeline import body_of, reconstruct_scene, scenes
@@ -228,8 +231,9 @@ def flow_figures(seen: Seen) -> dict:
 
 def measure(overrides: list[str], out: Path) -> dict:
     cfg = configuration(overrides, out)
+    # before the minutes of the reconstruction: a copy of the scene may have come without it
+    published = read_json(under(cfg.scene.root, cfg.scene.path) / "derived" / "visual_hull_track.json")
     seen = see(cfg)
-    published = json.loads((under(cfg.scene.root, cfg.scene.path) / "derived" / "visual_hull_track.json").read_text())
     return {
         "overrides": overrides, "width_px": seen.scene.cameras.width, "particles": len(seen.result.volume),
         "spacing_m": seen.result.spacing, "seed": cfg.seed, "held_out": held_out_figures(seen, cfg.seed),
@@ -453,6 +457,8 @@ def main() -> None:
     args = parser.parse_args()
     if args.table:
         lines = [json.loads(file.read_text()) for file in args.out.glob("*.json")]
+        if not lines:
+            parser.error(f"--table: nothing has been measured into {args.out}; run it without --table first")
         print(tables(sorted(lines, key=lambda line: (len(line["overrides"]), line["overrides"]))))
         return
     if args.scene != BIRD:  # no figures to compare with, but pictures
@@ -475,4 +481,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except (MosaError, HydraException) as error:
+        sys.exit(f"{type(error).__name__}: {error}")

@@ -319,9 +319,11 @@ def number(row: list[str]) -> tuple[int, str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", default=",".join(PARTS), help="comma-separated parts")
+    parser.add_argument("--only", default=",".join(PARTS), help=f"comma-separated parts of {', '.join(PARTS)}")
     parser.add_argument("--bar-cells", type=int, default=30)
     options = parser.parse_args()
+    if unknown := [name for name in options.only.split(",") if name not in PARTS]:
+        parser.error(f"--only: expected names among {', '.join(PARTS)}, found {unknown[0]!r}")
     torch.set_num_threads(1)
     data = Path(os.environ["MOSA_DATA"]) if "MOSA_DATA" in os.environ else None
     store = ROOT / "outputs" / "verification.json"
@@ -331,14 +333,19 @@ def main() -> None:
         results[name] = bar(data, options.bar_cells) if name == "bar" else PARTS[name](data)
         store.write_text(json.dumps(results, indent=1))
         print(name, *(" | ".join(row) for row in results[name]), sep="\n  ", flush=True)
+    publish(results, ROOT / "docs" / "verification.md")
+
+
+def publish(results: dict[str, list[list[str]]], page: Path) -> None:
+    """The table into the page; printed instead where a part has not been measured, whose rows the page would lose."""
     rows = sorted((row for part in results.values() for row in part), key=number)
-    table = ["| check | what | asked | reached |", "|---|---|---|---|", *(f"| {' | '.join(row)} |" for row in rows)]
-    page = ROOT / "docs" / "verification.md"
-    if page.is_file():
-        before, rest = page.read_text().split("<!-- table -->\n")[:2]
-        page.write_text(before + "<!-- table -->\n" + "\n".join(table) + "\n<!-- end -->\n" + rest.split("<!-- end -->\n")[1])
-    else:
-        print("\n".join(table))
+    table = "\n".join(["| check | what | asked | reached |", "|---|---|---|---|", *(f"| {' | '.join(row)} |" for row in rows)])
+    missing = [name for name in PARTS if not results.get(name)]
+    if missing or not page.is_file():
+        print(f"{table}\n\n{page} is left as it is: not measured: {', '.join(missing) or 'no such page'}")
+        return
+    before, rest = page.read_text().split("<!-- table -->\n")[:2]
+    page.write_text(before + "<!-- table -->\n" + table + "\n<!-- end -->\n" + rest.split("<!-- end -->\n")[1])
 
 
 if __name__ == "__main__":

@@ -17,8 +17,12 @@ from mosa.modules.body import Body, SimulationSettings, World
 from mosa.modules.heterogeneity import HeterogeneityField
 from mosa.modules.material import Material
 from mosa.modules.stages import Stage
+from mosa.physics.boundary import Plane
 from mosa.physics.colliders import colliders_from_config, domain_walls
 from mosa.types import Ground, Scene
+
+LAW_OPTIONS = ("yield_convention", "norm_eps", "rebuild", "on_inversion", "init_affine")
+"""Arguments of `Simulator` that say how a law is taken."""
 
 
 def plain(cfg: DictConfig) -> dict[str, Any]:
@@ -39,9 +43,13 @@ def build_world(config: Mapping[str, Any]) -> World:
     """walls: {mode, friction} of the box's six sides, or None; colliders: list, see `colliders_from_config`; both may be absent."""
     ground = Ground(**config["ground"]) if config["ground"] is not None else None
     gravity, up, box = (torch.tensor(config[k], dtype=torch.float32) for k in ("gravity", "up", "box"))
-    walls = config.get("walls")
-    planes = domain_walls(box, **walls) if walls is not None else []
-    return World(ground, gravity, up, box, tuple(planes), colliders_from_config(config.get("colliders") or ()))
+    return World(ground, gravity, up, box, build_walls(config.get("walls"), box),
+                 colliders_from_config(config.get("colliders") or ()))
+
+
+def build_walls(walls: Mapping[str, Any] | None, box: Tensor) -> tuple[Plane, ...]:
+    """The six sides of the box, none where `walls` is None. Errors: ConfigError naming the key."""
+    return () if walls is None else tuple(known_keys("world.walls", domain_walls, walls, box))
 
 
 def run_config(cfg: dict[str, Any], scene: Scene, dx: float) -> dict[str, Any]:
@@ -54,21 +62,49 @@ def build_body(config: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Body
     """A body with the law, adapter and settings of a run. tensors: rest, volume, colors, opacities, covariances."""
     cfg = config["cfg"]
     torch.manual_seed(cfg["seed"])
-    settings = SimulationSettings(
-        dx=config["dx"], **{k: cfg["simulation"][k] for k in
-                            ("stride", "max_substeps", "courant", "precision", "contact_offset")},
-        **{k: cfg["simulation"][k] for k in ("adaptive", "min_substeps") if k in cfg["simulation"]})  # newer than some checkpoints
-    law = dict(cfg["prior"])
-    options = law.pop("options", {})
-    material = Material(**{k: v for k, v in law.items() if k != "_target_"})
-    heterogeneity = None
-    if cfg["heterogeneity"]["enabled"]:
-        keys = {k: v for k, v in cfg["heterogeneity"].items() if k != "enabled"}
-        low, high = tensors["rest"].amin(0), tensors["rest"].amax(0)
-        heterogeneity = known_keys("heterogeneity", HeterogeneityField, keys | {"low": low, "high": high})
+    settings = build_simulation(cfg["simulation"], config["dx"])
+    material, options = build_prior(cfg["prior"])
+    heterogeneity = build_heterogeneity(cfg["heterogeneity"], tensors["rest"].amin(0), tensors["rest"].amax(0))
     adapter = build_adapter(cfg["adapter"])
     return Body(**tensors, density=config["density"], material=material, heterogeneity=heterogeneity, adapter=adapter,
                 settings=settings, law_options=options)
+
+
+def build_simulation(config: Mapping[str, Any], dx: float) -> SimulationSettings:
+    """Settings of the rollouts on a grid of spacing dx [m]."""
+    names = ("stride", "max_substeps", "courant", "precision", "contact_offset")
+    newer = (name for name in ("adaptive", "min_substeps") if name in config)  # than some checkpoints
+    return SimulationSettings(dx=dx, **{name: config[name] for name in (*names, *newer)})
+
+
+def build_prior(config: Mapping[str, Any]) -> tuple[Material, dict[str, Any]]:
+    """The prior's parameters, and the options of its law (`Simulator`). Errors: ConfigError naming the key."""
+    keys = dict(config)
+    options = keys.pop("options", None) or {}
+    if unknown := [name for name in options if name not in LAW_OPTIONS]:
+        raise ConfigError(f"prior.options.{unknown[0]}: unknown key; expected one of {', '.join(LAW_OPTIONS)}")
+    keys["frozen"] = keys.get("frozen") or ()
+    return known_keys("prior", Material, keys), options
+
+
+def build_heterogeneity(config: Mapping[str, Any], low: Tensor, high: Tensor) -> HeterogeneityField | None:
+    """The field on the box (3,) to (3,) [m], None where it is switched off. Errors: ConfigError naming the key."""
+    if not config["enabled"]:
+        return None
+    return known_keys("heterogeneity", HeterogeneityField, {k: v for k, v in config.items() if k != "enabled"} |
+                      {"low": low, "high": high})
+
+
+def rehearse(cfg: Mapping[str, Any]) -> None:
+    """Build what needs no data and drop it: a mistake then shows before the reconstruction. Errors: ConfigError naming the key."""
+    low, high = torch.zeros(3), torch.ones(3)
+    with torch.random.fork_rng(devices=[]):
+        build_prior(cfg["prior"])
+        heterogeneity, adapter = build_heterogeneity(cfg["heterogeneity"], low, high), build_adapter(cfg["adapter"])
+    build_simulation(cfg["simulation"], 1.0)
+    build_stages(cfg["fit"], heterogeneity=heterogeneity is not None, adapter=adapter is not None)
+    build_walls(cfg["world"]["walls"], torch.stack([low, high]))
+    colliders_from_config(cfg["world"]["colliders"] or ())
 
 
 def known_keys(where: str, build: Callable, keys: Mapping[str, Any], *positional: Any) -> Any:

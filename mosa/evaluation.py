@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -11,13 +12,16 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mosa import metrics
+from mosa.analysis.anisotropy import stiffest_axis
+from mosa.analysis.vibration import GROWTH_LIMIT, vibration_growth
+from mosa.errors import SimulationDiverged
 from mosa.modules.body import VARIANTS, Body, Start, World
+from mosa.modules.material import material_states
 from mosa.modules.observer import deformed_covariances, observe
 from mosa.rendering.cameras import crop_boxes
 from mosa.types import Rollout, Scene
 
 PREFIX = {"adapted": "", "prior": "prior/", "prior_eta": "prior_eta/"}
-IMAGE_METRICS = ("psnr_crop", "ssim_crop", "psnr_full", "ssim_full")
 
 
 @dataclass(frozen=True)
@@ -32,17 +36,23 @@ class Sequence:
 
 
 @torch.no_grad()
-def rollouts(body: Body, sequence: Sequence, world: World, variants=VARIANTS) -> tuple[dict[str, Rollout], float | None]:
-    """Every variant's rollout over all frames of `sequence`, and mean |C| of the adapted one (None without an adapter)."""
+def rollouts(
+    body: Body, sequence: Sequence, world: World, variants=VARIANTS
+) -> tuple[dict[str, Rollout], float | None, float]:
+    """Every variant's rollout over all frames of `sequence`, mean |C| of the adapted one (None without an adapter), and the
+    particle substeps per second of the last."""
     scene = sequence.scene
     frame_dt = float(scene.times[1] - scene.times[0])
     sizes: list[float] = []
-    result = {
-        v: body.simulate(sequence.start, world, scene.frames, frame_dt, variant=v,
-                         collect=lambda found: sizes.append(float(found.mean_abs_C)))
-        for v in variants
-    }
-    return result, float(np.mean(sizes)) if sizes else None
+    result, rate = {}, 0.0
+    for v in variants:
+        began = time.perf_counter()
+        result[v] = body.simulate(sequence.start, world, scene.frames, frame_dt, variant=v,
+                                  collect=lambda found: sizes.append(float(found.mean_abs_C)))
+        if body.rest.is_cuda:
+            torch.cuda.synchronize()
+        rate = len(body.rest) * sum(result[v].counts) / (time.perf_counter() - began)
+    return result, float(np.mean(sizes)) if sizes else None, rate
 
 
 @torch.no_grad()
@@ -105,9 +115,11 @@ def evaluate(body: Body, sequences: list[Sequence], world: World, *, samples: in
     figures: dict[str, float] = {}
     kept: dict[str, dict[str, Rollout]] = {}
     bar = tqdm(total=len(sequences) * len(variants), desc="evaluate", unit="rollout", dynamic_ncols=True)
+    rates = []
     for sequence in sequences:
         kept[sequence.prefix] = {}
-        simulated, size = rollouts(body, sequence, world, variants)
+        simulated, size, rate = rollouts(body, sequence, world, variants)
+        rates.append(rate)
         if size is not None:
             figures[f"{sequence.prefix}/mean_abs_C"] = size
         for variant, rollout in simulated.items():
@@ -116,6 +128,7 @@ def evaluate(body: Body, sequences: list[Sequence], world: World, *, samples: in
             bar.update()
     bar.close()
     figures |= test_means(figures)
+    figures["time/particle_substeps_per_s"] = max(rates)  # the first rollouts also load kernels
     return figures, kept
 
 
@@ -155,6 +168,32 @@ def test_means(figures: Mapping[str, float]) -> dict[str, float]:
     return {key: float(np.mean(values)) for key, values in groups.items()}
 
 
+def floor_figures(body: Body, evaluated: list[Sequence], world: World, *, samples: int, assignment: int) -> dict[str, float]:
+    """What no law can get below, to read the figures of a model against.
+
+    `floor/<part>/...`: the true law on the learner's own grid and particles, on synthetic scenes, over the same frames and with as
+    many points as the models. `floor/sampling/...`: two random samplings of the true shape, where true positions are known.
+    """
+    from mosa.data.builtin.floor import floor_rollout
+
+    figures = {}
+    for sequence in evaluated:
+        scene = sequence.scene
+        if scene.truth is None:
+            continue
+        x = floor_rollout(body, scene, world)
+        frames = scene.training_frames if sequence.prefix.startswith("train") else list(range(scene.frames))
+        result = motion_metrics(x, body, sequence, frames, samples, assignment)
+        figures |= {f"floor/{sequence.prefix}/{k}": v for k, v in result.items()}
+    figures |= test_means(figures)
+    clouds = [scene.truth.rest if scene.truth is not None else scene.particles[0] for scene in (s.scene for s in evaluated)
+              if scene.truth is not None or scene.particles is not None]
+    if clouds:
+        floors = metrics.sampling_floors(clouds[0], len(body.rest), len(clouds[0]), samples=samples, assignment=assignment)
+        figures |= {f"floor/sampling/{name}": value for name, value in floors.items()}
+    return figures
+
+
 def identification(body: Body, scene: Scene) -> dict[str, float]:
     """Identified parameters after calibration (`id_prior/`) and after the joint stage (`id/`), with errors where truth is known."""
     figures = {}
@@ -165,7 +204,29 @@ def identification(body: Body, scene: Scene) -> dict[str, float]:
             scale = mean if name in material.modulated else 1.0
             figures[f"{prefix}/{name}"] = float(value.detach()) * scale
             if name in scene.known_parameters:
-                true = scene.known_parameters[name]
-                figures[f"{prefix}/{name}_relative_error"] = abs(figures[f"{prefix}/{name}"] - true) / abs(true)
+                errors = metrics.identification_errors(name, figures[f"{prefix}/{name}"], scene.known_parameters[name])
+                figures |= {f"{prefix}/{key}": value for key, value in errors.items()}
         figures[f"{prefix}/contact_offset_m"] = float(contact().detach())
+    return figures
+
+
+def law_figures(body: Body) -> dict[str, float]:
+    """What the learned law is like by itself: its stiffest direction, and whether it makes energy (with a warning)."""
+    adapter, material = body.adapter, body.material
+    if adapter is None or not adapter.is_on:
+        return {}
+    figures = {}
+    growth = vibration_growth(material, adapter, density=body.density, stride=body.settings.stride, law_options=body.law_options)
+    if growth is not None:
+        figures["id/growth_per_period"] = growth
+        if growth > GROWTH_LIMIT:
+            print(f"warning: the learned law makes energy: a freely vibrating block grows by a factor of {growth:.3g} in a period; "
+                  "adapter.major_symmetry=true with adapter.state_dependence=constant gives it an energy")
+    if "E" in material.physical():
+        states = material_states(material.law, material.per_particle(), **body.law_options)
+        try:
+            axis, figures["id/stiffness_ratio"] = stiffest_axis(states, adapter)
+        except SimulationDiverged:  # a law without a tensile modulus
+            return figures
+        figures |= {f"id/stiffest_{name}": float(value) for name, value in zip("xyz", axis)}
     return figures

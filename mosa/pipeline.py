@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import sys
 import time
 import warnings
@@ -24,17 +23,18 @@ from mosa import parallel
 from mosa.analysis.figures import side_by_side, write_strip, write_video
 from mosa.analysis.tables import parameter_table, results_table
 from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLast
-from mosa.config import build_body, build_stages, build_world, plain, run_config
+from mosa.config import build_body, build_stages, build_world, plain, rehearse, run_config, world_config
 from mosa.data.datamodule import MultiViewDataModule, training_observations
 from mosa.errors import ConfigError, MosaError
-from mosa.evaluation import Sequence, evaluate, identification, render
+from mosa.evaluation import Sequence, evaluate, floor_figures, identification, law_figures, render
 from mosa.modules.body import Body, Start
 from mosa.modules.lit_mosa import LitMosa, Take
 from mosa.reconstruction.starts import first_contact, sequence_start, splats_of
 from mosa.rendering.cameras import crop_boxes, crop_images
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import use_backend
-from mosa.run import begins_from, device_names, device_of, finished, shared_starts
+from mosa.run import begins_from, cost, device_names, device_of, finished, log_outcome, named_device, shared_starts
+from mosa.schema import EVALUATION, SIMULATION, TRAINING, check
 from mosa.twin import Twin, save_rollout
 from mosa.types import MotionCues, Reconstruction, Scene
 
@@ -112,6 +112,8 @@ def sequences(body: Body, training: Scene, others: list[Scene], found: dict[str,
 def train(cfg: DictConfig) -> float | None:
     """Run everything `cfg` asks for; returns the figure a sweep optimises. Errors: MosaError of whatever was wrong."""
     quiet()
+    check(plain(cfg), TRAINING, EVALUATION)
+    rehearse(plain(cfg))
     L.seed_everything(cfg.seed, verbose=False)
     clock, folder = Clock(), run_folder()
     if (done := finished(cfg, folder)) is not None:
@@ -145,11 +147,13 @@ def train(cfg: DictConfig) -> float | None:
     with clock.measure("evaluation"):
         figures, kept = evaluate(body, sequences(body, scene, held_out, found), world,
                                  samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
-    figures |= identification(body, scene) | start_figures(found["train"])
+    figures |= identification(body, scene) | law_figures(body) | start_figures(found["train"])
     if cfg.evaluation.floor:
-        figures |= floor_figures(body, sequences(body, scene, held_out, found), world)
-    figures |= clock.figures | {"time/peak_memory_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
-                                "seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
+        figures |= floor_figures(body, sequences(body, scene, held_out, found), world,
+                                 samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
+    figures |= clock.figures | cost(device) | {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
+    if cfg.logger.enabled:
+        log_outcome(folder, plain(cfg), figures)
     write_outputs(folder, cfg, body, sequences(body, scene, held_out, found), figures, kept)
     return optimized(figures, cfg.optimized_metric)
 
@@ -223,7 +227,7 @@ def fit(cfg, module: LitMosa, data: MultiViewDataModule, folder: Path, device: s
     """The staged optimisation under Lightning; resumes from cfg.ckpt_path. Errors: ConfigError for a missing checkpoint."""
     if cfg.ckpt_path is not None and not Path(cfg.ckpt_path).is_file():
         raise ConfigError(f"ckpt_path: no file {cfg.ckpt_path}; a run writes <run folder>/checkpoints/last.ckpt")
-    logger = TensorBoardLogger(folder, name="tensorboard", version="") if cfg.logger.enabled else False
+    logger = TensorBoardLogger(folder, name="tensorboard", version="", default_hp_metric=False) if cfg.logger.enabled else False
     callbacks = [KeepLast(folder / "checkpoints"), FitProgress()]
     if cfg.logger.enabled and cfg.logger.images_every:
         callbacks.append(ImageStrips(cfg.logger.images_every))
@@ -253,22 +257,6 @@ def start_figures(start: Start) -> dict[str, float]:
     names = ("x", "y", "z")
     return {f"id/v0_{n}": float(v) for n, v in zip(names, start.velocity)} | {
         f"id/omega0_{n}": float(v) for n, v in zip(names, start.angular_velocity)}
-
-
-def floor_figures(body: Body, evaluated: list[Sequence], world) -> dict[str, float]:
-    """What the true law reaches on the learner's own grid and particles, on synthetic scenes: differences below mean nothing."""
-    from mosa.data.builtin.floor import floor_rollout
-    from mosa.evaluation import motion_metrics, test_means
-
-    figures = {}
-    for sequence in evaluated:
-        if sequence.scene.truth is None:
-            continue
-        x = floor_rollout(body, sequence.scene, world)
-        frames = list(range(sequence.scene.frames))
-        result = motion_metrics(x, body, sequence, frames, 4096, 512)
-        figures |= {f"floor/{sequence.prefix}/{k}": v for k, v in result.items()}
-    return figures | test_means(figures)
 
 
 def write_outputs(folder: Path, cfg: DictConfig, body: Body, evaluated: list[Sequence], figures: dict, kept: dict) -> None:
@@ -311,8 +299,12 @@ def optimized(figures: dict[str, float], wanted: str) -> float | None:
 def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     """`eval.py`: reproduce the figures of a run, evaluate on another scene, or simulate from a new start."""
     quiet()
+    if OmegaConf.is_missing(cfg, "ckpt_path"):
+        raise ConfigError("ckpt_path: expected the checkpoint of a run, found none; "
+                          "python eval.py ckpt_path=<run folder>/checkpoints/last.ckpt")
+    check(plain(cfg), EVALUATION, SIMULATION)
     folder = run_folder()
-    twin = Twin.load(cfg.ckpt_path, cfg.device)
+    twin = Twin.load(cfg.ckpt_path, named_device(cfg.device))
     simulate = plain(cfg.simulate)
     if any(simulate[k] is not None for k in ("velocity", "rotation", "height", "angular_velocity", "colliders")):
         rollout = twin.simulate(**simulate, progress=True)
@@ -322,20 +314,20 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     if cfg.get("scene"):
         run.scene = cfg.scene
     scene, held_out = scenes(run)
-    known = {k: Start.read(s) for k, s in twin.config["starts"].items()}
+    body, world = twin.body, twin.world
     if cfg.get("scene"):
-        splats = splats_of(twin.body)
-        known = {f"test/{s.sequence}": sequence_start(twin.body, splats, s, register=True) for s in (scene, *held_out)}
-        evaluated = [Sequence(p, s, known[p], first_contact(twin.body, known[p], s)) for p, s in
-                     zip(known, (scene, *held_out))]
+        splats = splats_of(body)
+        found = {f"test/{s.sequence}": sequence_start(body, splats, s, register=True) for s in (scene, *held_out)}
+        # the body moves in the world that the scene shows, among the run's walls and colliders
+        world = build_world(world_config(scene) | (twin.config["cfg"].get("world") or {}))
     else:
-        evaluated = sequences(twin.body, scene, held_out, known)
-    figures, kept = evaluate(twin.body, evaluated, twin.world, samples=cfg.evaluation.samples,
-                             assignment=cfg.evaluation.assignment)
-    figures |= identification(twin.body, scene)
+        found = {k: Start.read(s, body.rest) for k, s in twin.config["starts"].items()}
+    evaluated = sequences(body, scene, held_out, found)
+    figures, kept = evaluate(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
+    figures |= identification(body, scene) | law_figures(body)
     if cfg.evaluation.floor:
-        figures |= floor_figures(twin.body, evaluated, twin.world)
-    write_outputs(folder, cfg, twin.body, evaluated, figures, kept)
+        figures |= floor_figures(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
+    write_outputs(folder, cfg, body, evaluated, figures, kept)
     return optimized(figures, "test/rms_m")
 
 

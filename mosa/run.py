@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import platform
+import resource
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
+from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import DictConfig
 
 from mosa import parallel
@@ -51,6 +54,35 @@ def device_of(cfg: DictConfig) -> str:
     return name
 
 
+def named_device(name: str) -> str:
+    """A device that torch can use here. Errors: ConfigError."""
+    try:
+        torch.empty(0, device=name)
+    except (RuntimeError, AssertionError) as error:  # AssertionError: torch without CUDA
+        reason = str(error).splitlines()[0]
+        raise ConfigError(f"device: expected cpu, or cuda on a machine with a GPU, found {name!r} ({reason})") from error
+    return name
+
+
+def device_label(name: str) -> str:
+    """What a torch device is called on this machine."""
+    if name != "cpu":
+        return torch.cuda.get_device_name(name)
+    listed = Path("/proc/cpuinfo")  # Linux; platform.processor() has no model there
+    lines = listed.read_text().splitlines() if listed.is_file() else []
+    models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(models, "") or platform.processor() or platform.machine()
+
+
+def cost(device: str) -> dict[str, float | str]:
+    """Device and peak memory of this process: `time/device`, `time/peak_memory_gb`, and of a GPU what torch took."""
+    figures = {"time/device": device_label(device),
+               "time/peak_memory_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6}
+    if device != "cpu":
+        figures["time/peak_gpu_memory_gb"] = torch.cuda.max_memory_allocated(device) / 1e9
+    return figures
+
+
 def shared_starts(cfg: DictConfig, folder: Path, find: Callable[[], dict[str, Start]], body: Body) -> dict[str, Start]:
     """The starts, found by the first process of the fit and read by the others: on a GPU each would find slightly different ones,
     and so look for another motion in the cache."""
@@ -64,3 +96,16 @@ def shared_starts(cfg: DictConfig, folder: Path, find: Callable[[], dict[str, St
     if len(device_names(cfg)) > 1:
         path.write_text(json.dumps({k: s.written() for k, s in found.items()}))
     return found
+
+
+OUTCOME = ("train/rms_m", "test/rms_m", "prior/test/rms_m", "prior_eta/test/rms_m", "train/psnr_crop", "test/psnr_crop",
+           "camera/psnr_crop", "test/mean_abs_C")
+
+
+def log_outcome(folder: Path, cfg: dict, figures: dict) -> None:
+    """The run's configuration beside its final figures, for TensorBoard's table of hyper-parameters, as `final/...`."""
+    logger = TensorBoardLogger(folder, name="tensorboard", version="", default_hp_metric=False)
+    final = {f"final/{k}": v for k, v in figures.items() if k in OUTCOME or k.startswith(("id/", "id_prior/"))}
+    (Path(logger.log_dir) / "hparams.yaml").unlink(missing_ok=True)  # the fit's logger left an empty one, which would be kept
+    logger.log_hyperparams({k: v for k, v in cfg.items() if k not in ("evaluation", "logger", "hydra")}, final)
+    logger.finalize("success")

@@ -32,3 +32,17 @@ def test_the_stored_ratios_cover_every_variant(rollout):
     assert {key: stored[key] for key in rollout.CHECK} == rollout.CHECK
     best = {f"{variant} {what}": 1.0 for variant in rollout.VARIANTS for what in ("forward", "both")} | {"yardstick": 1.0}
     assert stored["ratios"].keys() == rollout.ratios(best).keys()
+
+
+def test_a_partial_verification_leaves_the_published_table_alone(monkeypatch, tmp_path, capsys):
+    """In a fresh clone `--only friction`, or a run without the reference data, would have dropped all other rows."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    verification = importlib.import_module("verification")
+    page = tmp_path / "page.md"
+    page.write_text("text\n<!-- table -->\n| old |\n<!-- end -->\nmore\n")
+    results = {name: [["1", name, "a", "b"]] for name in verification.PARTS}
+    verification.publish(results | {"probes": []}, page)
+    assert "| old |" in page.read_text() and "not measured: probes" in capsys.readouterr().out
+    verification.publish(results, page)
+    assert "| old |" not in page.read_text() and "| 1 | probes | a | b |" in page.read_text()
+    assert page.read_text().startswith("text\n") and page.read_text().endswith("<!-- end -->\nmore\n")

@@ -4,13 +4,15 @@ import itertools
 from pathlib import Path
 
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
 from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 
-from mosa.config import build_adapter, build_stages
+from mosa.config import build_adapter, build_stages, rehearse
 from mosa.errors import ConfigError
 from mosa.modules.body import SimulationSettings
+from mosa.schema import EVALUATION, SIMULATION, TRAINING, check
 
 ROOT = Path(__file__).parents[1]
 
@@ -66,6 +68,63 @@ def test_a_mistake_in_a_stage_names_its_key():
         build_stages(fit | {"joint": {"iterations": 2, "lrr": 1}}, heterogeneity=True, adapter=True)
     with pytest.raises(ConfigError, match=r"fit\.joint\.start"):
         build_stages(fit | {"joint": {"iterations": 2, "lr": 1, "start": "foo"}}, heterogeneity=True, adapter=True)
+
+
+@pytest.mark.parametrize("group_name", ["adapter", "ablation", "debug", "fit", "logger", "prior", "reconstruction", "rendering",
+                                        "scene", "simulation", "trainer"])  # fmt: skip
+def test_every_option_passes_the_checks_before_a_run(group_name):
+    for option in group(group_name):
+        config = composed(f"{group_name}={option}")
+        check(config, TRAINING, EVALUATION)
+        rehearse(config)
+
+
+@pytest.mark.parametrize("override", [
+    "seed=abc", "seed=-1", "seed=1.5", "scene.also_train=test_60", "fit.views=1.5", "fit.views=true", "fit.clip=0",
+    "fit.prior.lr=-1",
+    "fit.joint.lr_adapter=abc", "fit.prior.iterations=1.5", "fit.joint.start=foo", "losses.image=null", "losses.flow=-1",
+    "heterogeneity.enabled=maybe", "heterogeneity.amplitude=abc", "adapter.alpha=.nan", "adapter.plastic=1",
+    "simulation.particles=1.5", "simulation.dx=abc", "simulation.courant=5", "simulation.contact_offset=abc", "prior.frozen=E",
+    "rendering.margin=abc", "reconstruction.resolution=0", "reconstruction.points=2", "reconstruction.neighbours=1",
+    "reconstruction.static.views=abc", "reconstruction.dynamic.modes=0", "world.walls=5", "world.colliders=[5]",
+    "evaluation.samples=0", "logger.images_every=-1",
+])  # fmt: skip
+def test_a_value_of_the_wrong_kind_is_named_before_anything_is_computed(override):
+    with pytest.raises(ConfigError, match=rf"^{override.split('=')[0]}: expected .*, found "):
+        check(composed(override), TRAINING, EVALUATION)
+
+
+@pytest.mark.parametrize("overrides, message", [
+    (["prior.parameters.nu=0.7"], r"prior\.parameters\.nu"),
+    (["+prior.foo=1"], r"prior\.foo: unknown key; expected one of law, parameters, frozen, modulated"),
+    (["+prior.options.foo=1"], r"prior\.options\.foo: unknown key; expected one of yield_convention"),
+    (["adapter.alpha=2"], r"adapter\.alpha"),
+    (["heterogeneity.amplitude=2"], r"heterogeneity\.amplitude"),
+    (["simulation.precision=16"], r"simulation\.precision"),
+    (["fit.prior.iterations=0"], r"fit\.prior\.iterations"),
+    (["world.walls={foo:1}"], r"world\.walls\.foo: unknown key; expected one of mode, friction"),
+    (["world.walls={friction:abc}"], r"world\.walls\.friction"),
+    (["world.walls={mode:sticky,friction:0.1}"], r"world\.walls\.friction"),
+    (["world.colliders=[{type:cone}]"], r"world\.colliders\[0\]\.type"),
+])  # fmt: skip
+def test_a_part_that_cannot_be_built_is_named_before_anything_is_computed(overrides, message):
+    with pytest.raises(ConfigError, match=message):
+        rehearse(composed(*overrides))
+
+
+def test_a_rehearsal_draws_no_random_number():
+    before = torch.get_rng_state()
+    rehearse(composed("adapter=mosa"))
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+@pytest.mark.parametrize("values, key", [
+    ({"velocity": ["a", 0, 0]}, "velocity"), ({"velocity": 5}, "velocity"), ({"rotation": [1, 0, 0]}, "rotation"),
+    ({"height": "abc"}, "height"), ({"frames": 0}, "frames"), ({"colliders": 5}, "colliders"),
+])  # fmt: skip
+def test_a_new_start_of_the_wrong_kind_is_named(values, key):
+    with pytest.raises(ConfigError, match=rf"simulate\.{key}: expected "):
+        check({"simulate": values}, SIMULATION)
 
 
 def flat(config, prefix="") -> dict:

@@ -48,3 +48,15 @@ def test_walls_and_errors():
         build_world(WORLD | {"colliders": [{"type": "sphere"}]})
     with pytest.raises(ConfigError, match=r"colliders\[0\].type"):
         twin().simulate(colliders=[{"type": "cone"}])
+
+
+@pytest.mark.parametrize("colliders, message", [
+    (5, r"^world\.colliders: expected a list"),
+    ([5], r"^world\.colliders\[0\]: expected type"),
+    ([{"type": "sphere", "radius": 0.1, "friction": "abc"}], r"^world\.colliders\[0\]: .*abc"),
+    ([{"type": "sphere", "radius": 0.1, "position": [0, 0]}], r"^world\.colliders\[0\]: position: expected three"),
+    ([{"type": "sphere", "radius": 0.1, "motion": {"waypoints": [{"time": 0}, {"time": 1}]}}], r"waypoints: .*'position'"),
+])  # fmt: skip
+def test_a_collider_of_the_wrong_form_is_named(colliders, message):
+    with pytest.raises(ConfigError, match=message):
+        build_world(WORLD | {"colliders": colliders})

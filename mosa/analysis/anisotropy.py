@@ -68,7 +68,10 @@ def directions_on_sphere(count: int = 200) -> Tensor:
 def in_double(adapter: Adapter) -> Adapter:
     """A copy of the adapter in float64 on the CPU, without gradients of its weights. Errors: ConfigError where it is not on."""
     adapter.check_on()
-    return copy.deepcopy(adapter).double().cpu().requires_grad_(False)
+    held = copy.deepcopy(adapter).double().cpu().requires_grad_(False)
+    if getattr(held, "fused", None) is True:  # the kernels run on CUDA only
+        held.fused = "auto"
+    return held
 
 
 def stress_jacobian(adapter: Adapter, w: Tensor, s: Tensor) -> Tensor:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import cv2
-import numpy as np
 import torch
+from kornia.color import hsv_to_rgb
 from torch import Tensor
 
 from mosa.errors import DataError
@@ -22,11 +21,9 @@ def flow_colors(flow: Tensor, largest: float | None = None) -> Tensor:
     length = flow.norm(dim=-1)
     if largest is None:
         largest = float(length.max())
-    hue = torch.rad2deg(torch.atan2(flow[..., 1], flow[..., 0])) % 360
+    hue = torch.atan2(flow[..., 1], flow[..., 0]) % (2 * torch.pi)
     saturation = (length / largest).clamp(max=1) if largest > 0 else torch.zeros_like(length)
-    hsv = torch.stack((hue, saturation, torch.ones_like(hue)), -1).numpy()
-    rgb = cv2.cvtColor(np.ascontiguousarray(hsv.reshape(-1, hsv.shape[-2], 3)), cv2.COLOR_HSV2RGB)
-    return torch.from_numpy(rgb.reshape(hsv.shape))
+    return hsv_to_rgb(torch.stack((hue, saturation, torch.ones_like(hue)), -3)).movedim(-3, -1)
 
 
 def color_wheel(size: int) -> Tensor:

@@ -32,7 +32,7 @@ def _sequences(figures: Mapping[str, float]) -> list[str]:
 
 def parameter_table(figures: Mapping[str, float]) -> str:
     """Markdown table of identified parameters: after calibration, after the joint stage, relative error where truth is known."""
-    names = [k.split("/", 1)[1] for k in figures if k.startswith("id_prior/") and not k.endswith("_relative_error")]
+    names = [k.split("/", 1)[1] for k in figures if k.startswith("id_prior/") and not k.endswith(("_relative_error", "_ratio"))]
     rows = [[n, f"{figures[f'id_prior/{n}']:.5g}", f"{figures.get(f'id/{n}', float('nan')):.5g}",
              f"{figures[f'id_prior/{n}_relative_error']:.1%}" if f"id_prior/{n}_relative_error" in figures else ""] for n in names]
     return markdown(["parameter", "prior", "joint", "error of prior"], rows)

@@ -39,7 +39,7 @@ def read_json(path: Path):
     if not path.is_file():
         raise DataError(f"{path}: file not found")
     try:
-        return json.loads(path.read_text())
+        return json.loads(path.read_text(encoding="utf-8-sig"))  # some editors put a byte order mark before it
     except json.JSONDecodeError as error:
         raise DataError(
             f"{path}: expected JSON, found a mistake in line {error.lineno}, column {error.colno}: {error.msg}"

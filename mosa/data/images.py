@@ -96,8 +96,8 @@ def composite(color: np.ndarray, matte: np.ndarray, background: np.ndarray) -> n
 
 def scaled_size(width: int, height: int, scale: float) -> tuple[int, int]:
     """Size [px] of a scaled image. Errors: ConfigError for a scale outside (0, 1] or one that leaves under 16 px."""
-    if not 0 < scale <= 1:
-        raise ConfigError(f"scene.scale: expected a number in (0, 1], found {scale}")
+    if isinstance(scale, bool) or not isinstance(scale, (int, float)) or not 0 < scale <= 1:
+        raise ConfigError(f"scene.scale: expected a number in (0, 1], found {scale!r}")
     size = round(width * scale), round(height * scale)
     if min(size) < 16:
         raise ConfigError(f"scene.scale: {scale} leaves {size[0]}x{size[1]} px of {width}x{height}; at least 16 px are needed")

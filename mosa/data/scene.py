@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,6 +38,8 @@ def load_scene(
     loader = getattr(importlib.import_module(module), function)
     if format == "builtin":
         return validate(call(loader, {"cache": cache, **{k: v for k, v in keys.items() if v is not None}}))
+    if keys.get("fps") is not None:
+        check_fps(keys["fps"])
     if path is None:
         raise ConfigError(
             f"scene.path: expected the folder of a scene in format {format}, found nothing; scene.path=<folder>"
@@ -72,6 +74,9 @@ def call(loader: Callable, arguments: dict) -> Scene:
     known = set(inspect.signature(loader).parameters)
     if "world" in known:
         known |= set(inspect.signature(assemble).parameters)
+    for key, parameter in inspect.signature(loader).parameters.items():
+        if parameter.default is parameter.empty and parameter.kind is parameter.KEYWORD_ONLY and key not in arguments:
+            raise ConfigError(f"scene.{key}: expected a value, found none")
     for key in arguments:
         if key not in known:
             raise ConfigError(
@@ -84,6 +89,8 @@ def ground_from(keys) -> Ground | None:
     """Ground of {height, mode, friction}, None for none. Errors: ConfigError naming the key."""
     if keys is None or isinstance(keys, Ground):
         return keys
+    if not isinstance(keys, Mapping):
+        raise ConfigError(f"scene.ground: expected the keys height, mode and friction, or null, found {keys!r}")
     unknown = set(keys) - {"height", "mode", "friction"}
     if unknown:
         raise ConfigError(f"scene.ground.{min(unknown)}: expected the keys height, mode and friction only")
@@ -92,8 +99,10 @@ def ground_from(keys) -> Ground | None:
         raise ConfigError(f"scene.ground.mode: expected sticky, slip or separate, found {mode!r}")
     if not isinstance(keys.get("height"), (int, float)):
         raise ConfigError(f"scene.ground.height: expected a height in metres, found {keys.get('height')!r}")
-    if not friction >= 0:
-        raise ConfigError(f"scene.ground.friction: expected a number >= 0, found {friction}")
+    if not isinstance(friction, (int, float)) or not friction >= 0:
+        raise ConfigError(f"scene.ground.friction: expected a number >= 0, found {friction!r}")
+    if friction > 0 and mode != "separate":
+        raise ConfigError(f"scene.ground.friction: acts with mode separate only, found {friction} with mode {mode!r}")
     return Ground(float(keys["height"]), mode, float(friction))
 
 
@@ -108,13 +117,23 @@ def vector(value, key: str) -> torch.Tensor:
     return result
 
 
+def check_fps(fps) -> None:
+    """Errors: ConfigError where frames per second are none."""
+    if isinstance(fps, bool) or not isinstance(fps, (int, float)) or not fps > 0:
+        raise ConfigError(f"scene.fps: expected a positive number, found {fps!r}")
+
+
 def held_out_cameras(names, footage_names: tuple[str, ...]) -> tuple[int, ...]:
     """Indices of the cameras that are named. Errors: ConfigError for an unknown name, or where under two are left."""
+    if names is not None and not isinstance(names, (list, tuple)):
+        raise ConfigError(f"scene.holdout_cameras: expected a list of cameras like [3], found {names!r}")
     indices = []
     for name in names or ():
         if str(name) not in footage_names:
             raise ConfigError(f"scene.holdout_cameras: no camera {name!r}; the scene has {', '.join(footage_names)}")
         indices.append(footage_names.index(str(name)))
+    if len(footage_names) < 2:
+        raise ConfigError(f"scene: expected at least two cameras, found {len(footage_names)}")
     if len(footage_names) - len(set(indices)) < 2:
         raise ConfigError(
             f"scene.holdout_cameras: {len(set(indices))} of {len(footage_names)} held out; two must be left to learn from"
@@ -127,7 +146,11 @@ def held_out_frames(numbers, frames: tuple[int, ...]) -> tuple[int, ...]:
 
     Errors: ConfigError where a number is unknown, where they are not the end of the sequence, or under three are left.
     """
-    if isinstance(numbers, int) and not isinstance(numbers, bool):
+    if isinstance(numbers, bool) or not isinstance(numbers, (int, list, tuple, type(None))):
+        raise ConfigError(f"scene.holdout_frames: expected a list of frame numbers or how many are held out, found {numbers!r}")
+    if isinstance(numbers, int):
+        if numbers < 0:
+            raise ConfigError(f"scene.holdout_frames: expected a number >= 0, found {numbers}")
         numbers = frames[len(frames) - numbers :] if 0 <= numbers <= len(frames) else frames
     indices = set()
     for number in numbers or ():
@@ -139,6 +162,8 @@ def held_out_frames(numbers, frames: tuple[int, ...]) -> tuple[int, ...]:
             f"scene.holdout_frames: expected the last frames of {frames[0]} to {frames[-1]}, found {sorted(numbers)}; "
             "what comes after a gap cannot be learned from"
         )
+    if len(frames) < 3:
+        raise ConfigError(f"scene.frames: expected at least three frames to learn from, found {len(frames)}")
     if len(frames) - len(indices) < 3:
         raise ConfigError(
             f"scene.holdout_frames: {len(indices)} of {len(frames)} frames held out; three must be left to learn from"
@@ -174,6 +199,11 @@ def assemble(
     up = vector(up, "up")
     if not up.norm() > 0:
         raise ConfigError("scene.up: expected a direction, found zero")
+    pull = vector(gravity, "gravity")
+    if ground is not None and bool(pull.norm() > 0) and not float(pull @ up) < 0:
+        raise ConfigError(
+            f"scene.gravity: expected a pull towards the ground, against scene.up = {up.tolist()}, found {pull.tolist()}; set both"
+        )
     try:
         low, high = box
     except (TypeError, ValueError) as error:
@@ -181,12 +211,11 @@ def assemble(
     box = torch.stack([vector(low, "box"), vector(high, "box")])
     if not bool((box[1] > box[0]).all()):
         raise ConfigError(f"scene.box: expected min < max on every axis, found {box.tolist()}")
-    if not (isinstance(density, (int, float)) and density > 0):
+    if isinstance(density, bool) or not (isinstance(density, (int, float)) and density > 0):
         raise ConfigError(f"scene.density: expected a positive number [kg/m^3], found {density!r}")
     times = footage.times
     if fps is not None:
-        if not fps > 0:
-            raise ConfigError(f"scene.fps: expected a positive number, found {fps}")
+        check_fps(fps)
         times = torch.tensor([(f - footage.frames[0]) / fps for f in footage.frames], dtype=torch.float32)
     if last_free_frame is not None:
         if last_free_frame not in footage.frames:
@@ -196,7 +225,7 @@ def assemble(
         last_free_frame = footage.frames.index(last_free_frame)
     scene = Scene(
         name=name, sequence=sequence, images=footage.images, mattes=footage.mattes, cameras=footage.cameras, times=times,
-        gravity=vector(gravity, "gravity"), up=up / up.norm(), ground=ground, box=box, density=float(density),
+        gravity=pull, up=up / up.norm(), ground=ground, box=box, density=float(density),
         background=footage.background, synthetic=synthetic, last_free_frame=last_free_frame,
         holdout_cameras=held_out_cameras(holdout_cameras, footage.cameras.names),
         holdout_frames=held_out_frames(holdout_frames, footage.frames), truth=truth,

@@ -5,7 +5,7 @@ grid is in `collider_kernels`, the shapes' distances in `collider_shapes`. A col
 B-spline grid lets material on both sides of a thinner one touch.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -150,7 +150,13 @@ def reach(shape: Shape) -> float:
 
 
 def domain_walls(box: Tensor, mode: str = "separate", friction: float = 0.0) -> list[Plane]:
-    """Six planes that keep a body inside box (2, 3) [m]."""
+    """Six planes that keep a body inside box (2, 3) [m]. Errors: ConfigError naming the key of `world.walls`."""
+    if mode not in MODES:
+        raise ConfigError(f"world.walls.mode: expected one of {', '.join(MODES)}, found {mode!r}")
+    if isinstance(friction, bool) or not isinstance(friction, (int, float)) or not friction >= 0:
+        raise ConfigError(f"world.walls.friction: expected a number >= 0, found {friction!r}")
+    if friction > 0 and mode != "separate":
+        raise ConfigError(f"world.walls.friction: acts with mode separate only, found mode {mode!r}")
     low, high = torch.as_tensor(box).double().tolist()
     planes = []
     for axis in range(3):
@@ -174,12 +180,16 @@ def colliders_from_config(items: Sequence[dict | Collider], field_name: str = "w
     position (3,) [m]; rotation (ax, ay, az, degrees); motion: {velocity, angular_velocity [rad/s], times} or
     {waypoints: [{time, position, rotation}, ...]}. Errors: ConfigError naming the entry and the field.
     """
+    if isinstance(items, Mapping | str) or not isinstance(items, Sequence):
+        raise ConfigError(f"{field_name}: expected a list of colliders, found {items!r}")
     return tuple(
-        item if isinstance(item, Collider) else _collider(dict(item), f"{field_name}[{i}]") for i, item in enumerate(items)
+        item if isinstance(item, Collider) else _collider(item, f"{field_name}[{i}]") for i, item in enumerate(items)
     )
 
 
-def _collider(item: dict, where: str) -> Collider:
+def _collider(item: Mapping, where: str) -> Collider:
+    if not isinstance(item, Mapping):
+        raise ConfigError(f"{where}: expected type and the keys of that type, found {item!r}")
     kind = item.get("type")
     if kind not in _FIELDS:
         raise ConfigError(f"{where}.type: expected one of {', '.join(_FIELDS)}, found {kind!r}")
@@ -197,12 +207,14 @@ def _collider(item: dict, where: str) -> Collider:
         else:
             shape = make(*(tuple(map(float, item[k])) if k == "size" else float(item[k]) for k in needed))
         motion = _motion(item)
+        friction, thickness = float(item.get("friction", 0.0)), float(item.get("thickness", 0.0))
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from error
+    except KeyError as error:
+        raise ConfigError(f"{where}.motion.waypoints: expected time and position in each, found one without {error}") from error
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{where}: a value has the wrong form ({error}), found {item}") from error
-    return Collider(shape, item.get("mode", "sticky"), float(item.get("friction", 0.0)), motion, float(item.get("thickness", 0.0)),
-                    str(item.get("name", "")))  # fmt: skip
+    return Collider(shape, item.get("mode", "sticky"), friction, motion, thickness, str(item.get("name", "")))
 
 
 def _motion(item: dict) -> Motion:
@@ -222,7 +234,10 @@ def _motion(item: dict) -> Motion:
         return Motion.waypoints([p["time"] for p in points], [p["position"] for p in points], torch.stack(turns))
     if unknown := [key for key in motion if key not in ("velocity", "angular_velocity", "times")]:
         raise ConfigError(f"motion: unknown: {', '.join(unknown)}; expected velocity, angular_velocity, times, or waypoints")
-    return Motion(item.get("position", (0.0, 0.0, 0.0)), rotation, **motion)
+    position = torch.as_tensor(item.get("position", (0.0, 0.0, 0.0)), dtype=torch.float64)
+    if position.shape != (3,):
+        raise ConfigError(f"position: expected three numbers, found {item['position']!r}")
+    return Motion(position, rotation, **motion)
 
 
 def _axis_degrees(value: Sequence[float] | None) -> Tensor:

@@ -28,14 +28,6 @@ class Particles:
     spacing: float
 
 
-def smooth_occupancy(volume: Volume, passes: int) -> Volume:
-    """Repeated 3x3x3 mean: rounds the ridges where the cones of two views meet; the 0.5 level of flat faces stays in place."""
-    values = volume.values.cpu().numpy()
-    for _ in range(passes):
-        values = ndimage.uniform_filter(values, size=3, mode="constant")
-    return Volume(torch.as_tensor(values, device=volume.values.device), volume.origin, volume.pitch)
-
-
 def carve(volume: Volume, depth: Tensor, alpha: Tensor, cameras: Cameras, *, tolerance: float, votes: int = 2) -> Volume:
     """Empties voxels that at least `votes` views see in front of the rendered surface by more than `tolerance` [m].
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -42,14 +42,6 @@ class Windows:
         return Windows(
             self.images.to(device), self.mattes.to(device), self.cameras.to(device), self.view.to(device), self.frame.to(device)
         )
-
-    def halved(self) -> Windows:
-        """The same windows at half the resolution (mean of 2 x 2 pixels)."""
-        K = self.cameras.K.clone()
-        K[:, :2] *= 0.5
-        cameras = replace(self.cameras, K=K, width=self.cameras.width // 2, height=self.cameras.height // 2)
-        images = F.avg_pool2d(self.images.permute(0, 3, 1, 2), 2).permute(0, 2, 3, 1).contiguous()
-        return replace(self, images=images, mattes=F.avg_pool2d(self.mattes[:, None], 2)[:, 0], cameras=cameras)
 
 
 def _extent(mattes: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.nn.functional as F
+from kornia.filters import filter2d_separable, get_gaussian_kernel1d
 from scipy import ndimage
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -43,17 +44,10 @@ class FitSettings:
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:
     """Mean structural similarity of images (B, H, W, C) in [0, 1]: 11 x 11 Gaussian window, sigma 1.5 (Wang et al. 2004)."""
-    axis = torch.arange(11, dtype=a.dtype, device=a.device) - 5
-    window = torch.exp(-(axis**2) / (2 * SSIM_SIGMA**2))
-    window = window / window.sum()
-    channels = a.shape[-1]
-
-    def blur(x: Tensor) -> Tensor:
-        rows = F.conv2d(x, window.view(1, 1, 11, 1).expand(x.shape[1], 1, 11, 1), groups=x.shape[1])
-        return F.conv2d(rows, window.view(1, 1, 1, 11).expand(x.shape[1], 1, 1, 11), groups=x.shape[1])
-
+    window = get_gaussian_kernel1d(11, SSIM_SIGMA, device=a.device, dtype=a.dtype)
     x, y = a.permute(0, 3, 1, 2), b.permute(0, 3, 1, 2)
-    moments = blur(torch.cat([x, y, x * x, y * y, x * y], 1)).split(channels, 1)
+    products = torch.cat([x, y, x * x, y * y, x * y], 1)
+    moments = filter2d_separable(products, window, window, padding="valid").split(a.shape[-1], 1)
     mx, my, xx, yy, xy = moments
     vx, vy, vxy = xx - mx * mx, yy - my * my, xy - mx * my
     c1, c2 = 0.01**2, 0.03**2

@@ -233,3 +233,8 @@ def test_the_floor_is_the_truth_itself_on_the_truth_s_own_particles_and_grid(tra
     wall = Plane((right, 0.0, 0.0), (-1.0, 0.0, 0.0), "separate")
     walled = floor_rollout(body, scene, replace(world, planes=(wall,)))
     assert walled[..., 0].max() < right + 0.005 < coarse[..., 0].max() - 0.005  # spreading by 13 mm is held within 2
+
+
+def test_a_built_in_scene_without_a_name_is_refused(cache):
+    with pytest.raises(ConfigError, match=r"scene\.name: expected a value"):
+        load_scene(format="builtin", name=None, cache=cache)

@@ -7,13 +7,20 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from mosa.modules.body import ContactOffset
+from mosa import pipeline
+from mosa.modules.body import ContactOffset, Start
+from mosa.twin import Twin
+from mosa.types import Ground
 
 ROOT = Path(__file__).parents[2]
 
@@ -51,7 +58,16 @@ def test_a_run_leaves_its_outputs(run):
     rollout = np.load(run / "rollout.npz")
     assert rollout["train/x"].shape[2] == 3 and rollout["train/F"].shape[2:] == (3, 3)
     assert (run / "video.mp4").stat().st_size > 1000
-    assert list((run / "tensorboard").rglob("events*"))
+    events = EventAccumulator(str(run / "tensorboard"))
+    events.Reload()
+    assert events.Scalars("final/test/rms_m")[-1].value == pytest.approx(figures["test/rms_m"], rel=1e-6)
+    assert {"_hparams_/session_start_info", "_hparams_/experiment"} <= set(events.summary_metadata)
+    assert "seed: 0" in (run / "tensorboard" / "hparams.yaml").read_text()
+    # what two samplings of the body are apart: more than nothing, less than the body
+    assert 0 < figures["floor/sampling/cd_m"] < 0.1 and 0 < figures["floor/sampling/emd_m"] < 0.1
+    assert figures["id/E_ratio"] == pytest.approx(figures["id/E"] / 2e5)
+    assert 0 < figures["id/growth_per_period"] <= 1 and figures["id/stiffness_ratio"] > 1  # it has an energy, and learned something
+    assert figures["time/device"] and figures["time/particle_substeps_per_s"] > 0
 
 
 def test_eval_reproduces_the_figures_from_the_checkpoint_alone(run, cache, tmp_path):
@@ -124,6 +140,7 @@ def test_resume_auto_goes_on_and_then_skips(run, cache, tmp_path):
         (["ckpt_path=nowhere.ckpt"], "ckpt_path: no file nowhere.ckpt"),
         (["losses.colour=1"], "colour"),
         (["trainer.devices=1000", "trainer.accelerator=gpu"], "trainer.devices: expected at most"),
+        (["fit.clip=abc"], "fit.clip: expected a number above 0, found 'abc'"),
         (["scene=pacnerf", "scene.path=/nonexistent"], "/nonexistent"),
     ],
 )
@@ -132,6 +149,56 @@ def test_a_mistake_ends_in_one_message(overrides, expected, cache, tmp_path):
     assert result.returncode != 0
     assert expected in result.stderr
     assert "Traceback" not in result.stderr
+
+
+def test_eval_without_a_checkpoint_says_what_it_needs(cache, tmp_path):
+    result = call("eval.py", tmp_path, cache)
+    assert result.returncode == 2 and "ckpt_path: expected the checkpoint of a run" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def evaluated(run, tmp_path, monkeypatch, *overrides) -> dict:
+    """What eval.py hands to `evaluate`: body, sequences, world. The checkpoint's body is in float64."""
+    seen = {}
+
+    def load(path, device):
+        twin = Twin.load(path, device)
+        twin.body.double()
+        return twin
+
+    def stop(body, sequences, world, **_):
+        seen.update(body=body, sequences=sequences, world=world)
+        raise InterruptedError
+
+    monkeypatch.setattr(pipeline, "Twin", SimpleNamespace(load=load))
+    monkeypatch.setattr(pipeline, "evaluate", stop)
+    monkeypatch.setattr(pipeline, "run_folder", lambda: tmp_path)
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        cfg = compose("eval", [f"ckpt_path={run}/checkpoints/last.ckpt", *overrides])
+    with pytest.raises(InterruptedError):
+        pipeline.evaluate_checkpoint(cfg)
+    return seen
+
+
+def test_eval_puts_the_starts_where_the_body_is(run, tmp_path, monkeypatch):
+    """Its device and type: on a GPU they stayed on the CPU, where the type is float32."""
+    for sequence in evaluated(run, tmp_path, monkeypatch)["sequences"]:
+        assert sequence.start.velocity.dtype == sequence.start.rotation.dtype == torch.float64
+
+
+def test_another_scene_is_evaluated_in_its_own_world(run, cache, tmp_path, monkeypatch):
+    raised = Ground(0.07, "separate", 0.3)
+
+    def scenes(run_config):
+        scene, _ = load(run_config)
+        return replace(scene, ground=raised, gravity=torch.tensor([0.0, -3.7, 0.0])), []
+
+    load = pipeline.scenes
+    monkeypatch.setattr(pipeline, "scenes", scenes)
+    monkeypatch.setattr(pipeline, "sequence_start", lambda body, *_, **__: Start(torch.eye(3), body.center, *torch.zeros(2, 3)))
+    world = evaluated(run, tmp_path, monkeypatch, "scene=tiny", f"scene.cache={cache}")["world"]
+    assert world.ground == raised and world.gravity.tolist() == pytest.approx([0.0, -3.7, 0.0])
+    assert evaluated(run, tmp_path, monkeypatch)["world"].ground == Ground(0.0, "sticky", 0.0)
 
 
 def test_a_sweep_goes_on_after_a_job_that_fails_and_says_so_at_the_end(cache, tmp_path):

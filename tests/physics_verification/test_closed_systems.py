@@ -1,11 +1,15 @@
 """Checks 1 to 3 and 26 of docs/verification.md: what a closed system keeps, with the full adapter on."""
 
 import itertools
+import math
 
 import pytest
 import torch
-from bodies import LAWS, PRECISIONS
+from bodies import DENSITY, LAM, LAWS, MU, PRECISIONS, random_adapter
 from closed_systems import asymmetric_control, conservation, vibration
+
+from mosa.analysis.vibration import GROWTH_LIMIT, vibration_growth
+from mosa.modules.material import Material
 
 
 @pytest.mark.parametrize("dtype", PRECISIONS)
@@ -44,3 +48,19 @@ def test_26_control_the_literal_operator_can_pump():
     """The same random numbers without the projection are no passive law: above 1.05 per period is what a run warns of."""
     maxima = vibration("corotated", seed=7, major_symmetry=False)
     assert max(later / earlier for earlier, later in itertools.pairwise(maxima)) > 1.05
+
+
+@pytest.mark.parametrize("major_symmetry", [True, False])
+def test_26_a_run_reports_whether_its_law_makes_energy(major_symmetry):
+    """The same operator as in the control, through what a run does with the law it has learned."""
+    material = Material("corotated", {"E": MU * (3 * LAM + 2 * MU) / (LAM + MU), "nu": LAM / (2 * (LAM + MU))})
+    adapter = random_adapter(7, state_dependence="constant", no_pre=True, no_post=True, major_symmetry=major_symmetry)
+    adapter.fused = True  # as in a run on a GPU: the report is made on the CPU
+    growth = vibration_growth(material, adapter, density=DENSITY, stride=8)
+    assert growth < 1 if major_symmetry else growth > GROWTH_LIMIT
+
+
+def test_26_a_body_that_bursts_is_no_traceback_and_a_fluid_has_no_vibration():
+    adapter = random_adapter(0, size=3.0, rest_free=False, l_max=None)
+    assert vibration_growth(Material("corotated", {"E": 8e4, "nu": 0.3}), adapter, density=DENSITY, stride=8) == math.inf
+    assert vibration_growth(Material("newtonian", {"mu": 100.0, "kappa": 1e5}), None, density=DENSITY, stride=8) is None

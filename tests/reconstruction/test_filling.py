@@ -10,7 +10,7 @@ import squashed_body
 import torch
 
 from mosa.errors import DataError
-from mosa.reconstruction.filling import body_volume, carve, fill, smooth_occupancy
+from mosa.reconstruction.filling import body_volume, carve, fill
 from mosa.reconstruction.hull import (
     Volume,
     hull_bounds,
@@ -142,11 +142,3 @@ def test_carving_empties_what_two_views_see_through(hull, squashed):
     assert body_volume(carved) < 0.8 * body_volume(hull)
     assert body_volume(carve(hull, depth, 0 * alpha, cameras, tolerance=0.005)) == body_volume(hull)
     assert body_volume(carve(hull, depth - 0.1, alpha, cameras, tolerance=0.005)) == body_volume(hull)
-
-
-def test_smoothing_leaves_flat_faces_in_place():
-    values = torch.zeros(20, 20, 20)
-    values[4:16, 4:16, 4:16] = 1
-    smooth = smooth_occupancy(Volume(values, torch.zeros(3), 0.1), 1)
-    assert torch.equal(smooth.values[:, 10, 10] > 0.5, values[:, 10, 10] > 0.5)
-    assert not bool(smooth.values[4, 4, 4] > 0.5)

@@ -98,15 +98,6 @@ def test_an_empty_matte_names_camera_and_frame(squashed):
         object_windows(replace(squashed, mattes=mattes), list(range(8)), [0, 1])
 
 
-def test_half_resolution_windows_project_alike(still):
-    half = still.halved()
-    assert half.images.shape[1] == still.images.shape[1] // 2
-    point = torch.tensor([0.03, 0.29, 0.02])
-    for full, small in zip(still.cameras.K, half.cameras.K):
-        seen = still.cameras.w2c[0, :3, :3] @ point + still.cameras.w2c[0, :3, 3]
-        assert torch.allclose((full @ seen)[:2] / 2, (small @ seen)[:2], atol=1e-5)
-
-
 def test_start_lies_on_the_surface_with_its_colours(hull, still):
     points, normals, spacing = surface_points(hull, count=1500, seed=0)
     colors = projected_colors(points, normals, still)

@@ -1,0 +1,82 @@
+"""Does a learned law make energy? A bounded operator without major symmetry has none of its own, and a free body may then grow."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import torch
+
+from mosa.analysis.anisotropy import in_double
+from mosa.errors import SimulationDiverged
+from mosa.modules.adapter import Adapter
+from mosa.modules.body import ADAPTER_MARGIN
+from mosa.modules.material import Material
+from mosa.physics.rollout import Simulator
+from mosa.types import ParticleState
+
+GROWTH_LIMIT = 1.05
+"""Of the kinetic maximum in one period, above which a law is said to make energy (docs/verification.md, check 26)."""
+FRAMES = 40
+"""Per period: a kinetic maximum between two samples is then missed by at most 2.5 %."""
+NEGLIGIBLE = 1e-3
+"""Share of the first period's kinetic maximum below which a vibration has ended."""
+
+
+def youngs_modulus(material: Material) -> float | None:
+    """E [Pa] of the small-strain response; None for a fluid, which does not vibrate freely in shear."""
+    p = {name: float(value) for name, value in material.physical().items()}
+    if "E" in p:
+        return p["E"]
+    if float(material.max_viscosity()) > 0:
+        return None
+    return 9 * p["kappa"] * p["mu"] / (3 * p["kappa"] + p["mu"])
+
+
+@torch.no_grad()
+def vibration_growth(
+    material: Material,
+    adapter: Adapter | None,
+    *,
+    density: float,
+    stride: int,
+    law_options: dict | None = None,
+    periods: int = 10,
+    cells: int = 4,
+    amplitude: float = 0.02,
+) -> float | None:
+    """Largest ratio of the kinetic maxima of two periods in a row, of a block of a law that vibrates freely; None for a fluid.
+
+    The block, 2 cells x 1 x 1 times `cells`, is given the velocity of its first longitudinal mode, at most `amplitude` times the
+    speed of sound in a bar, about the strain; float64 on the CPU. adapter: switched on, or None for the prior; stride: substeps
+    between its evaluations; density [kg/m^3]. At most 1 where the law has an energy, infinite where the block bursts.
+    """
+    E = youngs_modulus(material)
+    if E is None:
+        return None
+    dx, spacing = 1.0, 0.5
+    axes = [torch.arange(n, dtype=torch.float64) * spacing + spacing / 2 for n in (4 * cells, 2 * cells, 2 * cells)]
+    x = torch.cartesian_prod(*axes)
+    n, length, speed = len(x), 2.0 * cells * dx, math.sqrt(E / density)
+    k = math.pi / length
+    v, C = torch.zeros(n, 3).double(), torch.zeros(n, 3, 3).double()
+    v[:, 0], C[:, 0, 0] = -amplitude * speed * torch.cos(k * x[:, 0]), amplitude * speed * k * torch.sin(k * x[:, 0])
+    F = torch.eye(3).double().expand(n, 3, 3).contiguous()
+    frame_dt = 2 * length / speed / FRAMES
+    needed = math.ceil(frame_dt * math.sqrt(ADAPTER_MARGIN * float(material.max_modulus()) / density) / (0.5 * dx))
+    steady = adapter is None or adapter.steady
+    substeps = needed if steady else -(-needed // stride) * stride
+    simulator = Simulator(material.law, dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=(0, 0, 0), dtype=torch.float64,
+                          **(law_options or {}))
+    parameters = {name: value.detach().double().cpu() for name, value in material.per_particle().items()}
+    held = None if adapter is None else in_double(adapter)
+    try:
+        rollout = simulator.rollout(
+            ParticleState(x, v, C, F, F), parameters, torch.full((n,), spacing**3).double(), density, periods * FRAMES + 1,
+            adapter=held, stride=None if steady else stride,
+        )  # fmt: skip
+    except SimulationDiverged:
+        return math.inf
+    maxima = rollout.v[1:].square().sum((1, 2)).reshape(periods, FRAMES).amax(1).tolist()
+    ratios = [later / earlier for earlier, later in itertools.pairwise(maxima) if earlier > NEGLIGIBLE * maxima[0]]
+    return max(ratios, default=0.0)

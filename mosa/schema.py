@@ -1,0 +1,147 @@
+"""What each value of the configuration may be, checked before anything is computed: a typing mistake costs no reconstruction.
+
+Only kinds and ranges of single values are here; which names, files and combinations exist is said where they are used.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from fnmatch import fnmatchcase
+from typing import Any, NamedTuple
+
+from mosa.errors import ConfigError
+
+
+class Kind(NamedTuple):
+    """described: as it stands in a message after 'expected'; fits: whether a value is one."""
+
+    described: str
+    fits: Callable[[Any], bool]
+
+
+def is_number(value: Any) -> bool:
+    """A finite number that is no flag."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def number(low: float, high: float = math.inf, *, above: bool = False) -> Kind:
+    """From `low`, or `above` it, to `high`."""
+    start = f"above {low:g}" if above else f"of at least {low:g}"
+    limit = f" and at most {high:g}" if math.isfinite(high) else ""
+    return Kind(f"a number {start}{limit}", lambda v: is_number(v) and (v > low or (v == low and not above)) and v <= high)
+
+
+def whole(low: int, high: int | None = None) -> Kind:
+    limit = "" if high is None else f" and at most {high}"
+    return Kind(f"a whole number of at least {low}{limit}",
+                lambda v: isinstance(v, int) and not isinstance(v, bool) and low <= v and (high is None or v <= high))
+
+
+def one_of(*names: str) -> Kind:
+    return Kind(" or ".join(names), lambda v: isinstance(v, str) and v in names)
+
+
+def or_null(kind: Kind) -> Kind:
+    return Kind(f"{kind.described}, or null", lambda v: v is None or kind.fits(v))
+
+
+FLAG = Kind("true or false", lambda v: isinstance(v, bool))
+NAMES = Kind("a list of names like [a, b]", lambda v: isinstance(v, list) and all(isinstance(name, str) for name in v))
+SECTION = Kind("a section of keys", lambda v: isinstance(v, Mapping))
+ENTRIES = Kind("a list of sections", lambda v: isinstance(v, list) and all(isinstance(entry, Mapping) for entry in v))
+THREE = Kind("three numbers", lambda v: isinstance(v, list) and len(v) == 3 and all(map(is_number, v)))
+TURN = Kind("four numbers, an axis and degrees", lambda v: isinstance(v, list) and len(v) == 4 and all(map(is_number, v)))
+POSITIVE, WEIGHT, COUNT = number(0, above=True), number(0), whole(1)
+
+TRAINING: dict[str, Kind] = {
+    "seed": whole(0, 2**32 - 1),
+    "scene.also_train": or_null(NAMES),
+    "fit.views": COUNT,
+    "fit.clip": POSITIVE,
+    "fit.*.iterations": whole(0),
+    "fit.*.lr*": WEIGHT,
+    "fit.*.converged": WEIGHT,
+    "fit.joint.start": or_null(one_of("prior", "prior_eta")),
+    "losses.*": WEIGHT,
+    "heterogeneity.enabled": FLAG,
+    "heterogeneity.amplitude": POSITIVE,
+    "heterogeneity.hidden": COUNT,
+    "heterogeneity.frequencies": whole(0),
+    "adapter.alpha": POSITIVE,
+    "adapter.l_max": or_null(POSITIVE),
+    "adapter.input_scale": POSITIVE,
+    "adapter.hidden": COUNT,
+    **{f"adapter.{name}": FLAG for name in ("rest_free", "plastic", "major_symmetry", "recompute", "no_C", "no_pre", "no_post",
+                                            "no_prior_stress")},
+    "simulation.particles": whole(8),
+    "simulation.dx": or_null(POSITIVE),
+    "simulation.courant": number(0, 1, above=True),  # beyond, an explicit step is unstable
+    "simulation.adaptive": FLAG,
+    "simulation.contact_offset": FLAG,
+    "prior.parameters": SECTION,
+    "prior.frozen": or_null(NAMES),
+    "prior.modulated": or_null(NAMES),
+    "prior.options": or_null(SECTION),
+    "prior.options.yield_convention": one_of("paper", "sqrt23"),
+    "prior.options.norm_eps": WEIGHT,
+    "prior.options.rebuild": FLAG,
+    "prior.options.on_inversion": one_of("warn", "ignore", "error"),
+    "prior.options.init_affine": one_of("spin", "zero"),
+    "rendering.margin": whole(0),
+    "reconstruction.resolution": whole(8),
+    "reconstruction.ridge_passes": whole(0),
+    "reconstruction.carve": FLAG,
+    "reconstruction.points": whole(8),
+    "reconstruction.neighbours": whole(4),  # fewer leave every deformation gradient open
+    "reconstruction.margin": whole(0),
+    "reconstruction.*.iterations": whole(0),
+    "reconstruction.*.views": COUNT,
+    "reconstruction.appearance.keep": WEIGHT,
+    "reconstruction.dynamic.modes": COUNT,
+    "reconstruction.dynamic.track_iterations": whole(0),
+    "reconstruction.dynamic.track_views": COUNT,
+    "reconstruction.dynamic.free_shape": FLAG,
+    "reconstruction.dynamic.elastic": WEIGHT,
+    "reconstruction.dynamic.bending": WEIGHT,
+    "reconstruction.dynamic.ssim": number(0, 1),
+    "reconstruction.dynamic.hidden": COUNT,
+    "world.walls": or_null(SECTION),
+    "world.colliders": or_null(ENTRIES),
+    "logger.enabled": FLAG,
+    "logger.images_every": whole(0),
+}
+EVALUATION: dict[str, Kind] = {
+    "evaluation.floor": FLAG,
+    "evaluation.samples": COUNT,
+    "evaluation.assignment": COUNT,
+    "evaluation.video": FLAG,
+}
+SIMULATION: dict[str, Kind] = {
+    "simulate.velocity": or_null(THREE),
+    "simulate.angular_velocity": or_null(THREE),
+    "simulate.rotation": or_null(TURN),
+    "simulate.height": or_null(Kind("a number", is_number)),
+    "simulate.colliders": or_null(ENTRIES),
+    "simulate.frames": COUNT,
+}
+
+
+def check(values: Mapping[str, Any], *schemas: Mapping[str, Kind]) -> None:
+    """Every value of a nested configuration that a schema knows is of its kind. Patterns stand for one level each.
+
+    Errors: ConfigError with the key, what was expected and what was found, for the first that is not.
+    """
+    kinds = {pattern: kind for schema in schemas for pattern, kind in schema.items()}
+    _check(values, kinds, ())
+
+
+def _check(values: Mapping[str, Any], kinds: Mapping[str, Kind], path: tuple[str, ...]) -> None:
+    for key, value in values.items():
+        here = (*path, str(key))
+        for pattern, kind in kinds.items():
+            parts = pattern.split(".")
+            if len(parts) == len(here) and all(map(fnmatchcase, here, parts)) and not kind.fits(value):
+                raise ConfigError(f"{'.'.join(here)}: expected {kind.described}, found {value!r}")
+        if isinstance(value, Mapping):
+            _check(value, kinds, here)
