@@ -1,6 +1,6 @@
 """The fused networks as one torch operation: what `ProgressiveOperator` computes, with nothing stored but inputs and weights.
 
-Sources of the kernels: network_kernels.py (forward), assembly_kernels.py, adjoint_kernels.py. Their torch twin is
+Sources of the kernels: network_kernels.py (forward), assembly_kernels.py, adjoint_kernels.py, sum_kernels.py. Their torch twin is
 mosa/modules/progressive.py.
 """
 
@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mosa.modules.fused.adjoint_kernels import phi_backward, psi1_backward, psi2_backward, theta_backward, weight_gradients
+from mosa.modules.fused.adjoint_kernels import phi_backward, psi1_backward, psi2_backward, theta_backward
 from mosa.modules.fused.assembly_kernels import assemble, assemble_adjoint, finish, normals, normals_adjoint
 from mosa.modules.fused.network_kernels import phi_forward, psi1_forward, psi2_forward, theta_forward
+from mosa.modules.fused.sum_kernels import weight_gradients
 from mosa.physics.activations import backward_at_hand
 
 LANES = 128
