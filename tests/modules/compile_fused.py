@@ -1,0 +1,52 @@
+"""Compiles the fused kernels for Hopper with the options they are launched with, without a GPU; prints what each takes, as JSON.
+
+A program of its own: in the tests' process Triton only interprets. python compile_fused.py PRECISION HIDDEN
+"""
+
+import importlib
+import inspect
+import json
+import sys
+
+import torch
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource, compile
+
+from mosa.modules.fused.operation import LANES, Settings, _Launch
+
+FORWARD = ("phi_forward", "psi1_forward", "psi2_forward", "theta_forward")
+BACKWARD = ("phi_backward", "psi1_backward", "psi2_backward", "theta_backward")
+BETWEEN = ("assemble", "assemble_adjoint", "normals", "normals_adjoint", "finish")
+FLAGS = {"BOUNDED": True, "EXTRA": False, "RESTED": True, "OPERATOR": True}
+INTEGERS, FLOATS = ("N", "M", "start", "size"), ("scale", "bound", "alpha")
+
+
+def compiled(module: str, name: str, options: dict) -> dict:
+    function = getattr(importlib.import_module(f"mosa.modules.fused.{module}_kernels"), name)
+    values = FLAGS | options
+    signature, constants, divisible = {}, {}, {}
+    for place, argument in enumerate(inspect.signature(function.fn).parameters):
+        if argument in values:
+            signature[argument], constants[(place,)] = "constexpr", values[argument]
+        elif argument in INTEGERS or argument in FLOATS:
+            signature[argument] = "i32" if argument in INTEGERS else "fp32"
+        else:
+            signature[argument] = "*fp32"
+        if argument == "M" or signature[argument] == "*fp32":
+            divisible[(place,)] = [["tt.divisibility", 16]]
+    launch = {key: options[key] for key in ("num_warps", "num_stages", "maxnreg") if key in options}
+    source = ASTSource(fn=function, signature=signature, constexprs=constants, attrs=divisible)
+    kernel = compile(source, target=GPUTarget("cuda", 90, 32), options=launch)
+    return {"shared": kernel.metadata.shared, "tensor_cores": "wgmma" in kernel.asm["ptx"] or "mma.sync" in kernel.asm["ptx"]}
+
+
+def main(precision: str, hidden: int) -> None:
+    launch = _Launch(Settings(0.1, 0.1, 10.0, True, precision), 1000, hidden, torch.device("cpu"))
+    found = {name: compiled("network", name, launch.forward()[1]) for name in FORWARD}
+    found |= {name: compiled("adjoint", name, launch.backward(True)[1]) for name in BACKWARD}
+    found |= {name: compiled("assembly", name, {"BLOCK": LANES, "num_warps": 4}) for name in BETWEEN}
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]))
