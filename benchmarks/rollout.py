@@ -16,7 +16,7 @@ process held beyond its start on a CPU. The first runs compile kernels and captu
     python benchmarks/rollout.py --device cuda --counts 30000 --variants none constant --frames 50 --forward-only
 
 is the forward rollout of 30k particles over 2000 substeps, in seconds in the last column. `--block`: threads of a CUDA block in the
-substeps, in place of the program's own.
+substeps, in place of the program's own. `--order`: of the particles in memory, for what the order costs.
 
 The check compares ratios of times in one run, of one interval, which the machine's speed cancels out of, and fails when one is more
 than a quarter above the stored one. `none forward / yardstick` has scattered sums of torch below it, as many as P2G has. Best CPU
@@ -57,6 +57,8 @@ DX, DT, DENSITY, MU, LAM = 1 / 32, 1e-4, 1000.0, 4e4, 6e4
 STRIDE = SimulationSettings.stride
 VARIANTS = {"none": (None, 1), "constant": ("operator", None), "stride1": ("mosa", 1), "mosa": ("mosa", STRIDE)}
 """Name: (file of conf/adapter, substeps between evaluations, None for one evaluation in all)."""
+ORDERS = ("lattice", "cell", "shuffled")
+"""Of the particles in memory: as a filling makes them, by the cell they lie in, by chance."""
 CHECK = {"particles": 2000, "substeps": 16, "rounds": 5}
 
 
@@ -84,10 +86,22 @@ class Case:
     both: Callable[[], None]
 
 
-def case(variant: str, particles: int, substeps: int, frames: int, device: str, settings: dict) -> Case:
+def ordered(x: torch.Tensor, order: str) -> torch.Tensor:
+    """(N,) indices that put the particles x (N, 3) in an order of ORDERS."""
+    if order == "shuffled":
+        return torch.randperm(len(x), generator=torch.Generator().manual_seed(1))
+    if order == "cell":
+        i, j, k = (x / DX - 0.5).floor().long().T
+        return torch.argsort((i * 1024 + j) * 1024 + k, stable=True)
+    return torch.arange(len(x))
+
+
+def case(variant: str, particles: int, substeps: int, frames: int, device: str, settings: dict, order: str = ORDERS[0]) -> Case:
     name, stride = VARIANTS[variant]
     adapter = adapter_of(name, device, settings)
-    state = ParticleState(*(t.to(device) for t in body(particles, DX, torch.float32)))
+    arrays = body(particles, DX, torch.float32)
+    index = ordered(arrays[0], order)
+    state = ParticleState(*(t[index].to(device) for t in arrays))
     volume = torch.full((particles,), (DX / 2) ** 3, device=device)
     sim = Simulator("corotated", dx=DX, substeps=substeps, frame_dt=substeps * DT, ground=Ground(2 * DX), device=device)
     leaves = [torch.tensor(MU, device=device), torch.zeros(3, device=device)]
@@ -175,7 +189,7 @@ def table(options: argparse.Namespace, settings: dict) -> None:
     for particles in options.counts:
         bases: list[float] = []
         for variant in options.variants:
-            run = case(variant, particles, options.substeps, options.frames, options.device, settings)
+            run = case(variant, particles, options.substeps, options.frames, options.device, settings, options.order)
             figures = []
             with memory:
                 for call in (run.forward, run.both)[: len(names)]:
@@ -265,6 +279,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, help="intervals of a rollout; 5 on CUDA, 1 on a CPU where not given")
     parser.add_argument("--forward-only", action="store_true", help="no backward pass")
     parser.add_argument("--block", type=int, default=workspace.BLOCK, help="threads of a CUDA block in the substeps")
+    parser.add_argument("--order", choices=ORDERS, default=ORDERS[0], help="of the particles in memory")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--store-activations", action="store_true", help="no recomputation of the networks")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="settings of the paper's adapter")
