@@ -307,11 +307,14 @@ class Chains:
         if key not in self._probes:
             if len(self._probes) >= MAX_CHAINS:
                 self._probes.clear()
-            held = torch.cuda.memory_allocated(device) if device.type == "cuda" else 0
             with torch.enable_grad(), at_hand():
                 leaves = [t.detach().requires_grad_() for t in (state[3], state[2], packed)]
-                answer = self.ask(adapter, *leaves)
-            held = torch.cuda.memory_allocated(device) - held if device.type == "cuda" else 0
+                answer, held = self.ask(adapter, *leaves), 0
+                if device.type == "cuda":  # the second one's: an adapter may hold its last graph, and frees it with the next
+                    held = torch.cuda.memory_allocated(device)
+                    second = self.ask(adapter, *leaves)
+                    held = torch.cuda.memory_allocated(device) - held
+                    del second
             self._probes[key] = adapter, answer["plastic_G"] is not None, held
         return self._probes[key]
 
