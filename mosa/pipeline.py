@@ -202,7 +202,7 @@ def take_of(cfg, scene: Scene, start: Start, reconstruction: Reconstruction, bod
                 first_contact(body, start, scene))
 
 
-BACKWARD = 3.5  # cost of a step with gradients over one without, measured on the rabbit
+BACKWARD = 2.5  # cost of a step with gradients over one without, measured on the rabbit
 ADAPTER_COST, ADAPTER_BYTES = 1.8, 4.8e3  # of a step with networks over one without; per particle and evaluation
 
 
