@@ -1,10 +1,12 @@
 """Device buffers of a segment of substeps, and the launches that advance it and run its adjoint.
 
-Everything is allocated once per (particles, slots, grid window); nothing allocates inside the substep loop. On CUDA the
-launches of a segment are captured as one graph the second time they are asked for with the same time step.
+Everything is allocated once per (particles, slots, grid window); nothing allocates inside the substep loop. The launches of a
+segment are captured as one graph the second time they are asked for with the same time step: on CUDA that saves the waits between
+them, on a CPU the 10 us that Python takes for each.
 """
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -57,6 +59,10 @@ class Steps(NamedTuple):
 
 MAX_GRAPHS = 64
 """Captured graphs a workspace keeps: one per pass and time step."""
+MAX_WINDOWS = 4
+"""Sizes of the window whose buffers and graphs a workspace on a CPU keeps: a body that falls and bounces comes back to them."""
+GRID = ("grid", "grid_wp", "velocity", "velocity_wp", "adj_grid", "adj_grid_wp", "adj_velocity", "adj_velocity_wp", "_graphs")
+"""What belongs to a size of the window."""
 BLOCK = 64
 """Threads of a CUDA block: small ones, so that ten thousand particles are spread over all multiprocessors."""
 
@@ -137,6 +143,7 @@ class Workspace:
         self.lowest, self.dims = (0, 0, 0), (0, 0, 0)
         self.steps = Steps(numerics.dt, numerics.dt)
         self._graphs: dict[tuple, object] = {}
+        self._windows: dict[tuple[int, int, int], dict] = {}
 
     def _array(self, shape: tuple[int, ...], kind, dtype: torch.dtype | None = None):
         tensor = torch.zeros(shape, dtype=dtype or self.numerics.dtype, device=self.numerics.device)
@@ -152,13 +159,17 @@ class Workspace:
         return [part[0]._base for part in parts]
 
     def set_window(self, origin: tuple[int, int, int], dims: tuple[int, int, int]) -> None:
-        """Place the grid: lowest node and number of nodes per axis. Reallocates (and forgets graphs) when dims change."""
+        """Place the grid: lowest node and number of nodes per axis. When dims change its buffers and graphs do too."""
         if origin != self.lowest:
             self.lowest = origin
             self.origin.copy_(torch.tensor([origin], dtype=torch.int32), non_blocking=True)  # CUDA stages it before it returns
         if dims == self.dims:
             return
+        known = self._exchanged(dims)
         self.dims, nodes = dims, dims[0] * dims[1] * dims[2]
+        if known is not None:
+            self.__dict__.update(known)
+            return
         grids = self.substeps if self.with_adjoint else 1
         self.grid, self.grid_wp = self._per_slot(grids, (nodes, 4), self.kernels.vec4)
         self.velocity, self.velocity_wp = self._per_slot(grids, (nodes, 4), self.kernels.vec4)
@@ -167,7 +178,19 @@ class Workspace:
         if self.with_adjoint:
             self.adj_grid, self.adj_grid_wp = self._array((nodes, 4), self.kernels.vec4)
             self.adj_velocity, self.adj_velocity_wp = self._array((nodes, 4), self.kernels.vec4)
-        self._graphs.clear()
+        self._graphs = {}
+
+    def _exchanged(self, dims: tuple[int, int, int]) -> dict | None:
+        """What a window of `dims` nodes had when it was left; what the present one has is kept for its return. On a CPU only: a GPU
+        has room for one window's buffers, and colliders have buffers of their own."""
+        if self.numerics.device.type == "cuda" or self.colliders is not None:
+            return None
+        if self.dims != (0, 0, 0):
+            self._windows[self.dims] = {name: self.__dict__[name] for name in GRID if name in self.__dict__}
+        known = self._windows.pop(dims, None)
+        while len(self._windows) >= MAX_WINDOWS:
+            self._windows.pop(next(iter(self._windows)))
+        return known
 
     def load(
         self, state: tuple[Tensor, ...], held: dict[str, Tensor | None], volume: Tensor, mass: Tensor, cutoff: float,
@@ -186,6 +209,7 @@ class Workspace:
         if cutoff != self.cutoff:
             self.cutoff = cutoff
             self._graphs.clear()
+            self._windows.clear()
 
     def hold(self, held: dict[str, Tensor | None]) -> None:
         """Copy parameters and the adapter's operator in, those that are given."""
@@ -214,10 +238,8 @@ class Workspace:
         self._launch("adjoint", lambda: self.adjoint_steps(0, self.substeps))
 
     def _launch(self, name: str, body) -> None:
-        if self.numerics.device.type != "cuda":
-            body()
-            return
-        stream = wp.stream_from_torch(torch.cuda.current_stream(self.numerics.device))
+        cuda = self.numerics.device.type == "cuda"
+        stream = wp.stream_from_torch(torch.cuda.current_stream(self.numerics.device)) if cuda else None
         key = (name, *self.steps)
         graph = self._graphs.get(key)
         if len(self._graphs) > MAX_GRAPHS:
@@ -228,7 +250,7 @@ class Workspace:
                 body()
             graph = self._graphs[key] = capture.graph
         if graph is None:
-            with wp.ScopedStream(stream):
+            with wp.ScopedStream(stream) if cuda else nullcontext():
                 body()  # the first pass compiles and loads the kernels, which a capture must not do
             self._graphs[key] = "loaded"
         else:
