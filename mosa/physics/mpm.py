@@ -169,10 +169,10 @@ class SegmentSolver:
         self._known = (*_identity(state), bounds, [t.detach() for t in state[:2]])
 
     def _kept(self, dims: tuple[int, int, int]) -> tuple[int, int, int]:
-        """`dims` or those of an earlier segment: buffers of another size cost CUDA a new capture, nodes more cost a CPU time."""
-        least = _largest([dims, self._dims])
+        """`dims`; on CUDA those of an earlier segment where they are not much larger: buffers of another size cost a new capture."""
         if self.numerics.device.type != "cuda":
-            return least
+            return dims
+        least = _largest([dims, self._dims])
         roomy = _largest([least, *(work.dims for work in self._workspaces.values())])
         return roomy if math.prod(roomy) <= max(SPARE * math.prod(dims), SMALL) else least
 

@@ -59,7 +59,7 @@ class Steps(NamedTuple):
 
 MAX_GRAPHS = 64
 """Captured graphs a workspace keeps: one per pass and time step."""
-MAX_WINDOWS = 4
+MAX_WINDOWS = 8
 """Sizes of the window whose buffers and graphs a workspace on a CPU keeps: a body that falls and bounces comes back to them."""
 GRID = ("grid", "grid_wp", "velocity", "velocity_wp", "adj_grid", "adj_grid_wp", "adj_velocity", "adj_velocity_wp", "_graphs")
 """What belongs to a size of the window."""
