@@ -47,13 +47,11 @@ from mosa.pipeline import body_of, reconstruct_scene, scenes
 from mosa.reconstruction.cues import neighbourhood, polar
 from mosa.reconstruction.filling import body_volume
 from mosa.reconstruction.hull import hull_bounds, visual_hull
-from mosa.reconstruction.observed import object_windows
 from mosa.reconstruction.pipeline import ReconstructionSettings, build_settings, object_hull
 from mosa.reconstruction.starts import first_contact, sequence_start
-from mosa.reconstruction.static import fit_splats, initial_splats
 from mosa.rendering.cameras import crop_boxes, crop_images, project
 from mosa.rendering.covariance import covariance_from
-from mosa.types import Cameras, Reconstruction, Scene, Splats
+from mosa.types import Cameras, Reconstruction, Scene
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -110,13 +108,6 @@ def balls(positions: Tensor, volume: Tensor, view: Cameras, finer: int = 8) -> T
     return torch.from_numpy(pictures).unflatten(1, (-1, finer)).unflatten(3, (-1, finer)).float().mean((2, 4))
 
 
-def static_gaussians(scene: Scene, settings: ReconstructionSettings, seed: int) -> Splats:
-    """The Gaussians of the static stage, as `reconstruct` fits them (it gives back the particles only)."""
-    still = object_windows(scene, scene.training_cameras, scene.training_frames, margin=settings.margin).of_frame(0)
-    start = initial_splats(object_hull(scene, settings), still, count=settings.points, seed=seed)
-    return fit_splats(start, still, scene.background, settings.static, move=True, seed=seed)
-
-
 def overlap(alpha: Tensor, mattes: Tensor) -> list[float]:
     """Intersection over union per frame of (T, H, W) and (T, H, W), both cut at 0.5."""
     a, b = alpha > 0.5, mattes > 0.5
@@ -128,9 +119,9 @@ def area_ratio(alpha: Tensor, mattes: Tensor) -> float:
     return float((alpha > 0.5).sum() / (mattes > 0.5).sum())
 
 
-def held_out_figures(seen: Seen, seed: int) -> dict:
+def held_out_figures(seen: Seen) -> dict:
     """Images and silhouettes of the held-out camera."""
-    scene, camera, splats = seen.scene, [seen.camera], static_gaussians(seen.scene, seen.settings, seed)
+    scene, camera, splats = seen.scene, [seen.camera], seen.result.static
     covariances = covariance_from(splats.scales, splats.rotations)[None]
     view = scene.cameras.select(camera)
     with torch.no_grad():
@@ -236,7 +227,7 @@ def measure(overrides: list[str], out: Path) -> dict:
     seen = see(cfg)
     return {
         "overrides": overrides, "width_px": seen.scene.cameras.width, "particles": len(seen.result.volume),
-        "spacing_m": seen.result.spacing, "seed": cfg.seed, "held_out": held_out_figures(seen, cfg.seed),
+        "spacing_m": seen.result.spacing, "seed": cfg.seed, "held_out": held_out_figures(seen),
         "volume": volume_figures(seen, published), "flight": flight_figures(seen, cfg, published), "flow": flow_figures(seen),
         "shadow": shadow_figures(seen),
     }  # fmt: skip

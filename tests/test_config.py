@@ -86,11 +86,14 @@ def test_every_option_passes_the_checks_before_a_run(group_name):
     "heterogeneity.enabled=maybe", "heterogeneity.amplitude=abc", "adapter.alpha=.nan", "adapter.plastic=1",
     "simulation.particles=1.5", "simulation.dx=abc", "simulation.courant=5", "simulation.contact_offset=abc", "prior.frozen=E",
     "rendering.margin=abc", "reconstruction.resolution=0", "reconstruction.points=2", "reconstruction.neighbours=1",
-    "reconstruction.static.views=abc", "reconstruction.dynamic.modes=0", "world.walls=5", "world.colliders=[5]",
+    "reconstruction.static.views=abc", "reconstruction.static.start=colmap", "reconstruction.static.shape=1",
+    "reconstruction.static.densify=split", "reconstruction.static.max_points=3.5", "+reconstruction.static.growth=-1",
+    "reconstruction.appearance.shape=round", "+reconstruction.appearance.axis_ratio=0.5",
+    "reconstruction.dynamic.modes=0", "world.walls=5", "world.colliders=[5]",
     "evaluation.samples=0", "logger.images_every=-1",
 ])  # fmt: skip
 def test_a_value_of_the_wrong_kind_is_named_before_anything_is_computed(override):
-    with pytest.raises(ConfigError, match=rf"^{override.split('=')[0]}: expected .*, found "):
+    with pytest.raises(ConfigError, match=rf"^{override.lstrip('+').split('=')[0]}: expected .*, found "):
         check(composed(override), TRAINING, EVALUATION)
 
 
@@ -98,6 +101,7 @@ def test_a_value_of_the_wrong_kind_is_named_before_anything_is_computed(override
     (["prior.parameters.nu=0.7"], r"prior\.parameters\.nu"),
     (["+prior.foo=1"], r"prior\.foo: unknown key; expected one of law, parameters, frozen, modulated"),
     (["+prior.options.foo=1"], r"prior\.options\.foo: unknown key; expected one of yield_convention"),
+    (["reconstruction.static.max_points=5000"], r"reconstruction\.static\.max_points: expected null"),
     (["adapter.alpha=2"], r"adapter\.alpha"),
     (["heterogeneity.amplitude=2"], r"heterogeneity\.amplitude"),
     (["simulation.precision=16"], r"simulation\.precision"),

@@ -19,7 +19,7 @@ from mosa.reconstruction.cues import Neighbourhood
 from mosa.reconstruction.modes import Modes
 from mosa.reconstruction.motion import ModalMotion, MotionBasisNetwork, MotionSample
 from mosa.reconstruction.observed import Windows
-from mosa.reconstruction.static import image_loss
+from mosa.reconstruction.photometric import image_loss
 from mosa.reconstruction.uniform_adam import UniformAdam
 from mosa.rendering.rasterizer import rasterize
 from mosa.types import Splats

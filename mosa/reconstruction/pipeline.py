@@ -20,9 +20,10 @@ from mosa.reconstruction.cues import gaussian_cues, neighbourhood, neighbourhood
 from mosa.reconstruction.dynamic import DynamicSettings, Scaffold, fit_motion
 from mosa.reconstruction.filling import Particles, body_volume, carve, fill
 from mosa.reconstruction.hull import Volume, hull_bounds, hull_centroid, shave_ridges, visual_hull
+from mosa.reconstruction.initial import inherited_colors
 from mosa.reconstruction.modes import deformation_modes
 from mosa.reconstruction.observed import Windows, object_windows
-from mosa.reconstruction.static import FitSettings, fit_splats, inherited_colors, initial_splats
+from mosa.reconstruction.static import FitSettings, StaticSettings, fit_splats, start_splats
 from mosa.rendering.covariance import covariance_from, matrix_to_quaternion, quaternion_multiply
 from mosa.rendering.rasterizer import expected_depth, rasterize
 from mosa.types import MotionCues, Reconstruction, Scene, Splats
@@ -34,10 +35,10 @@ CACHE_VERSION = 2
 @dataclass(frozen=True)
 class ReconstructionSettings:
     """resolution: voxels along the object's longest side in the hull; ridge_passes: hull.shave_ridges; carve: empty what
-    lies in front of the static Gaussians' depth by more than carve_tolerance [spacings]; points: static Gaussians;
-    neighbours: of the least-squares deformation; cue: neighbourhood | gaussian (docs/cues.md); margin: px of the
-    windows around mattes; splats: 3DGS PLY file of the object at frame 0, in the scene's world, that replaces the static
-    stage (None: fit it)."""
+    lies in front of the static Gaussians' depth by more than carve_tolerance [spacings]; points: static Gaussians
+    (with static.densify=mcmc at the start); neighbours: of the least-squares deformation; cue: neighbourhood | gaussian
+    (docs/cues.md); margin: px of the windows around mattes; splats: 3DGS PLY file of the object at frame 0, in the scene's
+    world, that replaces the static stage (None: fit it)."""
 
     resolution: int = 80
     ridge_passes: int = 24
@@ -48,13 +49,18 @@ class ReconstructionSettings:
     cue: str = "neighbourhood"
     margin: int = 6
     splats: str | None = None
-    static: FitSettings = field(default_factory=FitSettings)
+    static: StaticSettings = field(default_factory=StaticSettings)
     appearance: FitSettings = field(default_factory=lambda: FitSettings(keep=1.0))
     dynamic: DynamicSettings = field(default_factory=DynamicSettings)
 
     def __post_init__(self) -> None:
         if self.cue not in ("neighbourhood", "gaussian"):
             raise ConfigError(f"reconstruction.cue: expected neighbourhood or gaussian, found {self.cue!r}")
+        if self.static.max_points is not None and self.static.max_points < self.points:
+            raise ConfigError(
+                f"reconstruction.static.max_points: expected at least reconstruction.points={self.points}, the number at the "
+                f"start, found {self.static.max_points}"
+            )
         free = self.dynamic.free_shape or self.dynamic.model == "network"
         if self.cue == "gaussian" and not free:
             raise ConfigError(
@@ -74,7 +80,7 @@ def _section(cls: type, values: Mapping[str, Any], where: str) -> Any:
 def build_settings(**keys: Any) -> ReconstructionSettings:
     """Settings from the plain keys of conf/reconstruction; ConfigError names an unknown key."""
     keys = dict(keys)
-    sections = {"static": FitSettings, "appearance": FitSettings, "dynamic": DynamicSettings}
+    sections = {"static": StaticSettings, "appearance": FitSettings, "dynamic": DynamicSettings}
     for name, cls in sections.items():
         if name in keys:
             keys[name] = _section(cls, keys[name] or {}, f"reconstruction.{name}")
@@ -204,7 +210,7 @@ def reconstruct(
         if settings.splats is not None:
             cache.strip("static", still, _render_still(imported.to(device), still, background))
             return _tensors(imported)
-        start = initial_splats(hull, still, count=settings.points, seed=seed)
+        start = start_splats(hull, still, settings.static, count=settings.points, seed=seed)
         with bar("static Gaussians", settings.static.iterations) as steps:
             fitted = fit_splats(start, still, background, settings.static, move=True, seed=seed, progress=steps.update)
         cache.strip("static", still, _render_still(fitted, still, background))

@@ -1,4 +1,4 @@
-"""Static stage: isotropic Gaussians fitted to one frame by rendering, from the visual hull's surface (paper, section 3.2)."""
+"""Static stage: Gaussians fitted to one frame by rendering, and where they start (paper, section 3.2)."""
 
 from __future__ import annotations
 
@@ -6,28 +6,35 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-import torch.nn.functional as F
-from kornia.filters import filter2d_separable, get_gaussian_kernel1d
-from scipy import ndimage
-from scipy.spatial import cKDTree
 from torch import Tensor
 
+from mosa.errors import ConfigError
+from mosa.reconstruction.densification import MarkovChain, Relocation
+from mosa.reconstruction.gaussians import FreeGaussians, Rates
 from mosa.reconstruction.hull import Volume
+from mosa.reconstruction.initial import initial_splats, random_splats
 from mosa.reconstruction.observed import Windows
+from mosa.reconstruction.photometric import image_loss
 from mosa.rendering.rasterizer import rasterize
 from mosa.types import Splats
 
-SSIM_SIGMA = 1.5
+SMALLEST = 0.25
+"""Bound of a scale in units of its start."""
+STARTS = {"hull": initial_splats, "random": random_splats}
+
+
+def _one_of(key: str, value: str, known: tuple[str, ...]) -> None:
+    if value not in known:
+        raise ConfigError(f"reconstruction.{key}: expected {' or '.join(known)}, found {value!r}")
 
 
 @dataclass(frozen=True)
 class FitSettings:
     """iterations; views: images per step; lr_*: Adam steps, of positions in units of the mean scale, of the others per
     unconstrained number; ssim: weight of 1 - SSIM against L1; matte: weight of the alpha term; keep: what a Gaussian's first colour
-    counts for, in pixels of an image; largest: bound of a scale in units of its start; relocate_every: steps between moves of
-    vanished Gaussians to where opaque ones are (0: never)."""
+    counts for, in pixels of an image; largest: bound of a scale in units of its start; shape: isotropic | anisotropic, three scales
+    and a rotation, which start isotropic; axis_ratio: an anisotropic one's largest scale over its smallest, at most."""
 
     iterations: int = 400
     views: int = 2
@@ -35,117 +42,55 @@ class FitSettings:
     lr_scales: float = 0.02
     lr_opacities: float = 0.05
     lr_colors: float = 0.02
+    lr_rotations: float = 0.02
     ssim: float = 0.2
     matte: float = 1.0
     keep: float = 0.0
     largest: float = 2.0
+    shape: str = "isotropic"
+    axis_ratio: float = 10.0
+
+    def __post_init__(self) -> None:
+        _one_of("*.shape", self.shape, ("isotropic", "anisotropic"))
+
+
+@dataclass(frozen=True)
+class StaticSettings(FitSettings):
+    """start: hull, on the visual hull's surface | random, in its box; densify: relocate, every `relocate_every` steps (0: never)
+    vanished Gaussians are moved to where opaque ones are | mcmc, every `refine_every` steps they are moved and `growth` of the
+    number is added, up to `max_points` (None: the number at the start), as copies that leave the image as it is. Of mcmc also:
+    fade, what an opacity of 1 costs, in pixels of an image: Gaussians that no image shows vanish and get moved; noise: random
+    steps of those about to vanish, in their standard deviations at the first step."""
+
+    start: str = "hull"
+    densify: str = "relocate"
+    max_points: int | None = None
     relocate_every: int = 100
+    refine_every: int = 10
+    growth: float = 0.1
+    fade: float = 0.03
+    noise: float = 0.2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _one_of("static.start", self.start, tuple(STARTS))
+        _one_of("static.densify", self.densify, ("relocate", "mcmc"))
+        if self.max_points is not None and self.densify != "mcmc":
+            raise ConfigError(
+                f"reconstruction.static.max_points: expected null, found {self.max_points}: densify={self.densify} keeps the "
+                "number of Gaussians (reconstruction.points); set reconstruction.static.densify=mcmc"
+            )
+
+    def densifier(self, count: int) -> Relocation | MarkovChain:
+        """What moves and adds Gaussians, of which there are `count` at the start."""
+        if self.densify == "relocate":
+            return Relocation(self.relocate_every)
+        return MarkovChain(self.max_points or count, self.refine_every, self.growth, self.fade, self.noise)
 
 
-def ssim(a: Tensor, b: Tensor) -> Tensor:
-    """Mean structural similarity of images (B, H, W, C) in [0, 1]: 11 x 11 Gaussian window, sigma 1.5 (Wang et al. 2004)."""
-    window = get_gaussian_kernel1d(11, SSIM_SIGMA, device=a.device, dtype=a.dtype)
-    x, y = a.permute(0, 3, 1, 2), b.permute(0, 3, 1, 2)
-    products = torch.cat([x, y, x * x, y * y, x * y], 1)
-    moments = filter2d_separable(products, window, window, padding="valid").split(a.shape[-1], 1)
-    mx, my, xx, yy, xy = moments
-    vx, vy, vxy = xx - mx * mx, yy - my * my, xy - mx * my
-    c1, c2 = 0.01**2, 0.03**2
-    return (((2 * mx * my + c1) * (2 * vxy + c2)) / ((mx * mx + my * my + c1) * (vx + vy + c2))).mean()
-
-
-def image_loss(image: Tensor, alpha: Tensor, windows: Windows, *, ssim_weight: float, matte_weight: float) -> Tensor:
-    """(1 - w) L1 + w (1 - SSIM) of colours, plus L1 of alpha against the mattes."""
-    loss = (1 - ssim_weight) * (image - windows.images).abs().mean()
-    if ssim_weight > 0:
-        loss = loss + ssim_weight * (1 - ssim(image, windows.images))
-    return loss + matte_weight * (alpha - windows.mattes).abs().mean()
-
-
-def isotropic_covariances(scale: Tensor) -> Tensor:
-    """(N, 3, 3) [m^2] of standard deviations (N,) [m]."""
-    return (scale**2)[:, None, None] * torch.eye(3, dtype=scale.dtype, device=scale.device)
-
-
-def surface_points(volume: Volume, *, count: int, seed: int) -> tuple[Tensor, Tensor, float]:
-    """About `count` points on the 0.5 level, outward normals, and their mean spacing [m]; drawn without replacement."""
-    values = volume.values.cpu().numpy()
-    inside = values > 0.5
-    shell = inside & ~ndimage.binary_erosion(inside)
-    index = np.argwhere(shell)
-    smooth = ndimage.gaussian_filter(inside.astype(np.float32), 1.5)
-    normal = -np.stack([g[shell] for g in np.gradient(smooth)], -1)
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True).clip(1e-6)
-    rng = np.random.default_rng(seed)
-    order = rng.permutation(len(index))[:count]
-    points = torch.as_tensor(index[order], dtype=torch.float32) * volume.pitch + volume.origin.cpu()
-    spacing = volume.pitch * math.sqrt(len(index) / len(order))
-    return points, torch.as_tensor(normal[order], dtype=torch.float32), spacing
-
-
-def projected_colors(points: Tensor, normals: Tensor, windows: Windows) -> Tensor:
-    """Colours (N, 3) of surface points: mean over the views that face them, weighted by the cosine to the fourth power.
-
-    Occlusion by other parts is not looked at; the fit corrects it.
-    """
-    cameras = windows.cameras
-    seen = points @ cameras.w2c[:, :3, :3].transpose(1, 2) + cameras.w2c[:, None, :3, 3]
-    pixel = seen @ cameras.K.transpose(1, 2)
-    pixel = pixel[..., :2] / pixel[..., 2:].clamp(min=1e-6)
-    grid = (2 * pixel / pixel.new_tensor([cameras.width, cameras.height]) - 1)[:, None]
-    stacked = torch.cat([windows.images * windows.mattes[..., None], windows.mattes[..., None]], -1).permute(0, 3, 1, 2)
-    sampled = F.grid_sample(stacked, grid, align_corners=False)[:, :, 0].transpose(1, 2)
-    centre = -(cameras.w2c[:, :3, :3].transpose(1, 2) @ cameras.w2c[:, :3, 3:])[..., 0]
-    cosine = (F.normalize(centre[:, None] - points, dim=-1) * normals).sum(-1).clamp(min=0)
-    weight = (cosine + 0.02) ** 4
-    total = (weight[..., None] * sampled).sum(0)
-    # the floor lies below the weight of points that every view sees from behind (0.02^4): they get a colour too
-    return (total[:, :3] / total[:, 3:].clamp(min=1e-9)).clamp(0.02, 0.98)
-
-
-def initial_splats(volume: Volume, windows: Windows, *, count: int, seed: int) -> Splats:
-    """Isotropic Gaussians on the surface of an occupancy volume, coloured by the images that face them."""
-    points, normals, spacing = surface_points(volume, count=count, seed=seed)
-    device = windows.images.device
-    points, normals = points.to(device), normals.to(device)
-    n = len(points)
-    rotations = torch.zeros(n, 4, device=device)
-    rotations[:, 0] = 1
-    return Splats(
-        points,
-        torch.full((n, 3), 0.6 * spacing, device=device),
-        rotations,
-        torch.full((n,), 0.7, device=device),
-        projected_colors(points, normals, windows),
-    )
-
-
-def inherited_colors(points: Tensor, splats: Splats, *, neighbours: int = 4) -> Tensor:
-    """Colours (N, 3) of points from the nearest opaque Gaussians, inverse-distance mean."""
-    opaque = (splats.opacities > 0.3).cpu().numpy()
-    opaque = opaque if opaque.sum() >= neighbours else np.ones(len(opaque), bool)
-    means = splats.means.detach().cpu().numpy()[opaque]
-    distance, index = cKDTree(means).query(points.cpu().numpy(), k=neighbours)
-    weight = torch.as_tensor(1 / (distance + 1e-6), dtype=torch.float32)
-    colors = splats.colors.detach().cpu()[opaque][torch.as_tensor(index)]
-    return ((weight[..., None] * colors).sum(1) / weight.sum(1, keepdim=True)).to(points.device)
-
-
-def _relocate(parameters: dict[str, Tensor], optimizer: torch.optim.Adam, generator: torch.Generator) -> None:
-    """Moves Gaussians whose opacity fell below 0.02 onto opaque ones, at half their scale apart, and forgets their momentum."""
-    opacity = torch.sigmoid(parameters["opacity"])
-    dead = (opacity < 0.02).nonzero()[:, 0]
-    if len(dead) == 0 or len(dead) == len(opacity):
-        return
-    chance = torch.where(opacity < 0.02, torch.zeros_like(opacity), opacity * parameters["log_scale"].exp() ** 2)
-    target = torch.multinomial(chance.cpu(), len(dead), replacement=True, generator=generator).to(dead.device)
-    for value in parameters.values():
-        value.data[dead] = value.data[target]
-        for moment in ("exp_avg", "exp_avg_sq"):
-            if value in optimizer.state:
-                optimizer.state[value][moment][dead] = 0
-    noise = torch.randn(len(dead), 3, generator=generator).to(dead.device)
-    parameters["means"].data[dead] += noise * 0.5 * parameters["log_scale"].data[dead].exp()[:, None]
+def start_splats(volume: Volume, windows: Windows, settings: StaticSettings, *, count: int, seed: int) -> Splats:
+    """`count` Gaussians, less where the hull's surface has fewer voxels, from which the static stage starts."""
+    return STARTS[settings.start](volume, windows, count=count, seed=seed)
 
 
 def fit_splats(
@@ -158,41 +103,37 @@ def fit_splats(
     seed: int,
     progress: Callable[[int], None] | None = None,
 ) -> Splats:
-    """Isotropic Gaussians fitted to windows of ONE frame: colours, opacities, scales and, with `move`, positions."""
+    """Gaussians fitted to windows of ONE frame: colours, opacities, scales, rotations where anisotropic, positions with `move`.
+
+    They start isotropic, of the mean scale of `splats`. With `move` and StaticSettings vanished ones are moved; with densify=mcmc
+    their number changes, never beyond `max_points`. The same bits for the same seed on a CPU.
+    """
     generator = torch.Generator().manual_seed(seed)
-    scale0 = splats.scales.mean(1)
-    unit = float(scale0.mean())
-    parameters = {
-        "means": splats.means.clone(),
-        "log_scale": scale0.log(),
-        "opacity": torch.logit(splats.opacities.clamp(0.01, 0.99)),
-        "color": torch.logit(splats.colors.clamp(0.01, 0.99)),
-    }
-    rates = {
-        "means": settings.lr_positions * unit,
-        "log_scale": settings.lr_scales,
-        "opacity": settings.lr_opacities,
-        "color": settings.lr_colors * 4,
-    }
-    learned = {name: p.requires_grad_(True) for name, p in parameters.items() if move or name != "means"}
-    optimizer = torch.optim.Adam(
-        [{"params": [p], "lr": rates[name], "name": name} for name, p in learned.items()], betas=(0.9, 0.99), eps=1e-12
+    densifier = settings.densifier(len(splats.means)) if move and isinstance(settings, StaticSettings) else None
+    unit = float(splats.scales.mean(1).mean())
+    rates = Rates(
+        settings.lr_positions * unit, settings.lr_scales, settings.lr_opacities, settings.lr_colors * 4, settings.lr_rotations
     )
-    start = [group["lr"] for group in optimizer.param_groups]
+    gaussians = FreeGaussians(
+        splats,
+        rates,
+        move=move,
+        anisotropic=settings.shape == "anisotropic",
+        smallest=SMALLEST * (densifier.shrinkage(len(splats.means)) if densifier is not None else 1.0),
+        largest=settings.largest,
+        axis_ratio=settings.axis_ratio,
+    )
     order = torch.empty(0, dtype=torch.long)
-    lower, upper = (scale0 / 4).log(), (scale0 * settings.largest).log()
     for step in range(settings.iterations):
         while len(order) < settings.views:
             order = torch.cat([order, torch.randperm(len(windows), generator=generator)])
         batch, order = windows.select(order[: settings.views]), order[settings.views :]
-        for group, rate in zip(optimizer.param_groups, start):
-            group["lr"] = rate * (0.55 + 0.45 * math.cos(math.pi * step / settings.iterations))
-        scale = parameters["log_scale"].exp()
+        gaussians.anneal(0.55 + 0.45 * math.cos(math.pi * step / settings.iterations))
         image, alpha = rasterize(
-            parameters["means"][None],
-            isotropic_covariances(scale)[None],
-            torch.sigmoid(parameters["opacity"]),
-            torch.sigmoid(parameters["color"])[None],
+            gaussians.parameters["means"][None],
+            gaussians.covariances()[None],
+            gaussians.opacities,
+            gaussians.colors[None],
             batch.cameras,
             torch.zeros(len(batch), dtype=torch.long, device=background.device),
             background,
@@ -201,28 +142,18 @@ def fit_splats(
         if settings.keep > 0:
             # Adam moves a Gaussian of a hundredth of a pixel as fast as one of ten: hardly seen ones drift to any colour, which
             # shows when the object turns
-            change = torch.sigmoid(parameters["color"]) - splats.colors
+            change = gaussians.colors - gaussians.fixed["first_colors"]
             loss = loss + settings.keep * change.square().mean(1).sum() / alpha.numel()
-        optimizer.zero_grad(set_to_none=True)
+        if densifier is not None and densifier.fade > 0:
+            loss = loss + densifier.fade * gaussians.opacities.sum() / alpha.numel()
+        gaussians.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        optimizer.step()
-        with torch.no_grad():
-            parameters["log_scale"].clamp_(lower, upper)
-            if (
-                move
-                and settings.relocate_every
-                and step
-                and step % settings.relocate_every == 0
-                and step < 0.8 * settings.iterations
-            ):
-                _relocate(parameters, optimizer, generator)
+        gaussians.optimizer.step()
+        gaussians.bound()
+        if densifier is not None and step:
+            densifier.after_step(gaussians, step, settings.iterations, generator)
         if progress is not None:
             progress(1)
-    with torch.no_grad():
-        return Splats(
-            parameters["means"].detach(),
-            parameters["log_scale"].exp()[:, None].repeat(1, 3),
-            splats.rotations,
-            torch.sigmoid(parameters["opacity"]),
-            torch.sigmoid(parameters["color"]),
-        )
+    if densifier is not None:
+        densifier.finish(gaussians)
+    return gaussians.splats()

@@ -8,9 +8,9 @@ import torch
 from mosa.data.splats import save_ply
 from mosa.errors import DataError
 from mosa.reconstruction import pipeline
+from mosa.reconstruction.initial import initial_splats
 from mosa.reconstruction.observed import object_windows
 from mosa.reconstruction.pipeline import build_settings, object_hull, reconstruct
-from mosa.reconstruction.static import initial_splats
 
 QUICK = {
     "resolution": 32, "ridge_passes": 4, "static": {"iterations": 3}, "appearance": {"iterations": 3},

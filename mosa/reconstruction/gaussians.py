@@ -1,0 +1,132 @@
+"""A set of Gaussians while it is fitted: free numbers, their bounds, and Adam's moments, which follow their Gaussian."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mosa.rendering.covariance import covariance_from
+from mosa.types import Splats
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Adam's steps: of positions [m], of the others per number that is free of constraints."""
+
+    means: float
+    log_scale: float
+    opacity: float
+    color: float
+    rotation: float
+
+
+def isotropic_covariances(scale: Tensor) -> Tensor:
+    """(N, 3, 3) [m^2] of standard deviations (N,) [m]."""
+    return (scale**2)[:, None, None] * torch.eye(3, dtype=scale.dtype, device=scale.device)
+
+
+class FreeGaussians:
+    """N Gaussians as free numbers: position [m], log of the scale(s), logits of opacity and colour, quaternion where anisotropic.
+
+    Starts isotropic, with the mean scale of each of `splats`. smallest, largest: bounds of a scale in units of its start;
+    axis_ratio: bound of the largest scale over the smallest. `first_colors` (N, 3) are the colours at the start.
+    """
+
+    def __init__(
+        self, splats: Splats, rates: Rates, *, move: bool, anisotropic: bool, smallest: float, largest: float, axis_ratio: float
+    ) -> None:
+        scale = splats.scales.mean(1)
+        self.parameters = {
+            "means": splats.means.clone(),
+            "log_scale": scale.log(),
+            "opacity": torch.logit(splats.opacities.clamp(0.01, 0.99)),
+            "color": torch.logit(splats.colors.clamp(0.01, 0.99)),
+        }
+        if anisotropic:
+            self.parameters["log_scale"] = scale.log()[:, None].repeat(1, 3)
+            self.parameters["rotation"] = splats.rotations.clone()
+        self.fixed = {"lower": (scale * smallest).log(), "upper": (scale * largest).log(), "rotations": splats.rotations,
+                      "first_colors": splats.colors}  # fmt: skip
+        self.anisotropic, self.axis_ratio, self.annealed = anisotropic, axis_ratio, 1.0
+        learned = {name: p.requires_grad_(True) for name, p in self.parameters.items() if move or name != "means"}
+        groups = [{"params": [p], "start": getattr(rates, name), "name": name} for name, p in learned.items()]
+        self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12)
+
+    def __len__(self) -> int:
+        return len(self.parameters["opacity"])
+
+    @property
+    def opacities(self) -> Tensor:
+        return torch.sigmoid(self.parameters["opacity"])
+
+    @property
+    def colors(self) -> Tensor:
+        return torch.sigmoid(self.parameters["color"])
+
+    @property
+    def scales(self) -> Tensor:
+        """(N, 3) [m]."""
+        scale = self.parameters["log_scale"].exp()
+        return scale if self.anisotropic else scale[:, None].repeat(1, 3)
+
+    def covariances(self) -> Tensor:
+        """(N, 3, 3) [m^2]."""
+        scale = self.parameters["log_scale"].exp()
+        return covariance_from(scale, self.parameters["rotation"]) if self.anisotropic else isotropic_covariances(scale)
+
+    def anneal(self, factor: float) -> None:
+        """Steps at `factor` of their start."""
+        self.annealed = factor
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["start"] * factor
+
+    @torch.no_grad()
+    def bound(self) -> None:
+        """Scales back between their bounds, the smaller ones of a Gaussian not further below its largest than the axis ratio."""
+        scale, lower, upper = self.parameters["log_scale"], self.fixed["lower"], self.fixed["upper"]
+        if not self.anisotropic:
+            scale.clamp_(lower, upper)
+            return
+        scale.clamp_(lower[:, None], upper[:, None])
+        torch.maximum(scale, scale.amax(1, keepdim=True) - math.log(self.axis_ratio), out=scale)
+
+    @torch.no_grad()
+    def take(self, source: Tensor, fresh: Tensor | None = None) -> None:
+        """Gaussian i becomes a copy of Gaussian source[i], (M,) long; Adam's moments go along, and are 0 where `fresh` (M,)."""
+        for group in self.optimizer.param_groups:
+            old = group["params"][0]
+            new = old.detach()[source].requires_grad_(True)
+            state = self.optimizer.state.pop(old, None)
+            if state is not None:
+                for moment in ("exp_avg", "exp_avg_sq"):
+                    state[moment] = state[moment][source]
+                    if fresh is not None:
+                        state[moment][fresh] = 0
+                self.optimizer.state[new] = state
+            group["params"], self.parameters[group["name"]] = [new], new
+        learned = {group["name"] for group in self.optimizer.param_groups}
+        self.parameters |= {name: p[source] for name, p in self.parameters.items() if name not in learned}
+        self.fixed = {name: value[source] for name, value in self.fixed.items()}
+
+    @torch.no_grad()
+    def shift(self, rows: Tensor | slice, vectors: Tensor) -> None:
+        """Moves the Gaussians `rows` by (M, 3, 1) [m]."""
+        self.parameters["means"][rows] += vectors[..., 0]
+
+    @torch.no_grad()
+    def dim(self, rows: Tensor, opacity: Tensor, factor: Tensor) -> None:
+        """Gives the Gaussians `rows` (N,) bool other opacities (M,) and `factor` (M,) times their scales, within the bounds."""
+        self.parameters["opacity"][rows] = torch.logit(opacity.clamp(1e-6, 1 - 1e-6))
+        self.parameters["log_scale"][rows] += factor.log()[:, None] if self.anisotropic else factor.log()
+        self.bound()
+
+    @torch.no_grad()
+    def splats(self) -> Splats:
+        """The Gaussians as they are, rotations of unit length."""
+        rotations = self.fixed["rotations"]
+        if self.anisotropic:
+            rotations = torch.nn.functional.normalize(self.parameters["rotation"].detach(), dim=-1)
+        return Splats(self.parameters["means"].detach(), self.scales, rotations, self.opacities, self.colors)
