@@ -51,7 +51,7 @@ def run(tmp_path_factory, cache):
 
 
 def test_a_run_leaves_its_outputs(run):
-    figures = json.loads((run / "metrics.json").read_text())
+    figures = json.loads((run / "metrics.json").read_text(), parse_constant=pytest.fail)  # strict JSON
     for key in ("train/rms_m", "prior/test/rms_m", "prior_eta/test/rms_m", "test/rms_m", "floor/test/rms_m", "test/psnr_crop",
                 "id_prior/E", "id/E"):
         assert np.isfinite(figures[key]), key
