@@ -20,7 +20,6 @@ from mosa.config import plain
 from mosa.errors import ConfigError
 from mosa.modules.body import Body, Start
 
-
 SPECIAL = {"Infinity": math.inf, "-Infinity": -math.inf, "NaN": math.nan}
 """Figures that JSON has no numbers for, as strings that float() and JavaScript's Number() read."""
 
