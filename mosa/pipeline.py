@@ -44,7 +44,7 @@ from mosa.run import (
     write_figures,
 )  # fmt: skip
 from mosa.schema import EVALUATION, SIMULATION, TRAINING, check
-from mosa.twin import Twin, save_rollout
+from mosa.twin import Twin, save_observed, save_rollout
 from mosa.types import MotionCues, Reconstruction, Scene
 
 
@@ -153,6 +153,8 @@ def train(cfg: DictConfig) -> float | None:
         fit(cfg, module, data, folder, device)
     if parallel.launched_rank() != 0:
         return None
+    learned_from = [prefix for prefix in found if prefix.startswith("train")]
+    save_observed(folder / "observed.npz", {prefix: take.cues for prefix, take in zip(learned_from, module.takes)})
     with clock.measure("evaluation"):
         figures, kept = evaluate(body, sequences(body, scene, held_out, found), world,
                                  samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
