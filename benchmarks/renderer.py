@@ -237,6 +237,8 @@ def main() -> None:
     parser.add_argument("--parity", action="store_true", help="differences from gsplat, nothing else")
     options = parser.parse_args()
     cuda = torch.cuda.is_available()
+    if not cuda and (options.device == "cuda" or options.parts or options.parity):
+        parser.error("--device cuda, --parts and --parity need a CUDA device, and torch finds none on this machine")
     print(f"{platform.processor() or platform.machine()}, torch {torch.__version__}, warp {wp.__version__}", end="")
     print(f", {torch.cuda.get_device_name()}, CUDA {torch.version.cuda}" if cuda else ", no CUDA device")
     if options.parity:

@@ -286,6 +286,8 @@ def main() -> None:
     parser.add_argument("--check", action="store_true", help="small CPU run against the stored ratios")
     parser.add_argument("--store", action="store_true", help="measure and store the ratios of --check")
     options = parser.parse_args()
+    if options.device == "cuda" and not torch.cuda.is_available():
+        parser.error("--device cuda: torch finds no CUDA device on this machine; use --device cpu")
     wp.config.quiet = True
     torch.set_num_threads(1)
     workspace.BLOCK = options.block

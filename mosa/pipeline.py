@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import time
@@ -33,9 +32,19 @@ from mosa.reconstruction.starts import first_contact, sequence_start, splats_of
 from mosa.rendering.cameras import crop_boxes, crop_images
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import use_backend
-from mosa.run import begins_from, cost, device_names, device_of, finished, log_outcome, named_device, shared_starts
+from mosa.run import (
+    begins_from,
+    cost,
+    device_names,
+    device_of,
+    finished,
+    log_outcome,
+    named_device,
+    shared_starts,
+    write_figures,
+)  # fmt: skip
 from mosa.schema import EVALUATION, SIMULATION, TRAINING, check
-from mosa.twin import Twin, save_rollout
+from mosa.twin import Twin, save_observed, save_rollout
 from mosa.types import MotionCues, Reconstruction, Scene
 
 
@@ -144,6 +153,8 @@ def train(cfg: DictConfig) -> float | None:
         fit(cfg, module, data, folder, device)
     if parallel.launched_rank() != 0:
         return None
+    learned_from = [prefix for prefix in found if prefix.startswith("train")]
+    save_observed(folder / "observed.npz", {prefix: take.cues for prefix, take in zip(learned_from, module.takes)})
     with clock.measure("evaluation"):
         figures, kept = evaluate(body, sequences(body, scene, held_out, found), world,
                                  samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
@@ -272,9 +283,7 @@ def write_outputs(folder: Path, cfg: DictConfig, body: Body, evaluated: list[Seq
         write_strip(folder / "strip.png", rows, enlarge=max(1, enlarge - 1))
     table = results_table(figures) + "\n\n" + parameter_table(figures)
     (folder / "results.md").write_text(table + "\n")
-    partial = folder / "metrics.json.partial"  # the last file, and whole: it tells resume=auto that the run is complete
-    partial.write_text(json.dumps(dict(sorted(figures.items())), indent=1))
-    partial.replace(folder / "metrics.json")
+    write_figures(folder, figures)  # the last file: the run is complete
     print(f"\n{table}\n\nrun folder: {folder}")
 
 

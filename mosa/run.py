@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import platform
 import resource
 from collections.abc import Callable
@@ -19,13 +20,35 @@ from mosa.config import plain
 from mosa.errors import ConfigError
 from mosa.modules.body import Body, Start
 
+SPECIAL = {"Infinity": math.inf, "-Infinity": -math.inf, "NaN": math.nan}
+"""Figures that JSON has no numbers for, as strings that float() and JavaScript's Number() read."""
+
+
+def write_figures(folder: Path, figures: dict[str, float | str]) -> None:
+    """metrics.json, sorted, strict JSON; whole or not at all, as it tells resume=auto that the run is complete."""
+
+    def strict(value: float | str) -> float | str:
+        if isinstance(value, float) and not math.isfinite(value):
+            return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+        return value
+
+    partial = folder / "metrics.json.partial"
+    partial.write_text(json.dumps({k: strict(figures[k]) for k in sorted(figures)}, indent=1, allow_nan=False))
+    partial.replace(folder / "metrics.json")
+
+
+def read_figures(path: Path) -> dict[str, float | str]:
+    """What `write_figures` wrote: infinite figures and those that are not numbers are floats again."""
+    found = json.loads(path.read_text())
+    return {k: SPECIAL.get(v, v) if isinstance(v, str) else v for k, v in found.items()}
+
 
 def finished(cfg: DictConfig, folder: Path) -> dict[str, float] | None:
     """The figures of a run that is complete and, with resume=auto, is not made again. Errors: ConfigError."""
     if cfg.resume not in (None, "auto"):
         raise ConfigError(f"resume: expected null or auto, found {cfg.resume!r}; a checkpoint's path is ckpt_path")
     path = folder / "metrics.json"
-    return json.loads(path.read_text()) if cfg.resume == "auto" and path.is_file() else None
+    return read_figures(path) if cfg.resume == "auto" and path.is_file() else None
 
 
 def begins_from(cfg: DictConfig, folder: Path) -> str | None:

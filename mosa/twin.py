@@ -26,7 +26,7 @@ from mosa.modules.body import Body, Start, World
 from mosa.modules.observer import deformed_covariances, observe
 from mosa.physics.colliders import Collider, colliders_from_config
 from mosa.rendering.cameras import look_at
-from mosa.types import Cameras, Rollout
+from mosa.types import Cameras, MotionCues, Rollout
 
 
 class Twin:
@@ -155,6 +155,14 @@ def save_rollout(path: str | Path, parts: dict[str, Rollout]) -> None:
     for name, r in parts.items():
         arrays |= {f"{name}/x": r.x, f"{name}/F": r.F, f"{name}/F_tot": r.F_tot, f"{name}/times": r.times,
                    f"{name}/counts": torch.tensor(r.counts, dtype=torch.int64)}
+    np.savez_compressed(path, **{k: v.detach().cpu().numpy() for k, v in arrays.items()})
+
+
+def save_observed(path: str | Path, parts: dict[str, MotionCues]) -> None:
+    """npz with x [T, N, 3] and covariances [T, N, 3, 3] of the motions learned from, under `<name>/...` as `save_rollout`."""
+    arrays = {}
+    for name, cues in parts.items():
+        arrays |= {f"{name}/x": cues.positions, f"{name}/covariances": cues.covariances}
     np.savez_compressed(path, **{k: v.detach().cpu().numpy() for k, v in arrays.items()})
 
 

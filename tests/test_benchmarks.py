@@ -46,3 +46,16 @@ def test_a_partial_verification_leaves_the_published_table_alone(monkeypatch, tm
     verification.publish(results, page)
     assert "| old |" not in page.read_text() and "| 1 | probes | a | b |" in page.read_text()
     assert page.read_text().startswith("text\n") and page.read_text().endswith("<!-- end -->\nmore\n")
+
+
+@pytest.mark.parametrize(("name", "arguments"), [("rollout", ["--device", "cuda"]), ("renderer", ["--device", "cuda"]),
+                                                 ("renderer", ["--parts"]), ("renderer", ["--parity"])])  # fmt: skip
+def test_cuda_asked_for_where_there_is_none_is_said(monkeypatch, capsys, name, arguments):
+    """It ended in torch's AssertionError, or in an empty table."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    monkeypatch.setattr("sys.argv", [f"{name}.py", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        importlib.import_module(name).main()
+    assert ended.value.code == 2
+    assert "CUDA device on this machine" in (said := capsys.readouterr().err) or "a CUDA device, and torch finds none" in said

@@ -10,8 +10,8 @@ import torch
 from mosa.analysis.anisotropy import in_double
 from mosa.errors import SimulationDiverged
 from mosa.modules.adapter import Adapter
-from mosa.modules.body import ADAPTER_MARGIN
 from mosa.modules.material import Material
+from mosa.modules.stiffening import ADAPTER_MARGIN
 from mosa.physics.rollout import Simulator
 from mosa.types import ParticleState
 
@@ -63,7 +63,8 @@ def vibration_growth(
     v[:, 0], C[:, 0, 0] = -amplitude * speed * torch.cos(k * x[:, 0]), amplitude * speed * k * torch.sin(k * x[:, 0])
     F = torch.eye(3).double().expand(n, 3, 3).contiguous()
     frame_dt = 2 * length / speed / FRAMES
-    needed = math.ceil(frame_dt * math.sqrt(ADAPTER_MARGIN * float(material.max_modulus()) / density) / (0.5 * dx))
+    margin = ADAPTER_MARGIN if adapter is None else adapter.stiffening(material.poisson())
+    needed = math.ceil(frame_dt * math.sqrt(margin * float(material.max_modulus()) / density) / (0.5 * dx))
     steady = adapter is None or adapter.steady
     substeps = needed if steady else -(-needed // stride) * stride
     simulator = Simulator(material.law, dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=(0, 0, 0), dtype=torch.float64,

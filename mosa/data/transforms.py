@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,18 +24,21 @@ from mosa.data.footage import (
     world_to_camera,
 )  # fmt: skip
 from mosa.data.images import composite, expect_size, fill_holes, read_image, resize, scaled_size
+from mosa.data.lens import COEFFICIENTS, is_fisheye, lens_of
 from mosa.data.scene import assemble
 from mosa.errors import DataError
 from mosa.rendering.cameras import scale_cameras
 from mosa.types import Scene
 
-DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 EXTENSIONS = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG")
+CUT = 1e-3
+"""Share of a matte that undoing a lens may cut off before it is said."""
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One entry: where it is written, image and mask file, time [s] or None, own intrinsics, pose w2c (4, 4), camera label."""
+    """One entry: where it is written, image and mask file, time [s] or None, own intrinsics, pose w2c (4, 4), camera label,
+    whether its lens is a fisheye."""
 
     where: str
     image: Path
@@ -43,12 +47,14 @@ class Shot:
     intrinsics: dict[str, float]
     w2c: np.ndarray
     camera: str | None
+    fisheye: bool = False
 
 
 def read_transforms(path: str | Path, *, frames=None, fps: float | None = None, scale: float = 1.0, fill: int = 0) -> Footage:
     """Footage of a transforms.json (path: the file, or its folder).
 
-    Top level or per entry: fl_x, fl_y, cx, cy [px] or camera_angle_x [rad], w, h. Per entry: file_path (extension may be left
+    Top level or per entry: fl_x, fl_y, cx, cy [px] or camera_angle_x [rad], w, h, the lens' k1 to k4, p1, p2, camera_model (see
+    `mosa.data.lens`: it is undone, images and mattes are then those of a pinhole). Per entry: file_path (extension may be left
     out), transform_matrix (camera to world, OpenGL axes), time [s] (left out: the last number in the file name counts
     frames at fps; where all entries have one and fps is given, evenly spaced times take their place), mask_path (grey, white =
     object; left out: the image's alpha), camera (left out: entries with one pose and intrinsics are one camera). fill: holes
@@ -65,9 +71,9 @@ def read_transforms(path: str | Path, *, frames=None, fps: float | None = None, 
         times = [i / fps for i in range(len(times))]
     remedy = "correct them, restrict scene.frames, or set scene.fps where every entry has a time"
     even_times([times[f] for f in wanted], wanted, str(file), remedy)
-    full, first, images, mattes = None, "", [], []
-    for row in table:
-        pictures = []
+    full, first, images, mattes, calibration = None, "", [], [], {}
+    for (name, shot), row in zip(cameras.items(), table):
+        pictures, lens, cut = [], None, 0.0
         for frame in wanted:
             color, matte = read_shot(row[frame])
             matte = fill_holes(matte, fill)
@@ -75,10 +81,20 @@ def read_transforms(path: str | Path, *, frames=None, fps: float | None = None, 
                 full, first = color.shape[1::-1], row[frame].image.name
                 size = scaled_size(*full, scale)
             expect_size(row[frame].image, color, *full, reason=f"as {first}")
-            pictures.append((resize(composite(color, matte, WHITE), *size), resize(matte, *size)))
+            if name not in calibration:
+                K = camera_matrix(shot, *full)
+                lens = lens_of(K, shot.intrinsics, *full, fisheye=shot.fisheye, where=shot.where)
+                calibration[name] = (K if lens is None else lens.K, shot.w2c)
+            picture = composite(color, matte, WHITE)
+            if lens is not None:
+                cut = max(cut, lens.lost(matte))
+                picture, matte = lens.straighten(picture, matte, WHITE)
+            pictures.append((resize(picture, *size), resize(matte, *size)))
+        if cut > CUT:
+            warnings.warn(f"{file}: camera {name}: undoing its lens distortion cuts off up to {cut:.1%} of the object, too close "
+                          "to the border of the image", stacklevel=2)
         images.append(np.stack([p[0] for p in pictures]))
         mattes.append(np.stack([p[1] for p in pictures]))
-    calibration = {name: (camera_matrix(shot, *full), shot.w2c) for name, shot in cameras.items()}
     rig = stack_cameras(calibration, *full)
     return Footage(
         scale_cameras(rig, scale) if scale != 1 else rig, tuple(wanted), torch.tensor([times[f] for f in wanted]).float(),
@@ -98,9 +114,8 @@ def read_shots(file: Path, document, fps: float | None) -> list[Shot]:
             if not isinstance(entry, dict) or key not in entry:
                 raise DataError(f"{where}: expected the key {key}")
         intrinsics = shared | {k: number(v, f"{where}, {k}") for k, v in entry.items() if k in intrinsic_keys()}
-        bent = [k for k in DISTORTION if intrinsics.get(k, 0.0) != 0]
-        if bent:
-            raise DataError(f"{where}: lens distortion ({', '.join(bent)}) is not modelled; undistort the images first")
+        fisheye = is_fisheye(entry.get("camera_model", document.get("camera_model")),
+                             entry.get("is_fisheye", document.get("is_fisheye")), where)
         image = locate(file.parent, str(entry["file_path"]), where)
         mask = locate(file.parent, str(entry["mask_path"]), where) if entry.get("mask_path") else None
         pose = matrix(entry["transform_matrix"], (3, 4), f"{where}, transform_matrix")
@@ -108,12 +123,12 @@ def read_shots(file: Path, document, fps: float | None) -> list[Shot]:
         if time is None:
             time = counted_time(image, fps, where)
         camera = str(entry["camera"]) if entry.get("camera") is not None else None
-        shots.append(Shot(where, image, mask, time, intrinsics, world_to_camera(pose, where), camera))
+        shots.append(Shot(where, image, mask, time, intrinsics, world_to_camera(pose, where), camera, fisheye))
     return shots
 
 
 def intrinsic_keys() -> tuple[str, ...]:
-    return ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", *DISTORTION)
+    return ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", *COEFFICIENTS)
 
 
 def locate(folder: Path, name: str, where: str) -> Path:

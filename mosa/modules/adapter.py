@@ -13,6 +13,7 @@ from mosa.errors import ConfigError
 from mosa.modules import microplane
 from mosa.modules.fused.selection import PRECISIONS, check_options, chosen, weights_of
 from mosa.modules.progressive import Correction, ProgressiveOperator, apply
+from mosa.modules.stiffening import ADAPTER_MARGIN, acoustic_stiffening, worst_stiffening
 from mosa.physics.activations import backward_at_hand
 from mosa.physics.rollout import AdapterOperator, MaterialState
 
@@ -66,6 +67,10 @@ class Adapter(nn.Module):
     def steady(self) -> bool:
         """Whether the operator is the same in every state, so that one evaluation serves a whole rollout."""
         return False
+
+    def stiffening(self, poisson: Tensor | float) -> float:
+        """Modulus over the prior's that the time step allows for; poisson: the prior's."""
+        return ADAPTER_MARGIN
 
     def __getstate__(self) -> dict:
         return {**self.__dict__, "_last": None}  # it holds a graph, which can be neither copied nor pickled
@@ -143,6 +148,17 @@ class StressAdapter(Adapter):
     def steady(self) -> bool:
         part = self.operator  # the plastic one has the same switches
         return (part.constant or part.no_C) and part.no_pre and part.no_post and not part.no_prior_stress
+
+    def stiffening(self, poisson: Tensor | float) -> float:
+        """That of the operator itself where there is only one, else the bound of all that alpha allows; `ADAPTER_MARGIN` at least.
+
+        What networks add (L_pre, L_post) is held between evaluations, as the operator is, and stiffens nothing meanwhile.
+        """
+        if self.operator.no_C or self.operator.no_prior_stress:
+            return ADAPTER_MARGIN
+        if not self.operator.constant:
+            return worst_stiffening(self.operator.alpha)
+        return max(ADAPTER_MARGIN, acoustic_stiffening(self.operator.constant_operator(), poisson))
 
     def affine(self, operator: ProgressiveOperator, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Correction]:
         """(A - I (N, 6, 6), b (N, 6), parts) of d(w, s) = (A - I) s + b, the rest term included."""

@@ -24,9 +24,6 @@ from mosa.rotations import skew
 from mosa.types import Ground, ParticleState, Rollout
 
 VARIANTS = ("prior", "prior_eta", "adapted")
-ADAPTER_MARGIN = 1.85
-"""Bound of the adapted modulus over the prior's at alpha = 0.1. Operators that saturate alpha = 0.2 reach 2.5, a Courant number of
-0.7 for the 0.6 that is asked for; learned ones have a mean entry of 0.06."""
 
 
 @dataclass(frozen=True)
@@ -200,12 +197,16 @@ class Body(nn.Module):
         F = Q.expand(n, 3, 3).contiguous()
         return ParticleState(arm + start.center, v, skew(start.angular_velocity).expand(n, 3, 3).contiguous(), F, F)
 
+    def stiffening(self, adapted: bool) -> float:
+        """Modulus over the prior's that the time step allows for."""
+        return self.adapter.stiffening(self.material.poisson()) if adapted else 1.0
+
     def substeps(self, parameters_modulus: float, frame_dt: float, speed: float, adapted: bool, viscosity: float = 0.0) -> int:
         """Substeps per frame that the time step bound asks for, rounded up to whole strides of the adapter."""
         settings = self.settings
         count = required_substeps(
             modulus_max=parameters_modulus, density=self.density, frame_dt=frame_dt, dx=settings.dx, v_max=speed,
-            factor=ADAPTER_MARGIN if adapted else 1.0, courant=settings.courant, limit=settings.max_substeps,
+            factor=self.stiffening(adapted), courant=settings.courant, limit=settings.max_substeps,
             viscosity=viscosity,
         )
         return -(-count // settings.stride) * settings.stride
@@ -214,7 +215,7 @@ class Body(nn.Module):
         """Bounds of adaptive substeps. Errors: ConfigError naming the field."""
         settings = self.settings
         return StepControl(
-            courant=settings.courant, factor=ADAPTER_MARGIN if adapted else 1.0, minimum=settings.min_substeps,
+            courant=settings.courant, factor=self.stiffening(adapted), minimum=settings.min_substeps,
             maximum=settings.max_substeps, multiple=settings.stride * -(-8 // settings.stride),
         )  # fmt: skip
 

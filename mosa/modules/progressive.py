@@ -84,6 +84,11 @@ class ProgressiveOperator(nn.Module):
         """(4, 3, 3). The numbers are learned in units of 1/input_scale: the networks' learning rate then fits them too."""
         return microplane.correction(self.alpha * torch.tanh(self.scale * self.free).to(like))
 
+    def constant_operator(self) -> Tensor:
+        """(6, 6) A - I of the constant matrices, before the projection to major symmetry."""
+        C = self.constant_corrections(self.free)
+        return microplane.redistribution(C[:3], C[3])
+
     def normal_correction(self, l1: Tensor | None, n: Tensor) -> tuple[Tensor, Tensor | None]:
         """Step 4: (C_xyz (N, 3, 3), l2 (N, hidden) or None where nothing reads it); n: (N, 3) normals after the planes."""
         numbers = l2 = None

@@ -169,7 +169,7 @@ class SegmentSolver:
         self._known = (*_identity(state), bounds, [t.detach() for t in state[:2]])
 
     def _kept(self, dims: tuple[int, int, int]) -> tuple[int, int, int]:
-        """`dims`; on CUDA those of an earlier segment where they are not much larger: buffers of another size cost a new capture."""
+        """`dims`; on CUDA those of an earlier segment where they are not much larger: another size costs a new capture."""
         if self.numerics.device.type != "cuda":
             return dims
         least = _largest([dims, self._dims])

@@ -13,6 +13,9 @@ from mosa.modules.body import Body, Start
 from mosa.reconstruction.registration import initial_velocity, register_pose
 from mosa.types import Scene, Splats
 
+MOST_FRAMES = 6
+"""Frames of free flight that a velocity is fitted to at most: more take longer and say little more."""
+
 
 def splats_of(body: Body) -> Splats:
     """The body's particles as (isotropic or not) splats with axes from their covariances."""
@@ -47,7 +50,8 @@ def sequence_start(body: Body, splats: Splats, scene: Scene, *, register: bool) 
     """Pose and velocity of `scene`. register: find the pose by rendering (held-out sequences); else the rest shape's own.
 
     The free frames are found on the way: a velocity from the first two frames predicts the contact, the frames before it give
-    the final one. Errors: DataError where contact comes before the second frame.
+    the final one. Where that one puts the contact earlier, into the frames it was fitted to, they are fewer: no velocity is kept
+    that frames after its own contact went into. Errors: DataError where contact comes before the second frame.
     """
     cameras = scene.training_cameras
     images, mattes = scene.images[cameras], scene.mattes[cameras]
@@ -57,7 +61,7 @@ def sequence_start(body: Body, splats: Splats, scene: Scene, *, register: bool) 
         rotation, center = register_pose(splats, images[:, 0], mattes[:, 0], views, background=scene.background,
                                          rest_center=body.center)
     start = Start(rotation.to(body.rest), center.to(body.rest), torch.zeros(3).to(body.rest), torch.zeros(3).to(body.rest))
-    count = 2
+    count, most = 2, MOST_FRAMES
     while True:
         velocity, spin = initial_velocity(splats, (rotation, center), images[:, :count], mattes[:, :count], views,
                                           times=scene.times[:count], gravity=scene.gravity, background=scene.background,
@@ -67,8 +71,8 @@ def sequence_start(body: Body, splats: Splats, scene: Scene, *, register: bool) 
         if free < 2:
             raise DataError(f"{scene.name}/{scene.sequence}: the object touches the ground before the second frame; at least two "
                             "frames of free flight are needed (scene.frames, scene.last_free_frame)")
-        if free <= count or count >= 6:
+        if free < count:
+            most = count - 1  # so that the loop ends
+        elif count == min(free, most):
             return start
-        count = min(free, 6)
-
-
+        count = min(free, most)

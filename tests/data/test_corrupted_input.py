@@ -144,7 +144,6 @@ TRANSFORMS = {
         entries(lambda d: [(e.pop("camera"), e["transform_matrix"][1].__setitem__(3, i)) for i, e in enumerate(d["frames"])]),
         "a single moving camera cannot be used",
     ),
-    "distorted": (entries(lambda d: d.update(k1=0.05)), "lens distortion .* undistort"),
     "size": (entries(lambda d: d.update(w=1920)), "intrinsics are for w = 1920 px"),
     "no matte": (
         lambda f: iio.imwrite(f / "images/0_000.png", np.array(iio.imread(f / "images/0_000.png"))[..., :3]),

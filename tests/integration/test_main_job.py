@@ -21,6 +21,7 @@ from mosa import pipeline
 from mosa.modules.body import ContactOffset, Start
 from mosa.twin import Twin
 from mosa.types import Ground
+from mosa.viewer import read_run
 
 ROOT = Path(__file__).parents[2]
 
@@ -51,7 +52,7 @@ def run(tmp_path_factory, cache):
 
 
 def test_a_run_leaves_its_outputs(run):
-    figures = json.loads((run / "metrics.json").read_text())
+    figures = json.loads((run / "metrics.json").read_text(), parse_constant=pytest.fail)  # strict JSON
     for key in ("train/rms_m", "prior/test/rms_m", "prior_eta/test/rms_m", "test/rms_m", "floor/test/rms_m", "test/psnr_crop",
                 "id_prior/E", "id/E"):
         assert np.isfinite(figures[key]), key
@@ -68,6 +69,15 @@ def test_a_run_leaves_its_outputs(run):
     assert figures["id/E_ratio"] == pytest.approx(figures["id/E"] / 2e5)
     assert 0 < figures["id/growth_per_period"] <= 1 and figures["id/stiffness_ratio"] > 1  # it has an energy, and learned something
     assert figures["time/device"] and figures["time/particle_substeps_per_s"] > 0
+
+
+def test_a_run_can_be_looked_at(run):
+    train, *held_out = read_run(run)
+    assert train.name == "train" and {clip.name for clip in held_out} == {"test/test_60", "test/test_40"}
+    assert train.observed.centers.shape == train.twin.centers.shape  # all frames were learned from
+    assert train.observed.covariances.shape == train.twin.covariances.shape
+    assert float(train.deviation(0).max()) < 0.02 * train.size  # one particle is the same one in both
+    assert all(clip.observed is None for clip in held_out)
 
 
 def test_eval_reproduces_the_figures_from_the_checkpoint_alone(run, cache, tmp_path):

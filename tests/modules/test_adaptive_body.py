@@ -9,8 +9,9 @@ import torch
 from mosa.config import build_body, build_world
 from mosa.errors import ConfigError
 from mosa.modules.adapter import StressAdapter
-from mosa.modules.body import ADAPTER_MARGIN, Body, SimulationSettings, Start
+from mosa.modules.body import Body, SimulationSettings, Start
 from mosa.modules.material import Material
+from mosa.modules.stiffening import ADAPTER_MARGIN
 from mosa.twin import Twin
 
 WORLD = {"ground": {"height": 0.0, "mode": "separate", "friction": 0.2}, "gravity": [0, -9.8, 0], "up": [0, 1, 0],

@@ -77,5 +77,5 @@ def load_builtin(
     return assemble(
         footage, name=name, gravity=GRAVITY, box=BOX, ground=Ground(0.0, "sticky"), density=hidden.density, sequence=sequence,
         last_free_frame=last_free_frame, holdout_cameras=holdout_cameras, holdout_frames=holdout_frames, truth=truth,
-        known_parameters={"E": hidden.E, "nu": hidden.nu}, synthetic=True,
+        known_parameters=hidden.known, synthetic=True,
     )  # fmt: skip

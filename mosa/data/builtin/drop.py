@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from mosa.data.builtin.hidden_material import LAW, HiddenMaterial
+from mosa.data.builtin.hidden_material import HiddenMaterial
+from mosa.data.builtin.hidden_yield import HiddenYield
 from mosa.data.builtin.objects import BuiltinObject, Drop
 from mosa.physics.rollout import Simulator
 from mosa.physics.time_step import required_substeps
@@ -45,8 +46,8 @@ def place(points: np.ndarray, center: np.ndarray, drop: Drop, lowest: np.ndarray
 
 
 def simulate(
-    body: BuiltinObject, material: HiddenMaterial, particles: np.ndarray, surface: np.ndarray, drop: Drop, training: Drop,
-    *, progress: Callable[[int], None] | None = None,
+    body: BuiltinObject, material: HiddenMaterial | HiddenYield, particles: np.ndarray, surface: np.ndarray, drop: Drop,
+    training: Drop, *, progress: Callable[[int], None] | None = None,
 ) -> Fall:  # fmt: skip
     """Particles (N, 3) of the shape's frame through a drop; surface: (M, 3) points of the shape's frame."""
     center = particles.mean(0)
@@ -59,7 +60,7 @@ def simulate(
         material.wave_modulus(), material.density, frame_dt, dx, v_max=reach, courant=COURANT, limit=5000
     )
     simulator = Simulator(
-        LAW, dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=GRAVITY, ground=Ground(0.0), up=(0.0, 1.0, 0.0)
+        material.law, dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=GRAVITY, ground=Ground(0.0), up=(0.0, 1.0, 0.0)
     )
     velocity = np.array([0.0, -drop.speed, 0.0])
     n = len(particles)

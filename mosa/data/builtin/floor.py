@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mosa.data.builtin.hidden_material import LAW
 from mosa.data.builtin.objects import object_named
 from mosa.errors import ConfigError
 from mosa.physics.colliders import reach
@@ -43,7 +42,7 @@ def floor_rollout(body, scene: Scene, world) -> Tensor:
         limit=5000,
     )
     simulator = Simulator(
-        LAW,
+        hidden.law,
         dx=settings.dx,
         substeps=substeps,
         frame_dt=frame_dt,

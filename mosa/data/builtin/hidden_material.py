@@ -63,6 +63,15 @@ class HiddenMaterial:
     axis: tuple[float, float, float] = (1.0, 0.0, 0.0)
     density: float = 1000.0
 
+    @property
+    def law(self) -> str:
+        return LAW
+
+    @property
+    def known(self) -> dict[str, float]:
+        """What a prior can be compared with."""
+        return {"E": self.E, "nu": self.nu}
+
     def variant(self, kind: str) -> "HiddenMaterial":
         """`anisotropic`: this one; `isotropic`: its twin without fibres and with one stiffness everywhere.
 

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mosa.data.builtin.hidden_material import HiddenMaterial
+from mosa.data.builtin.hidden_yield import HiddenYield
 from mosa.errors import ConfigError
 
 
@@ -51,7 +52,7 @@ class BuiltinObject:
 
     shape: str
     height: float
-    material: HiddenMaterial
+    material: HiddenMaterial | HiddenYield
     drops: dict[str, Drop]
     footage: Footage = field(default_factory=Footage)
     spacing: float = 0.0075
@@ -67,6 +68,11 @@ PEANUT = HiddenMaterial(
 MANDARIN = HiddenMaterial(
     E=2.5e5, nu=0.32, ratio=1.7, fibre=(0.4, 1.0, 0.3), amplitude=0.2, period=0.14, axis=(0.2, 0.3, 0.9)
 )  # fmt: skip
+# dents where it lands, and in one direction more easily than in another: the coefficients span yield stresses of 1 to 1.8
+CLAY = HiddenYield(
+    E=2e5, nu=0.3, yield_stress=1.5e4, coefficients=(0.6, 1.5, 2.0, 0.7, 1.8, 0.6), turn=(0.4, 0.3, 0.2), amplitude=0.2,
+    period=0.125,
+)  # fmt: skip
 CHICK = HiddenMaterial(E=2.2e5, nu=0.28, ratio=1.8, fibre=(0.3, -0.2, 1.0), amplitude=0.15, period=0.13, axis=(0.0, 1.0, 0.3))
 
 DROPS = {
@@ -77,6 +83,7 @@ DROPS = {
 
 OBJECTS = {
     "rabbit": BuiltinObject("rabbit", 0.25, RABBIT, DROPS),
+    "rabbit_plastic": BuiltinObject("rabbit", 0.25, CLAY, DROPS),
     "peanut": BuiltinObject(
         "peanut", 0.133, PEANUT,
         {"train": DROPS["train"], "test_60": replace(DROPS["test_60"], offset=(-0.10, 0.015)),
