@@ -150,13 +150,9 @@ class SegmentSolver:
         self._know(final, numbers[4:])
         return [int(n) for n in numbers[:4]]
 
-    def takes_room(self, substeps: int) -> bool:
-        """Whether the states of so many substeps may be kept; they have the room from then on."""
-        size = substeps * substep_bytes(self.numerics, len(self.volume))
-        if size > self.room:
-            return False
-        self.room -= size
-        return True
+    def has_room(self, substeps: int) -> bool:
+        """Whether the states of so many substeps may be kept."""
+        return substeps * substep_bytes(self.numerics, len(self.volume)) <= self.room
 
     def bounds(self, state: tuple[Tensor, ...]) -> list[float]:
         """`extent` of x and v, without a transfer where `look` has told it."""
@@ -213,8 +209,9 @@ class _Segment(torch.autograd.Function):
         state = tuple(t.detach().contiguous() for t in inputs[:5])
         held, poses = dict(zip(HELD, inputs[5:10], strict=True)), inputs[10:] or None
         ctx.set_materialize_grads(False)
-        kept = solver.takes_room(substeps)
+        kept = solver.has_room(substeps)
         result, reaction, window, ctx.tape = solver.advance(state, held, poses, substeps, first, steps, kept)
+        solver.room -= sum(t.nbytes for t in ctx.tape)
         ctx.solver, ctx.substeps, ctx.window, ctx.steps = solver, substeps, window, steps
         ctx.states = 5 if solver.numerics.law.plastic else 4
         ctx.save_for_backward(*state, *inputs[5:])

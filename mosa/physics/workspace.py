@@ -5,6 +5,7 @@ segment are captured as one graph the second time they are asked for with the sa
 them, on a CPU the 10 us that Python takes for each.
 """
 
+import math
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -59,8 +60,8 @@ class Steps(NamedTuple):
 
 MAX_GRAPHS = 64
 """Captured graphs a workspace keeps: one per pass and time step."""
-MAX_WINDOWS = 8
-"""Sizes of the window whose buffers and graphs a workspace on a CPU keeps: a body that falls and bounces comes back to them."""
+WINDOWS = 2**27
+"""Bytes of other windows' buffers that a workspace on a CPU keeps, with their graphs: a falling body comes back to them."""
 GRID = ("grid", "grid_wp", "velocity", "velocity_wp", "adj_grid", "adj_grid_wp", "adj_velocity", "adj_velocity_wp", "_graphs")
 """What belongs to a size of the window."""
 BLOCK = 64
@@ -188,7 +189,8 @@ class Workspace:
         if self.dims != (0, 0, 0):
             self._windows[self.dims] = {name: self.__dict__[name] for name in GRID if name in self.__dict__}
         known = self._windows.pop(dims, None)
-        while len(self._windows) >= MAX_WINDOWS:
+        each = 8 * len(self.grid) * torch.finfo(self.numerics.dtype).bits // 8 if self._windows else 0
+        while sum(each * math.prod(kept) for kept in self._windows) > WINDOWS:
             self._windows.pop(next(iter(self._windows)))
         return known
 

@@ -21,9 +21,9 @@ def falls(sim, state, *, mu=4e4, frames=9):
 
 
 @pytest.mark.parametrize("kept", [True, False])
-@pytest.mark.parametrize("windows", [workspace.MAX_WINDOWS, 1])
+@pytest.mark.parametrize("windows", [workspace.WINDOWS, 0])
 def test_captured_segments_are_those_launched_one_by_one(kept, windows, make_block, monkeypatch):
-    monkeypatch.setattr(workspace, "MAX_WINDOWS", windows)
+    monkeypatch.setattr(workspace, "WINDOWS", windows)
     monkeypatch.setattr("mosa.physics.memory.KEPT_ON_CPU", 2**29 if kept else 0)
     replays, dims = [], set()
     launch, place = wp.capture_launch, workspace.Workspace.set_window
@@ -38,7 +38,7 @@ def test_captured_segments_are_those_launched_one_by_one(kept, windows, make_blo
     state = replace(state, v=state.v + 5 * (state.x - state.x.mean(0)))
     sim = Simulator("corotated", dx=0.04, substeps=12, frame_dt=12 * 1e-3, gravity=(0.0, -90.0, 0.0), dtype=torch.float64)
     found = [falls(sim, state) for _ in range(3)]
-    assert len(dims) > 1 and len(replays) >= (8 if windows > 1 else 1)
+    assert len(dims) > 1 and len(replays) >= (8 if windows else 1)
     others = falls(sim, state, mu=5e4)  # other numbers through the same graphs
     monkeypatch.setattr(workspace.Workspace, "_launch", lambda work, name, body: body())
     replays.clear()
