@@ -28,6 +28,7 @@ from mosa.errors import ConfigError, MosaError
 from mosa.evaluation import Sequence, evaluate, floor_figures, identification, law_figures, render
 from mosa.modules.body import Body, Start
 from mosa.modules.lit_mosa import LitMosa, Take
+from mosa.physics.memory import KEPT_ON_CPU
 from mosa.reconstruction.starts import first_contact, sequence_start, splats_of
 from mosa.rendering.cameras import crop_boxes, crop_images
 from mosa.rendering.covariance import covariance_from
@@ -215,6 +216,7 @@ def take_of(cfg, scene: Scene, start: Start, reconstruction: Reconstruction, bod
 
 BACKWARD = 2.5  # cost of a step with gradients over one without, measured on the rabbit
 ADAPTER_COST, ADAPTER_BYTES = 1.8, 4.8e3  # of a step with networks over one without; per particle and evaluation
+STATE_BYTES = 330  # per particle and substep kept for the backward pass, with its share of the grid; measured on the rabbit
 
 
 def fit_estimate(module: LitMosa, processes: int = 1) -> str:
@@ -230,8 +232,9 @@ def fit_estimate(module: LitMosa, processes: int = 1) -> str:
     seconds = sum(s.iterations * step * (ADAPTER_COST if s.name == "joint" and networks else 1) for s in stages)
     evaluations = (frames - 1) * body.last_substeps / body.settings.stride
     memory = evaluations * len(body.rest) * ADAPTER_BYTES if networks else 0
+    kept = 0 if body.rest.is_cuda else min(KEPT_ON_CPU, (frames - 1) * body.last_substeps * len(body.rest) * STATE_BYTES)
     return (f"fit: {len(body.rest)} particles, {frames} frames of {body.last_substeps} substeps, at most "
-            f"{sum(s.iterations for s in stages)} steps, about {seconds / 60:.0f} minutes and {0.8 + memory / 1e9:.1f} GB")
+            f"{sum(s.iterations for s in stages)} steps, about {seconds / 60:.0f} minutes and {0.8 + (memory + kept) / 1e9:.1f} GB")
 
 
 def fit(cfg, module: LitMosa, data: MultiViewDataModule, folder: Path, device: str) -> None:
