@@ -15,7 +15,7 @@ import triton
 import triton.language as tl
 
 from mosa.modules.fused.network_kernels import by_column, factor, forward, network_input, product, silu, store_by_column, tile_of
-from mosa.modules.fused.sum_kernels import ones_column, outer, store_columns, store_square, with_ones
+from mosa.modules.fused.sum_kernels import ones_column, outer, store_columns, store_hidden, store_square, with_ones
 
 
 @triton.jit
@@ -45,6 +45,26 @@ def store_input_adjoint(gw, gs, g, r, M):
 @triton.jit
 def backward(W, OUT: tl.constexpr, IN: tl.constexpr, STRIDE: tl.constexpr, P: tl.constexpr):
     return factor(tile_of(W, OUT, IN, STRIDE), P)
+
+
+@triton.jit
+def hidden_adjoint(
+    g, z1, a1, k2, U2, D2, d2, h1, g1, g2, r, M, SUMS: tl.constexpr, H: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr
+):
+    """(adjoint of z1, D2, d2) from g, that of the second layer's activations, whose slope is k2."""
+    h = tl.arange(0, H)
+    e2 = g * k2
+    if SUMS == "inside":
+        D2 += outer(e2, a1, P)
+        d2 += outer(e2, ones_column(BLOCK), P)
+    elif SUMS == "outside":
+        store_by_column(h1, a1, r, h, M, H)
+        store_by_column(g2, e2, r, h, M, H)
+    _, k1 = silu(z1)
+    e1 = product(e2, U2, P) * k1
+    if SUMS == "outside":
+        store_by_column(g1, e1, r, h, M, H)
+    return e1, D2, d2
 
 
 @triton.jit(do_not_specialize=["N", "start"])
@@ -82,35 +102,21 @@ def theta_backward(
             D3 += outer(a2, g, P)
         elif SUMS == "outside":
             store_by_column(gout, g, r, c, M, 6)
-            store_by_column(h1, a1, r, h, M, H)
             store_by_column(h2, a2, r, h, M, H)
             store_by_column(l2 + H * M, of_state, r, c, M, 12)
-        e2 = product(g, U3 if SUMS == "inside" else backward(W3, 6, H, H, P), P) * k2
-        if SUMS == "inside":
-            D2 += outer(e2, a1, P)
-            d2 += outer(e2, ones_column(BLOCK), P)
-        elif SUMS == "outside":
-            store_by_column(g2, e2, r, h, M, H)
-        _, k1 = silu(z1)
-        e1 = product(e2, U2 if SUMS == "inside" else backward(W2, H, H, H, P), P) * k1
+        g = product(g, U3 if SUMS == "inside" else backward(W3, 6, H, H, P), P)
+        e1, D2, d2 = hidden_adjoint(
+            g, z1, a1, k2, U2 if SUMS == "inside" else backward(W2, H, H, H, P), D2, d2, h1, g1, g2, r, M, SUMS, H, BLOCK, P
+        )
         if SUMS == "inside":
             D1 += outer(e1, x, P)
             Dx += outer(e1, with_ones(of_state, 12), P)
-        elif SUMS == "outside":
-            store_by_column(g1, e1, r, h, M, H)
         store_by_column(gl2, product(e1, U1 if SUMS == "inside" else backward(W1, H, H, H + 12, P), P), r, h, M, H)
         store_input_adjoint(gw, gs2, scale * product(e1, Ux if SUMS == "inside" else backward(W1 + H, H, 12, H + 12, P), P), r, M)
     if SUMS == "inside":
         at = partial + tl.program_id(0) * size + start
         store_square(at, D1, H + 12, H)
-        store_columns(at + H, Dx, H + 12, 1, 0, 12, H)
-        at += H * (H + 12)
-        store_columns(at, Dx, 1, 0, 12, 1, H)
-        at += H
-        store_square(at, D2, H, H)
-        at += H * H
-        store_columns(at, d2, 1, 0, 0, 1, H)
-        at += H
+        at = store_hidden(at, Dx, D2, d2, H + 12, 12, H)
         store_columns(at, D3, 1, H, 0, 6, H)
         tl.store(at + 6 * H + c, tl.sum(d3, 0), mask=c < 6)
 
@@ -147,31 +153,18 @@ def psi2_backward(
             store_by_column(gout + 12 * M, eb, r, h, M, H)
         g = product(e, U3 if SUMS == "inside" else backward(W3, 12, H, H, P), P)
         g += product(eb, U4 if SUMS == "inside" else backward(W3 + 12 * H, H, H, H, P), P)
-        e2 = g * k2
-        if SUMS == "inside":
-            D2 += outer(e2, a1, P)
-            d2 += outer(e2, ones_column(BLOCK), P)
-        elif SUMS == "outside":
-            store_by_column(h1, a1, r, h, M, H)
-            store_by_column(g2, e2, r, h, M, H)
-        _, k1 = silu(z1)
-        e1 = product(e2, U2 if SUMS == "inside" else backward(W2, H, H, H, P), P) * k1
+        e1, D2, d2 = hidden_adjoint(
+            g, z1, a1, k2, U2 if SUMS == "inside" else backward(W2, H, H, H, P), D2, d2, h1, g1, g2, r, M, SUMS, H, BLOCK, P
+        )
         if SUMS == "inside":
             D1 += outer(e1, x, P)
             Dx += outer(e1, with_ones(normals, 3), P)
-        elif SUMS == "outside":
-            store_by_column(g1, e1, r, h, M, H)
         store_by_column(gl1, product(e1, U1 if SUMS == "inside" else backward(W1, H, H, H + 3, P), P), r, h, M, H)
         store_by_column(gl1 + H * M, product(e1, Ux if SUMS == "inside" else backward(W1 + H, H, 3, H + 3, P), P), r, c, M, 3)
     if SUMS == "inside":
         at = partial + tl.program_id(0) * size + start
         store_square(at, D1, H + 3, H)
-        store_columns(at + H, Dx, H + 3, 1, 0, 3, H)
-        at += H * (H + 3)
-        store_columns(at, Dx, 1, 0, 3, 1, H)
-        at += H
-        store_square(at, D2, H, H)
-        store_columns(at + H * H, d2, 1, 0, 0, 1, H)
+        store_hidden(at, Dx, D2, d2, H + 3, 3, H)
 
 
 @triton.jit(do_not_specialize=["N", "start"])
@@ -207,31 +200,17 @@ def psi1_backward(
             store_by_column(gplanes, e, r, planes, M, 36)
             store_by_column(gout, g, r, h, M, H)
             store_by_column(x, inputs, r, c, M, 12)
-            store_by_column(h1, a1, r, h, M, H)
             store_by_column(h2, a2, r, h, M, H)
-        e2 = product(g, U3 if SUMS == "inside" else backward(W3, H, H, H, P), P) * k2
-        if SUMS == "inside":
-            D2 += outer(e2, a1, P)
-            d2 += outer(e2, ones_column(BLOCK), P)
-        elif SUMS == "outside":
-            store_by_column(g2, e2, r, h, M, H)
-        _, k1 = silu(z1)
-        e1 = product(e2, U2 if SUMS == "inside" else backward(W2, H, H, H, P), P) * k1
+        g = product(g, U3 if SUMS == "inside" else backward(W3, H, H, H, P), P)
+        e1, D2, d2 = hidden_adjoint(
+            g, z1, a1, k2, U2 if SUMS == "inside" else backward(W2, H, H, H, P), D2, d2, h1, g1, g2, r, M, SUMS, H, BLOCK, P
+        )
         if SUMS == "inside":
             D1 += outer(e1, with_ones(inputs, 12), P)
-        elif SUMS == "outside":
-            store_by_column(g1, e1, r, h, M, H)
         store_input_adjoint(gw, gs, scale * product(e1, U1 if SUMS == "inside" else backward(W1, H, 12, 12, P), P), r, M)
     if SUMS == "inside":
         at = partial + tl.program_id(0) * size + start
-        store_columns(at, D1, 12, 1, 0, 12, H)
-        at += H * 12
-        store_columns(at, D1, 1, 0, 12, 1, H)
-        at += H
-        store_square(at, D2, H, H)
-        at += H * H
-        store_columns(at, d2, 1, 0, 0, 1, H)
-        at += H
+        at = store_hidden(at, D1, D2, d2, 12, 12, H)
         store_square(at, D3, H, H)
         at += H * H
         store_columns(at, d3, 1, 0, 0, 1, H)
@@ -277,20 +256,13 @@ def phi_backward(
         elif SUMS == "outside":
             store_by_column(gout, g, r, c, M, 6)
             store_by_column(x, inputs, r, c, M, 12)
-            store_by_column(h1, a1, r, h, M, H)
             store_by_column(h2, a2, r, h, M, H)
-        e2 = product(g, U3 if SUMS == "inside" else backward(W3, 6, H, H, P), P) * k2
-        if SUMS == "inside":
-            D2 += outer(e2, a1, P)
-            d2 += outer(e2, ones_column(BLOCK), P)
-        elif SUMS == "outside":
-            store_by_column(g2, e2, r, h, M, H)
-        _, k1 = silu(z1)
-        e1 = product(e2, U2 if SUMS == "inside" else backward(W2, H, H, H, P), P) * k1
+        g = product(g, U3 if SUMS == "inside" else backward(W3, 6, H, H, P), P)
+        e1, D2, d2 = hidden_adjoint(
+            g, z1, a1, k2, U2 if SUMS == "inside" else backward(W2, H, H, H, P), D2, d2, h1, g1, g2, r, M, SUMS, H, BLOCK, P
+        )
         if SUMS == "inside":
             D1 += outer(e1, with_ones(inputs, 12), P)
-        elif SUMS == "outside":
-            store_by_column(g1, e1, r, h, M, H)
         gx = scale * product(e1, U1 if SUMS == "inside" else backward(W1, H, 12, 12, P), P)
         direct = by_column(gwx, r, c, M, 6) + by_column(gwt, r, c, M, 6)
         tl.store(gw + row * 6 + column, gx + direct, mask=(row < N) & (column < 6))
@@ -300,13 +272,6 @@ def phi_backward(
         tl.store(gs + row * 6 + column - 6, (gx + direct) / tl.load(unit), mask=of_s)
     if SUMS == "inside":
         at = partial + tl.program_id(0) * size + start
-        store_columns(at, D1, 12, 1, 0, 12, H)
-        at += H * 12
-        store_columns(at, D1, 1, 0, 12, 1, H)
-        at += H
-        store_square(at, D2, H, H)
-        at += H * H
-        store_columns(at, d2, 1, 0, 0, 1, H)
-        at += H
+        at = store_hidden(at, D1, D2, d2, 12, 12, H)
         store_columns(at, D3, 1, H, 0, 6, H)
         tl.store(at + 6 * H + c, tl.sum(d3, 0), mask=c < 6)

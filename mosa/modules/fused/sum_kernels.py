@@ -42,6 +42,20 @@ def store_columns(at, D, row: tl.constexpr, column: tl.constexpr, first: tl.cons
 
 
 @triton.jit
+def store_hidden(at, Dx, D2, d2, IN: tl.constexpr, COUNT: tl.constexpr, H: tl.constexpr):
+    """The last COUNT columns of the first weight (H, IN) from Dx (H, 16), its bias from the column after them, and the second
+    layer; returns where the third begins."""
+    store_columns(at + IN - COUNT, Dx, IN, 1, 0, COUNT, H)
+    at += H * IN
+    store_columns(at, Dx, 1, 0, COUNT, 1, H)
+    at += H
+    store_square(at, D2, H, H)
+    at += H * H
+    store_columns(at, d2, 1, 0, 0, 1, H)
+    return at + H
+
+
+@triton.jit
 def layer_gradient(
     g, x, at, M, OUT: tl.constexpr, IN: tl.constexpr, ROW: tl.constexpr, COLUMN: tl.constexpr,
     TILE: tl.constexpr, BLOCK: tl.constexpr, P: tl.constexpr,
