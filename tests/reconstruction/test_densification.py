@@ -27,16 +27,6 @@ RATES = Rates(means=1e-3, log_scale=0.02, opacity=0.05, color=0.08, rotation=0.0
 BOUNDS = {"smallest": 0.25, "largest": 2.0, "axis_ratio": 10.0}
 
 
-@pytest.fixture(scope="module")
-def hull(squashed):
-    return visual_hull(squashed.mattes[:, 0], squashed.cameras, squashed.box, pitch=0.0032)
-
-
-@pytest.fixture(scope="module")
-def still(squashed):
-    return object_windows(squashed, list(range(8)), [0, 1]).of_frame(0)
-
-
 def rendered(splats, windows, background=WHITE):
     state = torch.zeros(len(windows), dtype=torch.long)
     covariances = covariance_from(splats.scales, splats.rotations)[None]

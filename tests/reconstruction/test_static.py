@@ -11,7 +11,6 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 from mosa.errors import DataError
 from mosa.reconstruction.filling import body_volume, fill
 from mosa.reconstruction.gaussians import isotropic_covariances
-from mosa.reconstruction.hull import visual_hull
 from mosa.reconstruction.initial import initial_splats, projected_colors, surface_points
 from mosa.reconstruction.observed import object_windows
 from mosa.reconstruction.photometric import ssim
@@ -21,16 +20,6 @@ from mosa.rendering.rasterizer import rasterize
 
 QUICK = FitSettings(iterations=120, views=2)
 DOWN = (0.0, -1.0, 0.0)
-
-
-@pytest.fixture(scope="module")
-def hull(squashed):
-    return visual_hull(squashed.mattes[:, 0], squashed.cameras, squashed.box, pitch=0.0032)
-
-
-@pytest.fixture(scope="module")
-def still(squashed):
-    return object_windows(squashed, list(range(8)), [0, 1]).of_frame(0)
 
 
 def rendered(splats, windows):
