@@ -4,8 +4,9 @@ An adapter of the state is asked every few substeps. Done one by one, each answe
 the host, which take longer than the arithmetic of 100 000 particles. A chain of K segments looks at the host once. Its backward
 pass goes back through the states of all substeps: the adapter is asked again at the start of a segment, this time with a graph,
 and what the segment's adjoint leaves on its answer goes through that graph to the state and to the adapter's weights. Between the
-passes all states are kept where there is memory for them (`kept`), else only the chain's start, from which they are made again,
-and the graphs of the chain's evaluations with them.
+passes all states are kept where there is memory for them (`kept`), else only the chain's start, from which they are made again.
+That asks the adapter too: where there is memory for the graphs of all the chain's evaluations (`graphs`), they are kept beside the
+states and nothing is asked a third time.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import accumulate, pairwise
 from typing import NamedTuple
 
 import torch
@@ -21,8 +21,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from mosa.physics.activations import at_hand
-from mosa.physics.memory import free_memory, room
-from mosa.physics.mpm import SegmentSolver, substep_bytes, wants_gradient, warp_stream
+from mosa.physics.mpm import SegmentSolver, warp_stream
 from mosa.physics.mpm_kernels import NO_EVENT
 from mosa.physics.window import grid_window
 from mosa.physics.workspace import Numerics, Workspace, copies
@@ -30,13 +29,7 @@ from mosa.physics.workspace import Numerics, Workspace, copies
 ANSWER = ("G", "h", "plastic_G", "plastic_h")
 COARSE = 8
 """Node counts of a chain's window are multiples of this: each change of them costs a new capture."""
-SEGMENT = 32
-"""Most substeps of a chain: what the backward pass stores at once."""
-WITHOUT_GRADIENT = 96
-"""The same where no gradient is wanted."""
-CHAIN_SHARE = 0.05
-"""Of a GPU's free memory, for what the backward pass of a chain stores."""
-MAX_CHAINS = 8
+LARGE = 2**14
 ATTEMPTS = 3
 """Captures that may fail before a chain gives up: libraries that set themselves up when they are first captured spoil one."""
 
@@ -54,12 +47,13 @@ class Chain:
 
     ask: (adapter, F, C_affine, packed parameters) -> its answer by name (`ANSWER`, None where it has none), differentiable.
     collects: also return `adapter.statistics()`, a named tuple of tensors, of every evaluation.
+    graphs: where states are made again, keep the graphs of the evaluations with them.
     An adapter that looks at the host cannot be captured: it is run uncaptured, with a warning.
     """
 
     def __init__(
         self, numerics: Numerics, adapter: nn.Module, ask: Callable[..., dict[str, Tensor | None]], particles: int,
-        lengths: Sequence[int], *, plastic_adapted: bool, collects: bool,
+        lengths: Sequence[int], *, plastic_adapted: bool, collects: bool, graphs: bool = False,
     ) -> None:  # fmt: skip
         self.numerics, self.adapter, self.ask, self.lengths, self.collects = numerics, adapter, ask, tuple(lengths), collects
         self.substeps = sum(lengths)
@@ -76,10 +70,12 @@ class Chain:
         self._graphs: dict[tuple, torch.cuda.CUDAGraph] = {}
         self._key: tuple = ()
         self._passes: dict[tuple, Callable[[], None]] = {}
+        self.again = "graphs" if graphs else "states"
         for kept in (False, True):
             self._passes["forward", kept] = partial(self._forward, kept)
+        for source in ("tape", self.again):
             for penalised in (False, True):
-                self._passes["adjoint", kept, penalised] = partial(self._adjoint, kept, penalised)
+                self._passes["adjoint", source, penalised] = partial(self._adjoint, source, penalised)
 
     def advance(
         self, solver: SegmentSolver, state: tuple[Tensor, ...], packed: Tensor, first: int, kept: bool = False
@@ -122,7 +118,7 @@ class Chain:
         for target, seed in zip(targets, seeds, strict=True):
             target.zero_() if seed is None else target.copy_(seed)
         penalised = any(seed is not None for seed in seeds[len(self._targets(slot)) :])
-        self._play(("adjoint", bool(tape), penalised))
+        self._play(("adjoint", "tape" if tape else self.again, penalised))
         found = copies([*self._targets(0), self.adj_packed, *self.adj_weights])
         states = len(self._targets(0))
         return found[:states], found[states], found[states + 1 :]
@@ -182,17 +178,21 @@ class Chain:
             work.advance_steps(step, length)
 
     def _forward(self, kept: bool) -> None:
-        work = self._full() if kept else self.light
+        collected = self._advance_all(self._full() if kept else self.light, self.collects)
+        self.statistics = tuple(torch.stack(parts) for parts in zip(*collected))
+
+    @torch.no_grad()
+    def _advance_all(self, work: Workspace, collects: bool) -> list[tuple[Tensor, ...]]:
+        """Launches all segments; returns the statistics of each evaluation."""
         work.flags.fill_(NO_EVENT)
         step, collected = 0, []
-        with torch.no_grad():
-            for length in self.lengths:
-                slot = step % len(work.x)
-                answer, statistics = self._ask(work.F[slot], work.C[slot], work.held["parameters"], self.collects)
-                collected.append(statistics)
-                self._advance(work, step, length, answer)
-                step += length
-        self.statistics = tuple(torch.stack(parts) for parts in zip(*collected))
+        for length in self.lengths:
+            slot = step % len(work.x)
+            answer, statistics = self._ask(work.F[slot], work.C[slot], work.held["parameters"], collects)
+            collected.append(statistics)
+            self._advance(work, step, length, answer)
+            step += length
+        return collected
 
     def _advance_with_graphs(self, penalised: bool) -> list[_Evaluation]:
         """Launches all segments again."""
@@ -204,9 +204,13 @@ class Chain:
             step += length
         return made
 
-    def _adjoint(self, kept: bool, penalised: bool) -> None:
-        work, step = self.full, self.substeps
-        made = [] if kept else self._advance_with_graphs(penalised)
+    def _adjoint(self, source: str, penalised: bool) -> None:
+        """source: of the states, tape | states | graphs: loaded, or made again, without or with the evaluations' graphs."""
+        work, step, made = self.full, self.substeps, []
+        if source == "graphs":
+            made = self._advance_with_graphs(penalised)
+        elif source == "states":
+            self._advance_all(work, False)
         self.adj_packed.zero_()
         torch._foreach_zero_(self.adj_weights)
         for index in reversed(range(len(self.lengths))):
@@ -224,9 +228,7 @@ class Chain:
             outputs, seeds = zip(*pairs)
             found = torch.autograd.grad(outputs, leaves, seeds, allow_unused=True)
             slot = step % 2
-            sums = [work.adj_F[slot], work.adj_C[slot], self.adj_packed, *self.adj_weights]
-            sums, found = zip(*[(s, f) for s, f in zip(sums, found, strict=True) if f is not None])
-            torch._foreach_add_(sums, found)
+            _add([work.adj_F[slot], work.adj_C[slot], self.adj_packed, *self.adj_weights], found)
 
     def _check_graphs(self, solver: SegmentSolver) -> None:
         """Forget captured graphs where what they have by value or address is another one."""
@@ -266,57 +268,14 @@ class Chain:
             self._graphs[name] = graph
 
 
-class Chains:
-    """The chains of one simulator. ask: as `Chain`."""
-
-    def __init__(self, numerics: Numerics, ask: Callable[..., dict[str, Tensor | None]]) -> None:
-        self.numerics, self.ask = numerics, ask
-        self.chains: dict[tuple, Chain] = {}
-        self._probes: dict[tuple, tuple[nn.Module, bool, int]] = {}
-
-    def plan(self, adapter: nn.Module, state: tuple[Tensor, ...], packed: Tensor, substeps: int, stride: int) -> tuple[int, bool]:
-        """(most substeps of a chain, whether to keep the states of all `substeps` of a rollout), by memory."""
-        if self.numerics.device.type != "cuda":
-            return SEGMENT, True
-        if not wants_gradient((*state, packed, *adapter.parameters())):
-            return WITHOUT_GRADIENT, False
-        each = substep_bytes(self.numerics, len(packed))
-        kept = room(self.numerics.device, substeps * each) > 0
-        if not kept:  # the graphs of a chain's evaluations live as long as its states
-            each += self._probe(adapter, state, packed)[2] // stride
-        return max(1, min(SEGMENT, int(CHAIN_SHARE * free_memory(self.numerics.device) / each))), kept
-
-    def chain(
-        self, adapter: nn.Module, lengths: tuple[int, ...], state: tuple[Tensor, ...], packed: Tensor, collects: bool
-    ) -> Chain:
-        learned = tuple(p.requires_grad for p in adapter.parameters())
-        key = (id(adapter), len(packed), lengths, collects, learned)  # the chain holds the adapter: its id stays its own
-        if key not in self.chains:
-            if len(self.chains) >= MAX_CHAINS:
-                self.chains.clear()
-            self.chains[key] = Chain(
-                self.numerics, adapter, self.ask, len(packed), lengths, collects=collects,
-                plastic_adapted=self._probe(adapter, state, packed)[1],
-            )  # fmt: skip
-        return self.chains[key]
-
-    def _probe(self, adapter: nn.Module, state: tuple[Tensor, ...], packed: Tensor) -> tuple[nn.Module, bool, int]:
-        """(the adapter, whether it corrects the yield function, bytes that an evaluation's graph holds), from one evaluation."""
-        device = self.numerics.device
-        key = (id(adapter), len(packed))
-        if key not in self._probes:
-            if len(self._probes) >= MAX_CHAINS:
-                self._probes.clear()
-            with torch.enable_grad(), at_hand():
-                leaves = [t.detach().requires_grad_() for t in (state[3], state[2], packed)]
-                answer, held = self.ask(adapter, *leaves), 0
-                if device.type == "cuda":  # the second one's: an adapter may hold its last graph, and frees it with the next
-                    held = torch.cuda.memory_allocated(device)
-                    second = self.ask(adapter, *leaves)
-                    held = torch.cuda.memory_allocated(device) - held
-                    del second
-            self._probes[key] = adapter, answer["plastic_G"] is not None, held
-        return self._probes[key]
+def _add(sums: Sequence[Tensor], found: Sequence[Tensor | None]) -> None:
+    """In place. Large ones each in a launch of their own, on all of a GPU: one launch for many gives a block 65536 numbers."""
+    pairs = [(s, f) for s, f in zip(sums, found, strict=True) if f is not None]
+    for total, part in pairs:
+        if total.numel() >= LARGE:
+            total.add_(part)
+    if small := [(s, f) for s, f in pairs if s.numel() < LARGE]:
+        torch._foreach_add_(*zip(*small))
 
 
 class _Chained(torch.autograd.Function):
@@ -351,13 +310,3 @@ def advance_chain(
     count = 5 if solver.numerics.law.plastic else 4
     final = result[:count] if count == 5 else (*result[:4], result[3])
     return final, chain.named(result[count:])
-
-
-def grouped(lengths: Sequence[int], limit: int) -> list[tuple[int, ...]]:
-    """The segments of a frame in chains of at most `limit` substeps, nearly equally many segments each."""
-    per_chain = max(1, limit // max(lengths))
-    chains = -(-len(lengths) // per_chain)
-    size, longer = divmod(len(lengths), chains)
-    sizes = [size + (index < longer) for index in range(chains)]
-    ends = [0, *accumulate(sizes)]
-    return [tuple(lengths[a:b]) for a, b in pairwise(ends)]

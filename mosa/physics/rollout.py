@@ -18,7 +18,8 @@ from torch import Tensor, nn
 from mosa.errors import ConfigError
 from mosa.physics.adaptive import StepChooser, StepControl, check_counts
 from mosa.physics.boundary import Plane, ground_plane, pack_planes
-from mosa.physics.chain import SEGMENT, Chains, advance_chain, grouped
+from mosa.physics.chain import advance_chain
+from mosa.physics.chains import SEGMENT, Chains, grouped
 from mosa.physics.collider_motion import Motion, Trajectory, sample_frame, sample_poses
 from mosa.physics.colliders import Collider, pack_colliders, reach
 from mosa.physics.laws import SLOTS, law_named
@@ -240,7 +241,7 @@ class Simulator:
         chained = self.chained and isinstance(adapter, nn.Module) and not variable and not self.colliders
         current = (state.x, state.v, C, F, F_tot)
         if chained:
-            most, kept = self._chains.plan(adapter, current, packed, (frames - 1) * self.substeps, stride)
+            plan = self._chains.plan(adapter, current, packed, (frames - 1) * self.substeps, stride)
         poses = () if variable else self._poses(motions, frames, start_time)
         reactions = []
         wanted = wants_gradient((*current, *held.values(), *poses))
@@ -261,9 +262,9 @@ class Simulator:
                 lengths = _segments(count, None if adapter is None else stride, most_alone)
             if chained:
                 forces = None
-                for group in grouped(lengths, most):
-                    chain = self._chains.chain(adapter, group, current, packed, collect is not None)
-                    current, statistics = advance_chain(chain, solver, current, packed, first, kept)
+                for group in grouped(lengths, plan.limit):
+                    chain = self._chains.chain(adapter, group, current, packed, collect is not None, plan.graphs)
+                    current, statistics = advance_chain(chain, solver, current, packed, first, plan.kept)
                     first += sum(group)
                     for each in statistics:
                         collect(each)

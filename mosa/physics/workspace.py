@@ -64,6 +64,8 @@ WINDOWS = 2**27
 """Bytes of other windows' buffers that a workspace on a CPU keeps, with their graphs: a falling body comes back to them."""
 GRID = ("grid", "grid_wp", "velocity", "velocity_wp", "adj_grid", "adj_grid_wp", "adj_velocity", "adj_velocity_wp", "_graphs")
 """What belongs to a size of the window."""
+ALIGNED = 32
+"""Numbers: where arrays in one buffer begin."""
 BLOCK = 64
 """Threads of a CUDA block: small ones, so that ten thousand particles are spread over all multiprocessors."""
 
@@ -128,9 +130,7 @@ class Workspace:
             if self.plastic:
                 self.adj_A, self.adj_A_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
             self.adj_tau, self.adj_tau_wp = self._array((n, 3, 3), self.kernels.mat33)
-            self.adj_held, self.adj_held_wp = {}, {}
-            for name, (shape, kind) in shapes.items():
-                self.adj_held[name], self.adj_held_wp[name] = self._array(shape, kind)
+            self.adj_held, self.adj_held_wp, self.all_adj_held_wp = self._in_one(shapes)
         self.flags, self.flags_wp = self._array((4,), wp.int64, torch.int64)
         self.origin, self.origin_wp = self._array((1, 3), wp.vec3i, torch.int32)
         self.planes_wp = wp.from_torch(numerics.planes, dtype=self.scalar)
@@ -149,6 +149,14 @@ class Workspace:
     def _array(self, shape: tuple[int, ...], kind, dtype: torch.dtype | None = None):
         tensor = torch.zeros(shape, dtype=dtype or self.numerics.dtype, device=self.numerics.device)
         return tensor, wp.from_torch(tensor, dtype=kind)
+
+    def _in_one(self, shapes: dict[str, tuple[tuple[int, ...], type]]) -> tuple[dict[str, Tensor], dict, wp.array]:
+        """Arrays by name, as `_array`, and one of all their numbers: to clear them takes one launch."""
+        sizes = [-(-math.prod(shape) // ALIGNED) * ALIGNED for shape, _ in shapes.values()]
+        whole, whole_wp = self._array((sum(sizes),), self.scalar)
+        parts = zip(shapes.items(), whole.split(sizes))
+        tensors = {name: part[: math.prod(shape)].view(shape) for (name, (shape, _)), part in parts}
+        return tensors, {name: wp.from_torch(t, dtype=shapes[name][1]) for name, t in tensors.items()}, whole_wp
 
     def _per_slot(self, slots: int, shape: tuple[int, ...], kind):
         tensor = torch.zeros((slots, *shape), dtype=self.numerics.dtype, device=self.numerics.device)
@@ -322,8 +330,7 @@ class Workspace:
         adj_held is of these substeps alone."""
         kernels, n, held = self.kernels, self.particles, self.adj_held_wp
         geometry, kicked = self._geometry(self.steps.dt), self._geometry(self.steps.kick)
-        for array in held.values():
-            array.zero_()
+        self.all_adj_held_wp.zero_()
         if self.colliders is not None and first + count == self.substeps:
             self.colliders.reset_adjoint()
         for step in reversed(range(first, first + count)):

@@ -8,7 +8,8 @@ from torch import nn
 
 from mosa.errors import SimulationDiverged
 from mosa.modules.adapter import StressAdapter, pool
-from mosa.physics.chain import ATTEMPTS, grouped
+from mosa.physics.chain import ATTEMPTS
+from mosa.physics.chains import Plan, chain_length, grouped
 from mosa.physics.rollout import SEGMENT, Simulator
 from mosa.types import Ground, ParticleState
 
@@ -27,7 +28,8 @@ def adapter_of(device: str, dtype: torch.dtype, plastic: bool) -> StressAdapter:
     return adapter.to(device)
 
 
-def rolled(chained, law, device, dtype, state, adapter, *, stride=2, substeps=11, frames=4, penalised=True, kept=True, **options):
+def rolled(chained, law, device, dtype, state, adapter, *, stride=2, substeps=11, frames=4, penalised=True, source="tape",
+           **options):
     """(frames x, F, F_tot, statistics of the evaluations) and gradients of a sum of them, all on the CPU in float64."""
     names = ("x", "v", "C_affine", "F", "F_tot")
     state = ParticleState(*(getattr(state, name).to(device=device, dtype=dtype) for name in names))
@@ -36,7 +38,7 @@ def rolled(chained, law, device, dtype, state, adapter, *, stride=2, substeps=11
     parameters = {"mu": mu, "lam": 1e4, **({"yield_stress": 300.0} if law == "von_mises" else {})}
     sim = Simulator(law, dx=0.04, substeps=substeps, frame_dt=4e-4 * substeps, ground=Ground(0.0), dtype=dtype, device=device,
                     chained=chained, **options)
-    sim._chains.plan = lambda *_: (SEGMENT, kept)
+    sim._chains.plan = lambda *_: Plan(SEGMENT, kept=source == "tape", graphs=source == "graphs")
     volume = torch.full((len(state.x),), 8e-6, device=device, dtype=dtype)
     weights = [p for p in adapter.parameters() if p.requires_grad]
 
@@ -60,13 +62,14 @@ def assert_same(found, expected, tolerance):
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("law, plastic", [("corotated", False), ("von_mises", True), ("von_mises", False)])
-@pytest.mark.parametrize("penalised, kept", [(True, True), (False, True), (True, False), (False, False)])
-def test_a_chain_is_its_segments(device, law, plastic, penalised, kept, make_block):
+@pytest.mark.parametrize("penalised", [True, False])
+@pytest.mark.parametrize("source", ["tape", "states", "graphs"])
+def test_a_chain_is_its_segments(device, law, plastic, penalised, source, make_block):
     """11 substeps of a frame are 6 evaluations, the last for one substep. On CUDA: eager, then captured, then replayed."""
     adapter = adapter_of(device, torch.float64, plastic)
     make = (law, device, torch.float64, make_block(n=5, velocity=(0.3, -1.0, 0.2)), adapter)
     expected, evaluations = rolled(False, *make, penalised=penalised)()
-    once = rolled(True, *make, penalised=penalised, kept=kept)
+    once = rolled(True, *make, penalised=penalised, source=source)
     for _ in range(3):
         found, count = once()
         assert count == evaluations
@@ -144,6 +147,15 @@ def test_divergence_names_the_substep_and_the_particle(make_block):
         messages.append(str(caught.value))
     assert messages[0] == messages[1] and "outside the box" in messages[1]
     assert int(messages[1].split(",")[0].removeprefix("substep ")) > 11
+
+
+def test_a_rollout_too_large_to_keep_takes_least_memory():
+    start, each = 96, 164
+    length, needed = chain_length(1000, start, each)
+    assert length == round((1000 * start / each) ** 0.5)
+    for other in range(1, SEGMENT):
+        assert needed <= 1.01 * (1000 / other * start + other * each)  # a whole number of chains
+    assert chain_length(10**6, start, each)[0] == SEGMENT and chain_length(4, start, 10**4)[0] == 1
 
 
 def test_segments_are_grouped_evenly_and_in_order():
