@@ -45,7 +45,8 @@ class _Evaluation(NamedTuple):
 class Chain:
     """Buffers and captured graphs of K segments of `lengths` substeps for N particles and one adapter.
 
-    ask: (adapter, F, C_affine, packed parameters) -> its answer by name (`ANSWER`, None where it has none), differentiable.
+    ask: (adapter, F, C_affine, packed parameters, into=None) -> its answer by name (`ANSWER`, None where it has none),
+    differentiable; into: as `material_state`.
     collects: also return `adapter.statistics()`, a named tuple of tensors, of every evaluation.
     graphs: where states are made again, keep the graphs of the evaluations with them.
     An adapter that looks at the host cannot be captured: it is run uncaptured, with a warning.
@@ -119,7 +120,7 @@ class Chain:
             target.zero_() if seed is None else target.copy_(seed)
         penalised = any(seed is not None for seed in seeds[len(self._targets(slot)) :])
         self._play(("adjoint", "tape" if tape else self.again, penalised))
-        found = copies([*self._targets(0), self.adj_packed, *self.adj_weights])
+        found = copies([*self._targets(0), work.adj_held["parameters"], *self.adj_weights])
         states = len(self._targets(0))
         return found[:states], found[states], found[states + 1 :]
 
@@ -131,7 +132,6 @@ class Chain:
         """The buffers of the backward pass, made when they are first needed."""
         if self.full is None:
             self.full = Workspace(self.numerics, **self._shape, with_adjoint=True)
-            self.adj_packed = torch.zeros_like(self.full.held["parameters"])
             self.adj_weights = [torch.zeros_like(w) for w in self.weights]
         return self.full
 
@@ -145,8 +145,9 @@ class Chain:
         return [self.adapter.get_parameter(name) for name in self.names]
 
     def _ask(
-        self, F: Tensor, C: Tensor, packed: Tensor, collects: bool, weights: Sequence[Tensor] | None = None
-    ) -> tuple[dict[str, Tensor | None], tuple[Tensor, ...]]:
+        self, F: Tensor, C: Tensor, packed: Tensor, collects: bool, weights: Sequence[Tensor] | None = None,
+        into: tuple[Tensor, Tensor, Tensor] | None = None,
+    ) -> tuple[dict[str, Tensor | None], tuple[Tensor, ...]]:  # fmt: skip
         """weights: in place of the adapter's own."""
         adapter = self.adapter
         if weights is not None:
@@ -155,7 +156,7 @@ class Chain:
             def adapter(state):
                 return functional_call(self.adapter, named, (state,))
 
-        answer = self.ask(adapter, F, C, packed)
+        answer = self.ask(adapter, F, C, packed, into=into)
         if not collects:
             return answer, ()
         statistics = self.adapter.statistics()
@@ -163,13 +164,14 @@ class Chain:
         return answer, tuple(statistics)
 
     def _evaluate(self, step: int, collects: bool) -> _Evaluation:
-        """The adapter's answer to the state in slot `step`, with a graph."""
-        work = self.full
+        """The adapter's answer to the state in slot `step`; its graph adds the state's gradient to the segment's adjoint."""
+        work, slot = self.full, step % 2
+        into = (work.adj_F[slot], work.adj_C[slot], work.adj_held["parameters"])
         with torch.enable_grad(), at_hand():
             inputs = (work.F[step], work.C[step], work.held["parameters"], *self.weights)
             # aliases: autograd ties a leaf to the stream it was first used on, which a capture on another one may not touch
             leaves = [t.detach().requires_grad_() for t in inputs]
-            return _Evaluation(leaves, *self._ask(*leaves[:3], collects, leaves[3:]))
+            return _Evaluation(leaves, *self._ask(*leaves[:3], collects, leaves[3:], into))
 
     def _advance(self, work: Workspace, step: int, length: int, answer: dict[str, Tensor | None]) -> None:
         """Launches a segment with the operator in `answer`."""
@@ -211,24 +213,22 @@ class Chain:
             made = self._advance_with_graphs(penalised)
         elif source == "states":
             self._advance_all(work, False)
-        self.adj_packed.zero_()
+        work.adj_held["parameters"].zero_()
         torch._foreach_zero_(self.adj_weights)
         for index in reversed(range(len(self.lengths))):
             step -= self.lengths[index]
             leaves, answer, statistics = made.pop() if made else self._evaluate(step, penalised)
             work.point({name: None if t is None else t.detach() for name, t in answer.items()})
             with warp_stream(self.numerics.device):
-                work.adjoint_steps(step, self.lengths[index])
+                work.adjoint_steps(step, self.lengths[index], more=True)
             pairs = [(answer[name], work.adj_held[name]) for name in ANSWER if answer[name] is not None]
             pairs += [(t, all_seeds[index]) for t, all_seeds in zip(statistics, self.statistics_seeds)]
             pairs = [(output, seed) for output, seed in pairs if output.requires_grad]
-            self.adj_packed.add_(work.adj_held["parameters"])
             if not pairs:
                 continue
             outputs, seeds = zip(*pairs)
             found = torch.autograd.grad(outputs, leaves, seeds, allow_unused=True)
-            slot = step % 2
-            _add([work.adj_F[slot], work.adj_C[slot], self.adj_packed, *self.adj_weights], found)
+            _add(self.adj_weights, found[3:])
 
     def _check_graphs(self, solver: SegmentSolver) -> None:
         """Forget captured graphs where what they have by value or address is another one."""

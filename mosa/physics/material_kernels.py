@@ -11,7 +11,8 @@ from functools import cache
 import warp as wp
 
 from mosa.physics.kinematics import contract, hencky_material, rotation, rotation_of, svd
-from mosa.physics.laws import SLOTS, Law, LawParameters
+from mosa.physics.laws import SLOTS, Law
+from mosa.physics.particle_memory import particle_memory
 
 vec6 = wp.types.vector(length=6, dtype=wp.float64)
 mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float64)
@@ -46,7 +47,7 @@ def field_types(scalar):
 def stress_kernel(stress, uses_rotation: bool, scalar, adapted: bool):
     """tau(F) [Pa]; adapted: + R mat(G vech(R^T tau R) + h) R^T with the operator held in the material frame."""
     field33, field6, field66, fieldp = field_types(scalar)
-    needs_rotation = uses_rotation or adapted
+    own, needs_rotation = particle_memory(scalar, SLOTS), uses_rotation or adapted
 
     @wp.kernel(module="unique")
     def stress_of_particles(
@@ -54,14 +55,14 @@ def stress_kernel(stress, uses_rotation: bool, scalar, adapted: bool):
         G: wp.array(dtype=field66), h: wp.array(dtype=field6), tau: wp.array(dtype=field33),
     ):  # fmt: skip
         i = wp.tid()
-        Fi = wp.mat33d(F[i])
+        Fi = own.matrix33(F, i)
         R = Fi
         if wp.static(needs_rotation):
             R = rotation(Fi, rotation_of(Fi))
-        T = stress(Fi, R, wp.mat33d(C_affine[i]), LawParameters(parameters[i]))
+        T = stress(Fi, R, own.matrix33(C_affine, i), own.parameters(parameters, i))
         if wp.static(adapted):
             s = vech(wp.transpose(R) * T * R)
-            T = T + R * unvech(mat66(G[i]) * s + vec6(h[i])) * wp.transpose(R)
+            T = T + R * unvech(own.matrix66(G, i) * s + own.vector6(h, i)) * wp.transpose(R)
         tau[i] = field33(T)
 
     return stress_of_particles
@@ -74,6 +75,7 @@ def return_kernel(return_map, scalar, adapted: bool):
     adapted: |E'| of the yield function is that of dev(mat((I + G) vech(E) + h)), E = dev(log W) of the trial.
     """
     field33, field6, field66, fieldp = field_types(scalar)
+    own = particle_memory(scalar, SLOTS)
 
     @wp.kernel(module="unique")
     def mapped_gradient(
@@ -82,8 +84,8 @@ def return_kernel(return_map, scalar, adapted: bool):
         F_new: wp.array(dtype=field33),
     ):  # fmt: skip
         i = wp.tid()
-        Fi = wp.mat33d(F[i])
-        Ci = wp.mat33d(C_affine[i])
+        Fi = own.matrix33(F, i)
+        Ci = own.matrix33(C_affine, i)
         trial = Fi + dt * (Ci * Fi)
         U, S, V = svd(trial)
         R = rotation(trial, U * wp.transpose(V))
@@ -91,9 +93,9 @@ def return_kernel(return_map, scalar, adapted: bool):
         E = deviator(H)
         if wp.static(adapted):
             # as an increment, so that a zero operator leaves the plain map bit for bit
-            E = E + deviator(unvech(mat66(G[i]) * vech(E) + vec6(h[i])))
+            E = E + deviator(unvech(own.matrix66(G, i) * vech(E) + own.vector6(h, i)))
         mapped, yielded = return_map(
-            trial, Fi, Ci, R, U, S, V, H, wp.ddot(E, E), norm_eps, LawParameters(parameters[i]), dt
+            trial, Fi, Ci, R, U, S, V, H, wp.ddot(E, E), norm_eps, own.parameters(parameters, i), dt
         )
         if yielded == 0 and rebuild == 1:
             mapped = contract(trial, U, S, V, wp.float64(1.0))
@@ -106,6 +108,7 @@ def return_kernel(return_map, scalar, adapted: bool):
 def state_kernel(stress, uses_rotation: bool, scalar, plastic: bool):
     """w = vech(W - I), s = vech(R^T tau R) [Pa] of the prior, e = vech(dev log W) if plastic."""
     field33, field6, _, fieldp = field_types(scalar)
+    own = particle_memory(scalar, SLOTS)
 
     @wp.kernel(module="unique")
     def material_state(
@@ -113,9 +116,9 @@ def state_kernel(stress, uses_rotation: bool, scalar, plastic: bool):
         w: wp.array(dtype=field6), s: wp.array(dtype=field6), e: wp.array(dtype=field6),
     ):  # fmt: skip
         i = wp.tid()
-        Fi = wp.mat33d(F[i])
+        Fi = own.matrix33(F, i)
         R = rotation(Fi, rotation_of(Fi))
-        T = stress(Fi, R, wp.mat33d(C_affine[i]), LawParameters(parameters[i]))
+        T = stress(Fi, R, own.matrix33(C_affine, i), own.parameters(parameters, i))
         Rt = wp.transpose(R)
         w[i] = field6(vech(Rt * Fi - wp.identity(n=3, dtype=wp.float64)))
         s[i] = field6(vech(Rt * T * R))

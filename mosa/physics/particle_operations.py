@@ -8,19 +8,21 @@ from torch import Tensor
 from mosa.physics.laws import Law
 from mosa.physics.material_kernels import field_types, return_kernel, state_kernel, stress_kernel
 from mosa.physics.mpm import warp_stream
-from mosa.physics.workspace import SCALARS, Numerics, launch
+from mosa.physics.particle_memory import aligned
+from mosa.physics.workspace import ALIGNED, SCALARS, Numerics, launch
 
 
 def _arrays(tensors: list[Tensor | None], kinds: list) -> list:
     return [
-        None if t is None else wp.from_torch(t.detach().contiguous(), dtype=kind) for t, kind in zip(tensors, kinds, strict=True)
+        None if t is None else wp.from_torch(aligned(t.detach()), dtype=kind) for t, kind in zip(tensors, kinds, strict=True)
     ]
 
 
 def _zeros(tensors: list[Tensor]) -> list[Tensor]:
-    """Contiguous, of the tensors' shapes, made in one launch: what Warp's adjoints add gradients to."""
-    flat = tensors[0].new_zeros(sum(t.numel() for t in tensors))
-    return [part.view(t.shape) for part, t in zip(flat.split([t.numel() for t in tensors]), tensors)]
+    """Contiguous, of the tensors' shapes, made in one launch: what adjoints add gradients to."""
+    sizes = [-(-t.numel() // ALIGNED) * ALIGNED for t in tensors]
+    flat = tensors[0].new_zeros(sum(sizes))
+    return [part[: t.numel()].view(t.shape) for part, t in zip(flat.split(sizes), tensors)]
 
 
 @torch.no_grad()
@@ -38,12 +40,12 @@ def kirchhoff_stress(law: Law, F: Tensor, C_affine: Tensor, parameters: Tensor) 
 
 class _MaterialState(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, law: Law, F, C, parameters):
+    def forward(ctx, law: Law, into, F, C, parameters):
         scalar = SCALARS[F.dtype]
         mat33, vec6, _, vecp = field_types(scalar)
         ctx.kernel = state_kernel(law.stress, law.uses_rotation, scalar, law.plastic)
         ctx.kinds = [mat33, mat33, vecp, vec6, vec6, vec6]
-        ctx.plastic = law.plastic
+        ctx.plastic, ctx.into = law.plastic, into
         ctx.set_materialize_grads(False)
         # the kernel writes all of them; a law that does not yield has no e
         w, s, e = (F.new_empty(rows, 6) for rows in (len(F), len(F), len(F) if law.plastic else 1))
@@ -58,19 +60,22 @@ class _MaterialState(torch.autograd.Function):
     def backward(ctx, *seeds):
         # the adjoint leaves the outputs alone and only reads the seeds: Warp clears only those that are the grad of an array
         inputs, seeds = list(ctx.saved_tensors), [*seeds] + [None] * (not ctx.plastic)
-        gradients, blank = _zeros(inputs), inputs[0].new_empty(1, 6)
+        gradients, blank = _zeros(inputs) if ctx.into is None else ctx.into, inputs[0].new_empty(1, 6)
         with warp_stream(blank.device):
             arrays = _arrays([*inputs, blank, blank, blank], ctx.kinds)
             launch(ctx.kernel, len(inputs[0]), arrays, arrays[0].device, _arrays([*gradients, *seeds], ctx.kinds))
-        return None, *gradients
+        return None, None, *(gradients if ctx.into is None else (None, None, None))
 
 
-def material_state(law: Law, F: Tensor, C_affine: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+def material_state(
+    law: Law, F: Tensor, C_affine: Tensor, parameters: Tensor, into: tuple[Tensor, Tensor, Tensor] | None = None
+) -> tuple[Tensor, Tensor, Tensor | None]:
     """(w, s, e) that an adapter reads, differentiable.
 
     w: (N, 6) vech(W - I); s: (N, 6) vech(R^T tau R) [Pa] of the prior; e: (N, 6) vech(dev log W), None for elastic laws.
+    into: add the gradients of F, C_affine and parameters to these contiguous tensors, and give autograd none.
     """
-    result = _MaterialState.apply(law, F, C_affine, parameters)
+    result = _MaterialState.apply(law, into, F, C_affine, parameters)
     return result if law.plastic else (*result, None)
 
 

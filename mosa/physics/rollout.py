@@ -329,10 +329,12 @@ class Simulator:
         return MaterialState(*material_state(self.law, F, C_affine, self.pack(parameters, len(F), rotation)))
 
     def _ask(
-        self, adapter: Callable, F: Tensor, C: Tensor, packed: Tensor, collect: Callable | None = None
-    ) -> dict[str, Tensor | None]:
+        self, adapter: Callable, F: Tensor, C: Tensor, packed: Tensor, collect: Callable | None = None,
+        into: tuple[Tensor, Tensor, Tensor] | None = None,
+    ) -> dict[str, Tensor | None]:  # fmt: skip
+        """The adapter's answer by name, checked. into: as `material_state`."""
         n = len(F)
-        answer = AdapterOperator(*adapter(MaterialState(*material_state(self.law, F, C, packed))))
+        answer = AdapterOperator(*adapter(MaterialState(*material_state(self.law, F, C, packed, into))))
         plastic = answer.plastic_G if self.law.plastic else None
         plastic_h = None if plastic is None else answer.plastic_h
         result = {"G": answer.G, "h": answer.h, "plastic_G": plastic, "plastic_h": plastic_h}

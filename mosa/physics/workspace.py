@@ -20,6 +20,7 @@ from mosa.physics.colliders import PackedColliders
 from mosa.physics.laws import SLOTS, Law
 from mosa.physics.material_kernels import kernels_of
 from mosa.physics.mpm_kernels import NO_EVENT, transfer_kernels
+from mosa.physics.particle_memory import aligned
 
 SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
 
@@ -130,7 +131,7 @@ class Workspace:
             if self.plastic:
                 self.adj_A, self.adj_A_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
             self.adj_tau, self.adj_tau_wp = self._array((n, 3, 3), self.kernels.mat33)
-            self.adj_held, self.adj_held_wp, self.all_adj_held_wp = self._in_one(shapes)
+            self.adj_held, self.adj_held_wp, (self.all_adj_wp, self.adj_operator_wp) = self._in_one(shapes)
         self.flags, self.flags_wp = self._array((4,), wp.int64, torch.int64)
         self.origin, self.origin_wp = self._array((1, 3), wp.vec3i, torch.int32)
         self.planes_wp = wp.from_torch(numerics.planes, dtype=self.scalar)
@@ -150,13 +151,15 @@ class Workspace:
         tensor = torch.zeros(shape, dtype=dtype or self.numerics.dtype, device=self.numerics.device)
         return tensor, wp.from_torch(tensor, dtype=kind)
 
-    def _in_one(self, shapes: dict[str, tuple[tuple[int, ...], type]]) -> tuple[dict[str, Tensor], dict, wp.array]:
-        """Arrays by name, as `_array`, and one of all their numbers: to clear them takes one launch."""
+    def _in_one(self, shapes: dict[str, tuple[tuple[int, ...], type]]) -> tuple[dict[str, Tensor], dict, tuple[wp.array, wp.array]]:
+        """Arrays by name, as `_array`, and (one of all their numbers, one of all but the first's): cleared in one launch."""
         sizes = [-(-math.prod(shape) // ALIGNED) * ALIGNED for shape, _ in shapes.values()]
         whole, whole_wp = self._array((sum(sizes),), self.scalar)
+        others_wp = wp.from_torch(whole[sizes[0] :], dtype=self.scalar)
         parts = zip(shapes.items(), whole.split(sizes))
         tensors = {name: part[: math.prod(shape)].view(shape) for (name, (shape, _)), part in parts}
-        return tensors, {name: wp.from_torch(t, dtype=shapes[name][1]) for name, t in tensors.items()}, whole_wp
+        arrays = {name: wp.from_torch(t, dtype=shapes[name][1]) for name, t in tensors.items()}
+        return tensors, arrays, (whole_wp, others_wp)
 
     def _per_slot(self, slots: int, shape: tuple[int, ...], kind):
         tensor = torch.zeros((slots, *shape), dtype=self.numerics.dtype, device=self.numerics.device)
@@ -230,7 +233,7 @@ class Workspace:
         """As `hold`, without a copy: the next launches read these tensors. The caller keeps them."""
         for name, value in held.items():
             if value is not None:
-                self.held_wp[name] = wp.from_torch(value.contiguous(), dtype=self.held_wp[name].dtype)
+                self.held_wp[name] = wp.from_torch(aligned(value), dtype=self.held_wp[name].dtype)
 
     def final(self) -> tuple[Tensor, ...]:
         """Copies of (x, v, C_affine, F, F_tot) after the segment; F_tot is F itself where the law does not yield."""
@@ -324,13 +327,13 @@ class Workspace:
             if self.plastic:
                 self._run(self.mapping, n, self._mapping_arguments(a, b))
 
-    def adjoint_steps(self, first: int, count: int) -> None:
+    def adjoint_steps(self, first: int, count: int, more: bool = False) -> None:
         """Launch the adjoint of `advance_steps`: from the seeds in slot (first + count) % 2 to slot first % 2.
 
-        adj_held is of these substeps alone."""
+        adj_held is of these substeps alone; more: but the parameters' part is added to what is there."""
         kernels, n, held = self.kernels, self.particles, self.adj_held_wp
         geometry, kicked = self._geometry(self.steps.dt), self._geometry(self.steps.kick)
-        self.all_adj_held_wp.zero_()
+        (self.adj_operator_wp if more else self.all_adj_wp).zero_()
         if self.colliders is not None and first + count == self.substeps:
             self.colliders.reset_adjoint()
         for step in reversed(range(first, first + count)):
