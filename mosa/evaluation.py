@@ -19,6 +19,7 @@ from mosa.modules.body import VARIANTS, Body, Start, World
 from mosa.modules.material import material_states
 from mosa.modules.observer import deformed_covariances, observe
 from mosa.rendering.cameras import crop_boxes
+from mosa.threads import threaded
 from mosa.types import Rollout, Scene
 
 PREFIX = {"adapted": "", "prior": "prior/", "prior_eta": "prior_eta/"}
@@ -106,10 +107,10 @@ def motion_metrics(
         target = true_motion(body, sequence.scene) if target is None else target
         result = {"rms_m": metrics.rms(x[after], target[after])}
         pairs = [(x[t], truth.positions[t]) for t in after]
-    each = [metrics.chamfer_distances(a, b, samples=samples) for a, b in pairs]
+    each = list(threaded(lambda pair: metrics.chamfer_distances(*pair, samples=samples), pairs))
     result |= {name: float(np.mean([found[name] for found in each])) for name in each[0]}
     last = pairs[:: max(1, len(pairs) // 3)]
-    result["emd_m"] = float(np.mean([metrics.emd(a, b, samples=assignment) for a, b in last]))
+    result["emd_m"] = float(np.mean(list(threaded(lambda pair: metrics.emd(*pair, samples=assignment), last))))
     return result
 
 

@@ -70,8 +70,8 @@ def _nearest(a: Tensor, b: Tensor, samples: int, seed: int) -> tuple[np.ndarray,
 
 
 def chamfer_distances(a: Tensor, b: Tensor, *, samples: int = CHAMFER_SAMPLES, seed: int = 0) -> dict[str, float]:
-    """`cd_sq_m2`, two-sided sum of mean squared nearest distances [m^2] of clouds (N, 3) and (M, 3) [m], and `cd_m`, the same of the
-    distances themselves [m]."""
+    """`cd_sq_m2`, two-sided sum of mean squared nearest distances [m^2] of clouds (N, 3) and (M, 3) [m], and `cd_m` [m], the same
+    of the distances themselves."""
     ab, ba = _nearest(a, b, samples, seed)
     return {"cd_sq_m2": float((ab**2).mean() + (ba**2).mean()), "cd_m": float(ab.mean() + ba.mean())}
 

@@ -8,6 +8,7 @@ triangular solves are serial.
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 import torch
@@ -37,9 +38,10 @@ def cosines(points: Tensor, count: int) -> Tensor:
 
 def _on(matrix: sparse.csr_matrix, like: Tensor, dtype: torch.dtype) -> Tensor:
     parts = (torch.as_tensor(a.astype(np.int64), device=like.device) for a in (matrix.indptr, matrix.indices))
-    return torch.sparse_csr_tensor(
-        *parts, torch.as_tensor(matrix.data, dtype=dtype, device=like.device), size=matrix.shape, check_invariants=False
-    )
+    values = torch.as_tensor(matrix.data, dtype=dtype, device=like.device)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
+        return torch.sparse_csr_tensor(*parts, values, size=matrix.shape, check_invariants=False)
 
 
 def largest_eigenvalue(matrix: Tensor, *, steps: int = 15, block: int = 8) -> float:
