@@ -19,6 +19,7 @@ from mosa.modules.body import VARIANTS, Body, Start, World
 from mosa.modules.material import material_states
 from mosa.modules.observer import deformed_covariances, observe
 from mosa.rendering.cameras import crop_boxes
+from mosa.threads import threaded
 from mosa.types import Rollout, Scene
 
 PREFIX = {"adapted": "", "prior": "prior/", "prior_eta": "prior_eta/"}
@@ -57,36 +58,41 @@ def rollouts(
 
 @torch.no_grad()
 def render(body: Body, rollout: Rollout, scene: Scene, cameras: list[int]) -> Tensor:
-    """(V, T, H, W, 3) images of a rollout from the given cameras, one camera at a time to bound memory."""
+    """(V, T, H, W, 3) images of a rollout from the given cameras, one camera at a time to bound memory; on the body's device."""
     device = body.rest.device
     views = [
         observe(rollout.x, deformed_covariances(rollout.F_tot, body.covariances), body.opacities, body.colors,
                 scene.cameras.select([c]).to(device), scene.background.to(device)).images
         for c in cameras
     ]
-    return torch.cat(views).clamp(0, 1).cpu()
+    return torch.cat(views).clamp_(0, 1)
 
 
 def image_metrics(images: Tensor, scene: Scene, cameras: list[int], frames: list[int]) -> dict[str, float]:
-    """PSNR and SSIM, in full and in one box per camera: that of the true mattes over all frames plus 10 px."""
+    """PSNR and SSIM, in full and in one box per camera: that of the true mattes over all frames plus 10 px.
+
+    images: (V, T, H, W, 3), all frames; where they lie is where they are compared.
+    """
     if not cameras or not frames:
         return {}
     x0, y0, width, height = crop_boxes(scene.mattes[cameras], margin=10)
-    real = scene.images[cameras]
-    pairs_full, pairs_crop = [], []
-    for v, (x, y) in enumerate(zip(x0.tolist(), y0.tolist())):
-        pairs_full.append((images[v][frames], real[v][frames]))
-        window = (slice(None), slice(y, y + height), slice(x, x + width))
-        pairs_crop.append((images[v][frames][window], real[v][frames][window]))
-    result = {}
-    for name, pairs in (("crop", pairs_crop), ("full", pairs_full)):
-        result[f"psnr_{name}"] = float(np.mean([metrics.psnr(a, b) for a, b in pairs]))
-        result[f"ssim_{name}"] = float(np.mean([metrics.ssim(a, b) for a, b in pairs]))
-    return result
+    found: dict[str, list[float]] = {f"{kind}_{name}": [] for name in ("crop", "full") for kind in ("psnr", "ssim")}
+    for v, (camera, x, y) in enumerate(zip(cameras, x0.tolist(), y0.tolist())):
+        seen, real = images[v][frames], scene.images[camera][frames].to(images.device)
+        crop = (slice(None), slice(y, y + height), slice(x, x + width))
+        for name, pair in (("crop", (seen[crop], real[crop])), ("full", (seen, real))):
+            found[f"psnr_{name}"].append(metrics.psnr(*pair))
+            found[f"ssim_{name}"].append(metrics.ssim(*pair))
+    return {name: float(np.mean(values)) for name, values in found.items()}
 
 
-def motion_metrics(x: Tensor, body: Body, sequence: Sequence, frames: list[int], samples: int, assignment: int) -> dict[str, float]:
-    """rms_m, chamfer and earth mover's distance after first contact, where the true motion is known."""
+def motion_metrics(
+    x: Tensor, body: Body, sequence: Sequence, frames: list[int], samples: int, assignment: int, target: Tensor | None = None
+) -> dict[str, float]:
+    """rms_m, chamfer and earth mover's distance after first contact, where the true motion is known.
+
+    target: `true_motion`, where it is at hand: it is the same for all models.
+    """
     truth = sequence.scene.truth
     after = [t for t in frames if t >= sequence.contact]
     if not after:
@@ -98,14 +104,20 @@ def motion_metrics(x: Tensor, body: Body, sequence: Sequence, frames: list[int],
         pairs = [(x[t], clouds[t]) for t in after]
         result = {}
     else:
-        target = metrics.interpolate_motion(truth.rest, truth.positions, body.rest.cpu())
+        target = true_motion(body, sequence.scene) if target is None else target
         result = {"rms_m": metrics.rms(x[after], target[after])}
         pairs = [(x[t], truth.positions[t]) for t in after]
-    result["cd_sq_m2"] = float(np.mean([metrics.chamfer_squared(a, b, samples=samples) for a, b in pairs]))
-    result["cd_m"] = float(np.mean([metrics.chamfer(a, b, samples=samples) for a, b in pairs]))
+    each = list(threaded(lambda pair: metrics.chamfer_distances(*pair, samples=samples), pairs))
+    result |= {name: float(np.mean([found[name] for found in each])) for name in each[0]}
     last = pairs[:: max(1, len(pairs) // 3)]
-    result["emd_m"] = float(np.mean([metrics.emd(a, b, samples=assignment) for a, b in last]))
+    result["emd_m"] = float(np.mean(list(threaded(lambda pair: metrics.emd(*pair, samples=assignment), last))))
     return result
+
+
+def true_motion(body: Body, scene: Scene) -> Tensor | None:
+    """(T, N, 3) [m] where the body's particles would truly be, None where that is not known."""
+    truth = scene.truth
+    return None if truth is None else metrics.interpolate_motion(truth.rest, truth.positions, body.rest.cpu())
 
 
 @torch.no_grad()
@@ -122,9 +134,10 @@ def evaluate(body: Body, sequences: list[Sequence], world: World, *, samples: in
         rates.append(rate)
         if size is not None:
             figures[f"{sequence.prefix}/mean_abs_C"] = size
+        target = true_motion(body, sequence.scene)
         for variant, rollout in simulated.items():
             kept[sequence.prefix][variant] = rollout
-            figures |= sequence_metrics(body, sequence, rollout, PREFIX[variant], samples, assignment)
+            figures |= sequence_metrics(body, sequence, rollout, PREFIX[variant], samples, assignment, target)
             bar.update()
     bar.close()
     figures |= test_means(figures)
@@ -132,21 +145,24 @@ def evaluate(body: Body, sequences: list[Sequence], world: World, *, samples: in
     return figures, kept
 
 
-def sequence_metrics(body, sequence: Sequence, rollout: Rollout, model: str, samples: int, assignment: int) -> dict[str, float]:
+def sequence_metrics(
+    body, sequence: Sequence, rollout: Rollout, model: str, samples: int, assignment: int, target: Tensor | None
+) -> dict[str, float]:
     """The figures of one rollout: training views and frames, held-out frames, held-out cameras."""
     scene, x = sequence.scene, rollout.x.cpu()
     training = sequence.prefix.startswith("train")
     frames = scene.training_frames if training else list(range(scene.frames))
     cameras = scene.training_cameras if training else list(range(len(scene.cameras)))
+    images = render(body, rollout, scene, cameras)
     figures: Mapping[str, float] = {
-        **motion_metrics(x, body, sequence, frames, samples, assignment),
-        **image_metrics(render(body, rollout, scene, cameras), scene, cameras, frames),
+        **motion_metrics(x, body, sequence, frames, samples, assignment, target),
+        **image_metrics(images, scene, cameras, frames),
     }
     result = {f"{model}{sequence.prefix}/{k}": v for k, v in figures.items()}
     if sequence.prefix == "train" and scene.holdout_frames:
         held = list(scene.holdout_frames)
-        figures = {**motion_metrics(x, body, sequence, held, samples, assignment),
-                   **image_metrics(render(body, rollout, scene, cameras), scene, cameras, held)}
+        figures = {**motion_metrics(x, body, sequence, held, samples, assignment, target),
+                   **image_metrics(images, scene, cameras, held)}
         result |= {f"{model}frames/{k}": v for k, v in figures.items()}
     if sequence.prefix == "train" and scene.holdout_cameras:
         held = list(scene.holdout_cameras)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import torch
 from scipy.optimize import linear_sum_assignment
@@ -68,16 +69,21 @@ def _nearest(a: Tensor, b: Tensor, samples: int, seed: int) -> tuple[np.ndarray,
     return cKDTree(b).query(a)[0], cKDTree(a).query(b)[0]
 
 
-def chamfer_squared(a: Tensor, b: Tensor, *, samples: int = CHAMFER_SAMPLES, seed: int = 0) -> float:
-    """`cd_sq_m2`: two-sided sum of mean squared nearest distances [m^2] of clouds (N, 3) and (M, 3) [m]."""
+def chamfer_distances(a: Tensor, b: Tensor, *, samples: int = CHAMFER_SAMPLES, seed: int = 0) -> dict[str, float]:
+    """`cd_sq_m2`, two-sided sum of mean squared nearest distances [m^2] of clouds (N, 3) and (M, 3) [m], and `cd_m` [m], the same
+    of the distances themselves."""
     ab, ba = _nearest(a, b, samples, seed)
-    return float((ab**2).mean() + (ba**2).mean())
+    return {"cd_sq_m2": float((ab**2).mean() + (ba**2).mean()), "cd_m": float(ab.mean() + ba.mean())}
+
+
+def chamfer_squared(a: Tensor, b: Tensor, *, samples: int = CHAMFER_SAMPLES, seed: int = 0) -> float:
+    """`cd_sq_m2` alone."""
+    return chamfer_distances(a, b, samples=samples, seed=seed)["cd_sq_m2"]
 
 
 def chamfer(a: Tensor, b: Tensor, *, samples: int = CHAMFER_SAMPLES, seed: int = 0) -> float:
-    """`cd_m`: two-sided sum of mean nearest distances [m] of clouds (N, 3) and (M, 3) [m]."""
-    ab, ba = _nearest(a, b, samples, seed)
-    return float(ab.mean() + ba.mean())
+    """`cd_m` alone."""
+    return chamfer_distances(a, b, samples=samples, seed=seed)["cd_m"]
 
 
 def emd(a: Tensor, b: Tensor, *, samples: int = ASSIGNMENT_SAMPLES, seed: int = 0) -> float:
@@ -117,11 +123,7 @@ def sampling_floors(
     cloud: (M, 3) [m] fills the true shape. A model can get below: regular points lie closer than random ones.
     """
     a, b = resample_shape(cloud, first, 2 * seed + 101), resample_shape(cloud, second, 2 * seed + 102)
-    return {
-        "cd_sq_m2": chamfer_squared(a, b, samples=samples, seed=seed),
-        "cd_m": chamfer(a, b, samples=samples, seed=seed),
-        "emd_m": emd(a, b, samples=assignment, seed=seed),
-    }
+    return chamfer_distances(a, b, samples=samples, seed=seed) | {"emd_m": emd(a, b, samples=assignment, seed=seed)}
 
 
 # --- images ---------------------------------------------------------------------------------------------------------
@@ -138,8 +140,27 @@ def ssim(rendered: Tensor, real: Tensor) -> float:
 
     Over all pixels, with borders reflected (torchmetrics; others leave 5 px at the border out). At least 6 x 6 px.
     """
-    a, b = rendered.movedim(-1, 1), real.movedim(-1, 1)
+    if rendered.device.type == "cpu":
+        return float(np.mean([_ssim_on_cpu(a, b) for a, b in zip(rendered.detach().numpy(), real.detach().numpy())]))
+    # in float64: convolutions on a GPU may round to TF32, and variances are small differences
+    a, b = rendered.movedim(-1, 1).double(), real.movedim(-1, 1).double()
     return float(structural_similarity_index_measure(a, b, data_range=1.0, sigma=1.5, kernel_size=11))
+
+
+def _ssim_on_cpu(a: np.ndarray, b: np.ndarray) -> float:
+    """Of one pair of images (H, W, 3): what torchmetrics computes, row by row and column by column, in a tenth of its time."""
+    window = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
+    window /= window.sum()
+
+    def mean(image: np.ndarray) -> np.ndarray:
+        return cv2.sepFilter2D(image, -1, window, window, borderType=cv2.BORDER_REFLECT_101)
+
+    ma, mb = mean(a), mean(b)
+    aa, bb, ab = ma * ma, mb * mb, ma * mb
+    va, vb = np.maximum(mean(a * a) - aa, 0), np.maximum(mean(b * b) - bb, 0)
+    c1, c2 = 0.01**2, 0.03**2
+    similarity = (2 * ab + c1) * (2 * (mean(a * b) - ab) + c2) / ((aa + bb + c1) * (va + vb + c2))
+    return float(similarity.mean(dtype=np.float64))
 
 
 # --- parameters -----------------------------------------------------------------------------------------------------

@@ -296,7 +296,8 @@ def comparison(body: Body, shown: Sequence, variants: dict) -> dict:
     camera = [(scene.training_cameras or [0])[0]]
     x0, y0, width, height = crop_boxes(scene.mattes[camera], margin=16)
     columns = {"real": scene.images[camera]}
-    columns |= {title: render(body, variants[v], scene, camera) for v, title in (("prior", "prior"), ("adapted", "adapted (MoSA)"))}
+    for variant, title in (("prior", "prior"), ("adapted", "adapted (MoSA)")):
+        columns[title] = render(body, variants[variant], scene, camera).cpu()
     return {title: crop_images(images, x0, y0, width, height, axis=2)[0] for title, images in columns.items()}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -57,15 +58,25 @@ def matte_values(points: Tensor, mattes: Tensor, cameras: Cameras) -> Tensor:
 def occupancy(points: Tensor, mattes: Tensor, cameras: Cameras, *, chunk: int = 400_000) -> Tensor:
     """Smallest matte value over all views, in [0, 1], shape of `points` without its last axis; 0.5 is the hull's surface."""
     flat = points.reshape(-1, 3)
-    parts = [matte_values(flat[i : i + chunk], mattes, cameras).amin(0) for i in range(0, len(flat), chunk)]
+    parts = [_smallest(flat[i : i + chunk], mattes, cameras) for i in range(0, len(flat), chunk)]
     return torch.cat(parts).reshape(points.shape[:-1])
+
+
+def _smallest(points: Tensor, mattes: Tensor, cameras: Cameras) -> Tensor:
+    """Smallest matte value (M,) of points (M, 3), view by view: of most points the first views already say that it is 0."""
+    smallest = torch.ones(len(points), dtype=points.dtype, device=points.device)
+    left = torch.arange(len(points), device=points.device)
+    for v in range(len(cameras)):
+        smallest[left] = torch.minimum(smallest[left], matte_values(points[left], mattes[v : v + 1], cameras.select([v]))[0])
+        left = left[smallest[left] > 0]
+    return smallest
 
 
 def _grow(mattes: Tensor, radius: int) -> Tensor:
     if radius <= 0:
         return mattes
-    rows = F.max_pool2d(mattes[:, None], (2 * radius + 1, 1), stride=1, padding=(radius, 0))
-    return F.max_pool2d(rows, (1, 2 * radius + 1), stride=1, padding=(0, radius))[:, 0]
+    kernel = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
+    return torch.as_tensor(np.stack([cv2.dilate(m, kernel) for m in mattes.cpu().numpy()]), device=mattes.device)
 
 
 def hull_bounds(mattes: Tensor, cameras: Cameras, box: Tensor, *, resolution: int = 48) -> Tensor:

@@ -17,6 +17,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from mosa.reconstruction.cues import Neighbourhood
+from mosa.reconstruction.softest import softest_vectors
+
+FILTERED_FROM = 6000
+"""Number of particles above which the modes are found by filtering: factorised, the matrix of 31,000 takes seven times as long."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,26 @@ def bending_matrix(around: Neighbourhood) -> sparse.csr_matrix:
     return (residual.T @ residual).tocsr()
 
 
+def _bending_modes(matrix: sparse.csr_matrix, rest: Tensor, affine: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Energies (count,) and orthonormal patterns (N, count) of the softest modes that are not affine, the softest first."""
+    if len(affine) >= FILTERED_FROM:
+        found = softest_vectors(matrix, rest.detach(), torch.as_tensor(affine, device=rest.device), count)
+        if found is not None:
+            return tuple(part.cpu().numpy() for part in found)
+    shift = 1e-7 * matrix.diagonal().mean()
+    # a fixed start vector: the same modes at every run
+    start = np.random.default_rng(0).standard_normal(len(affine))
+    values, vectors = eigsh(matrix.tocsc(), k=count + 4, sigma=-shift, which="LM", v0=start)
+    vectors = vectors[:, np.argsort(values)]
+    rest_of_them = vectors - affine @ (affine.T @ vectors)
+    # the four directions nearest to the affine ones are what the projection leaves almost nothing of
+    keep = np.sort(np.argsort(-np.linalg.norm(rest_of_them, axis=0), kind="stable")[:count])
+    extra, _ = np.linalg.qr(rest_of_them[:, keep])
+    energy = np.einsum("nk,nk->k", extra, matrix @ extra)
+    order = np.argsort(energy)
+    return energy[order], extra[:, order]
+
+
 def deformation_modes(rest: Tensor, around: Neighbourhood, *, count: int) -> Modes:
     """The affine functions and the `count` - 4 softest other modes. rest: (N, 3) [m]."""
     points = rest.detach().cpu().double().numpy()
@@ -80,27 +104,16 @@ def deformation_modes(rest: Tensor, around: Neighbourhood, *, count: int) -> Mod
     modes, energy = affine, np.zeros(4)
     if count > 4:
         matrix = bending_matrix(around)
-        shift = 1e-7 * matrix.diagonal().mean()
-        # a fixed start vector: the same modes at every run
-        start = np.random.default_rng(0).standard_normal(particles)
-        values, vectors = eigsh(matrix.tocsc(), k=count, sigma=-shift, which="LM", v0=start)
-        order = np.argsort(values)
-        vectors = vectors[:, order]
-        rest_of_them = vectors - affine @ (affine.T @ vectors)
-        # the four directions nearest to the affine ones are what the projection leaves almost nothing of
-        keep = np.sort(np.argsort(-np.linalg.norm(rest_of_them, axis=0), kind="stable")[: count - 4])
-        extra, _ = np.linalg.qr(rest_of_them[:, keep])
-        energy = np.einsum("nk,nk->k", extra, matrix @ extra)
-        by_energy = np.argsort(energy)
-        modes = np.concatenate([affine, extra[:, by_energy]], 1)
+        energy, extra = _bending_modes(matrix, rest, affine, count - 4)
+        modes = np.concatenate([affine, extra], 1)
         # residuals of pairs at distance r are about curvature r^2 / 2: to curvature in units of 1 / size, whatever the spacing
         reach = np.sqrt((centred**2).sum(1).mean())
         distance = np.sqrt((around.offset.double().cpu().numpy() ** 2).sum(-1).mean())
-        energy = np.concatenate([np.zeros(4), energy[by_energy] * (reach / distance) ** 4])
+        energy = np.concatenate([np.zeros(4), energy * (reach / distance) ** 4])
     modes = modes * np.sqrt(particles)
     index, operator = around.index.cpu().numpy(), around.gradient.double().cpu().numpy()
-    gradient = np.zeros((particles, 3, modes.shape[1]))
-    for k in range(index.shape[1]):
-        gradient += operator[:, k, :, None] * (modes[index[:, k]] - modes)[:, None]
+    starts = np.arange(particles + 1) * index.shape[1]
+    slopes = [sparse.csr_matrix((operator[..., a].ravel(), index.ravel(), starts), (particles, particles)) for a in range(3)]
+    gradient = np.stack([slope @ modes - operator[..., a].sum(1)[:, None] * modes for a, slope in enumerate(slopes)], 1)
     as_tensor = lambda a: torch.as_tensor(a, dtype=rest.dtype, device=rest.device)  # noqa: E731
     return Modes(as_tensor(modes), as_tensor(gradient), as_tensor(energy))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from mosa.errors import DataError
@@ -50,6 +49,12 @@ def _extent(mattes: Tensor) -> tuple[Tensor, Tensor]:
     return mattes.float().argmax(1), n - 1 - mattes.flip(1).float().argmax(1)
 
 
+def _overlap(start: int, size: int, limit: int) -> tuple[slice, slice]:
+    """What a window of `size` px from `start` shows of an image of `limit` px: where in the image, where in the window."""
+    low, high = max(start, 0), min(start + size, limit)
+    return slice(low, high), slice(low - start, high - start)
+
+
 def object_windows(scene: Scene, views: list[int], frames: list[int], *, margin: int = 6, multiple: int = 8) -> Windows:
     """Windows around the mattes of the given views and frames, `margin` px wider on each side, sides a multiple of `multiple`.
 
@@ -57,7 +62,6 @@ def object_windows(scene: Scene, views: list[int], frames: list[int], *, margin:
     Raises DataError where a matte is empty.
     """
     mattes = scene.mattes[views][:, frames].flatten(0, 1)
-    images = scene.images[views][:, frames].flatten(0, 1)
     view = torch.tensor(views).repeat_interleave(len(frames))
     frame = torch.tensor(frames).repeat(len(views))
     occupied = mattes > 0.5
@@ -74,16 +78,15 @@ def object_windows(scene: Scene, views: list[int], frames: list[int], *, margin:
     height = round_up((bottom - top).max() + 1 + 2 * margin)
     x0 = (left + right + 1 - width) // 2
     y0 = (top + bottom + 1 - height) // 2
-    pad = max(width, height)
-    mattes = F.pad(mattes, (pad, pad, pad, pad))
-    images = torch.stack([F.pad(images[..., c], (pad, pad, pad, pad), value=float(scene.background[c])) for c in range(3)], -1)
-    corners = list(enumerate(zip(x0.tolist(), y0.tolist())))
-
-    def cut(padded: Tensor) -> Tensor:
-        return torch.stack([padded[b, y + pad : y + pad + height, x + pad : x + pad + width] for b, (x, y) in corners])
-
+    images = scene.background.to(scene.images).expand(len(view), height, width, 3).contiguous()
+    cut = mattes.new_zeros(len(view), height, width)
+    for b, (v, t, x, y) in enumerate(zip(view.tolist(), frame.tolist(), x0.tolist(), y0.tolist())):
+        rows, in_rows = _overlap(y, height, scene.cameras.height)
+        columns, in_columns = _overlap(x, width, scene.cameras.width)
+        images[b, in_rows, in_columns] = scene.images[v, t, rows, columns]
+        cut[b, in_rows, in_columns] = mattes[b, rows, columns]
     K = scene.cameras.K[view].clone()
     K[:, 0, 2] -= x0
     K[:, 1, 2] -= y0
     cameras = Cameras(K, scene.cameras.w2c[view], width, height, tuple(scene.cameras.names[v] for v in view.tolist()))
-    return Windows(cut(images), cut(mattes), cameras, view, frame)
+    return Windows(images, cut, cameras, view, frame)

@@ -26,6 +26,7 @@ from mosa.reconstruction.observed import Windows, object_windows
 from mosa.reconstruction.static import FitSettings, StaticSettings, fit_splats, start_splats
 from mosa.rendering.covariance import covariance_from, matrix_to_quaternion, quaternion_multiply
 from mosa.rendering.rasterizer import expected_depth, rasterize
+from mosa.threads import threaded
 from mosa.types import MotionCues, Reconstruction, Scene, Splats
 
 CACHE_VERSION = 2
@@ -330,7 +331,8 @@ def _motion(
     """Positions, covariances and, where free, shapes of the particles in every training frame."""
     views, frames = scene.training_cameras, scene.training_frames
     cameras, dynamic = scene.cameras.select(views), settings.dynamic
-    centres = torch.stack([hull_centroid(scene.mattes[views, t], cameras, scene.box) for t in frames]).to(splats.means)
+    centres = list(threaded(lambda t: hull_centroid(scene.mattes[views, t], cameras, scene.box), frames))
+    centres = torch.stack(centres).to(splats.means)
     around = neighbourhood(splats.means, neighbours=settings.neighbours)
     modes = deformation_modes(splats.means, around, count=dynamic.modes)
     reach = float((splats.means - splats.means.mean(0)).norm(dim=1).max())

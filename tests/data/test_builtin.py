@@ -16,6 +16,7 @@ from mosa.data.builtin.objects import OBJECTS
 from mosa.data.builtin.renderer import render_surface, ring_of_cameras
 from mosa.data.builtin.shapes import SHAPES
 from mosa.data.builtin.surface import Surface, bind, extract_surface, fill
+from mosa.data.images import composite, resize
 from mosa.data.scene import held_out_sequences, load_scene
 from mosa.errors import ConfigError
 from mosa.modules.body import World
@@ -233,6 +234,20 @@ def test_the_floor_is_the_truth_itself_on_the_truth_s_own_particles_and_grid(tra
     wall = Plane((right, 0.0, 0.0), (-1.0, 0.0, 0.0), "separate")
     walled = floor_rollout(body, scene, replace(world, planes=(wall,)))
     assert walled[..., 0].max() < right + 0.005 < coarse[..., 0].max() - 0.005  # spreading by 13 mm is held within 2
+
+
+@pytest.mark.parametrize("size", [(24, 24), (12, 12), (17, 17)])
+def test_pictures_are_composited_on_white_at_every_size(size):
+    """A window around the object is enough: beside it all is white. The last picture is empty."""
+    rng = np.random.default_rng(0)
+    pictures = rng.integers(0, 256, (2, 2, 24, 24, 4)).astype(np.uint8)
+    pictures[:, :, :5, :, 3] = pictures[:, :, :, 20:, 3] = pictures[1, 1, ..., 3] = 0
+    images, mattes = takes.pictures_to_footage(pictures, size)
+    for v, t in np.ndindex(2, 2):
+        picture = pictures[v, t].astype(np.float32) / 255
+        plain = composite(picture[..., :3], picture[..., 3], np.ones(3, np.float32))
+        assert np.array_equal(images[v, t].numpy(), resize(plain, *size))
+        assert np.array_equal(mattes[v, t].numpy(), resize(np.ascontiguousarray(picture[..., 3]), *size))
 
 
 def test_a_built_in_scene_without_a_name_is_refused(cache):

@@ -15,7 +15,8 @@ from mosa.types import ParticleState, Scene
 
 @torch.no_grad()
 def floor_rollout(body, scene: Scene, world) -> Tensor:
-    """Positions (T, N, 3) [m] of the body's particles under the hidden material of a built-in scene.
+    """Positions (T, N, 3) [m] of the body's particles under the hidden material of a built-in scene, simulated where the body is,
+    returned on the CPU.
 
     world: `mosa.modules.body.World`; its ground, walls and colliders act as in `Body.simulate`.
     body: `mosa.modules.body.Body`; its particles, volumes, grid and learned contact height are used, its law is not. What is
@@ -27,7 +28,7 @@ def floor_rollout(body, scene: Scene, world) -> Tensor:
         raise ConfigError(f"scene {scene.name}: the true law is known for built-in scenes only")
     hidden = object_named(scene.name).material.variant("anisotropic" if truth.parameters["ratio"] > 1 else "isotropic")
     settings, frame_dt = body.settings, float(scene.times[1] - scene.times[0])
-    rest = body.rest.detach().float().cpu()
+    rest, device = body.rest.detach().float().cpu(), body.rest.device
     Q = truth.rotation.float()
     start = (rest - truth.rest.mean(0)) @ Q.T + truth.positions[0].mean(0)
     speed = float(truth.velocity.norm()) + float(world.gravity.norm()) * frame_dt * scene.frames
@@ -51,14 +52,17 @@ def floor_rollout(body, scene: Scene, world) -> Tensor:
         ground=world.ground,
         planes=world.planes,
         colliders=world.colliders,
+        device=device,
     )
     n, gravity, up = len(rest), world.gravity.float().cpu(), world.up.float().cpu()
     lift = body.contact().detach().float().cpu() * up
     F = Q.expand(n, 3, 3).contiguous()
     velocity = (truth.velocity.float() - 0.5 * frame_dt / substeps * gravity).expand(n, 3).contiguous()
-    state = ParticleState(start + lift, velocity, torch.zeros(n, 3, 3), F, F)
+    F = F.to(device)
+    state = ParticleState((start + lift).to(device), velocity.to(device), torch.zeros(n, 3, 3, device=device), F, F)
+    parameters = {name: value.to(device) for name, value in hidden.parameters(rest).items()}
     rollout = simulator.rollout(
-        state, hidden.parameters(rest), body.volume.float().cpu(), hidden.density, scene.frames,
+        state, parameters, body.volume.float().to(device), hidden.density, scene.frames,
         motions=[c.motion.shifted(lift) for c in world.colliders],  # the lift is the ground's: they keep their place
     )  # fmt: skip
-    return rollout.x - lift
+    return rollout.x.cpu() - lift

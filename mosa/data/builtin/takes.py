@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
 import tempfile
@@ -17,10 +18,11 @@ from mosa.data.builtin.drop import simulate
 from mosa.data.builtin.objects import OBJECTS, BuiltinObject, drop_named, object_named
 from mosa.data.builtin.renderer import render_surface, ring_of_cameras
 from mosa.data.builtin.shapes import SHAPES
-from mosa.data.builtin.surface import bind, extract_surface, fill
+from mosa.data.builtin.surface import Skin, Surface, bind, extract_surface, fill
 from mosa.data.footage import WHITE
 from mosa.data.images import composite, resize
 from mosa.errors import ConfigError
+from mosa.threads import threaded
 from mosa.types import Cameras
 
 # part of the key of a cached sequence: raise it whenever what is made changes
@@ -86,14 +88,22 @@ def make(
     return take
 
 
-def film_drop(name: str, sequence: str, material: str, seed: int, progress: bool) -> Take:
-    """Simulate and film, without the cache."""
-    body, drop = OBJECTS[name], drop_named(name, sequence)
-    shape, film = SHAPES[body.shape], body.footage
+@functools.lru_cache(maxsize=1)
+def built(name: str, seed: int) -> tuple[Surface, np.ndarray, Skin]:
+    """Surface, particles (N, 3) [m] and skin of an object, the same in every sequence and material: not to be changed."""
+    body = OBJECTS[name]
+    shape = SHAPES[body.shape]
     # one generator a purpose: the same texture, lattice and cameras in every sequence and material of a seed
     surface = extract_surface(shape, body.pitch, np.random.default_rng([seed, 1]))
     particles = fill(shape, body.spacing, np.random.default_rng([seed, 2]))
-    skin = bind(surface.vertices, particles, body.spacing)
+    return surface, particles, bind(surface.vertices, particles, body.spacing)
+
+
+def film_drop(name: str, sequence: str, material: str, seed: int, progress: bool) -> Take:
+    """Simulate and film, without the cache."""
+    body, drop = OBJECTS[name], drop_named(name, sequence)
+    film = body.footage
+    surface, particles, skin = built(name, seed)
     label = f"{name}/{sequence} (synthetic, {material})"
     with tqdm(
         total=film.frames - 1, desc=f"{label}: simulate", unit="frame", disable=not progress, dynamic_ncols=True
@@ -103,10 +113,12 @@ def film_drop(name: str, sequence: str, material: str, seed: int, progress: bool
             progress=lambda frame: bar.update(),
         )  # fmt: skip
     cameras = cameras_of(body, seed)
-    pictures = [
-        render_surface(surface, skin.follow(x), cameras)
-        for x in tqdm(fall.positions, desc=f"{label}: film", unit="frame", disable=not progress, dynamic_ncols=True)
-    ]
+    film_frame = threaded(lambda x: render_surface(surface, skin.follow(x), cameras), fall.positions)
+    with tqdm(total=film.frames, desc=f"{label}: film", unit="frame", disable=not progress, dynamic_ncols=True) as bar:
+        pictures = []
+        for picture in film_frame:
+            pictures.append(picture)
+            bar.update()
     chosen = np.sort(np.random.default_rng([seed, 3]).permutation(len(particles))[:TRUTH_PARTICLES])
     return Take(
         np.stack(pictures, 1), fall.rest[chosen].astype(np.float32), fall.positions[:, chosen].astype(np.float32),
@@ -141,11 +153,19 @@ def write_take(file: Path, take: Take) -> None:
 
 def pictures_to_footage(pictures: np.ndarray, size: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
     """Images (V, T, h, w, 3) on white and mattes (V, T, h, w), area averages of RGBA pictures (V, T, H, W, 4)."""
-    V, T = pictures.shape[:2]
+    V, T, H, W = pictures.shape[:4]
     images, mattes = np.empty((V, T, size[1], size[0], 3), np.float32), np.empty((V, T, size[1], size[0]), np.float32)
-    for v in range(V):
-        for t in range(T):
-            picture = pictures[v, t].astype(np.float32) / 255
-            images[v, t] = resize(composite(picture[..., :3], picture[..., 3], WHITE), *size)
-            mattes[v, t] = resize(np.ascontiguousarray(picture[..., 3]), *size)
+
+    def convert(index: tuple[int, int]) -> None:
+        alpha = pictures[*index, ..., 3]
+        image, matte = np.ones((H, W, 3), np.float32), np.zeros((H, W), np.float32)
+        rows, columns = (np.flatnonzero(alpha.any(axis)) for axis in (1, 0))
+        if len(rows):  # around the object there is nothing but white
+            window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+            part = pictures[*index, *window].astype(np.float32) / 255
+            image[window], matte[window] = composite(part[..., :3], part[..., 3], WHITE), part[..., 3]
+        images[index], mattes[index] = resize(image, *size), resize(matte, *size)
+
+    for _ in threaded(convert, list(np.ndindex(V, T))):
+        pass
     return torch.from_numpy(images), torch.from_numpy(mattes)
