@@ -60,7 +60,7 @@ class Chain:
         self.substeps = sum(lengths)
         self.names = [name for name, p in adapter.named_parameters() if p.requires_grad]
         self._shape = {"particles": particles, "substeps": self.substeps, "adapted": True, "plastic_adapted": plastic_adapted}
-        self.light = Workspace(numerics, **self._shape, with_adjoint=False)
+        self.light: Workspace | None = None
         self.full: Workspace | None = None
         self.dims = (0, 0, 0)
         self.statistics: tuple[Tensor, ...] = ()
@@ -72,20 +72,22 @@ class Chain:
         self._key: tuple = ()
         self._passes: dict[tuple, Callable[[], None]] = {}
         self.again = "graphs" if graphs else "states"
-        for kept in (False, True):
-            self._passes["forward", kept] = partial(self._forward, kept)
+        for full in (False, True):
+            self._passes["forward", full] = partial(self._forward, full)
         for source in ("tape", self.again):
             for penalised in (False, True):
                 self._passes["adjoint", source, penalised] = partial(self._adjoint, source, penalised)
 
     def advance(
-        self, solver: SegmentSolver, state: tuple[Tensor, ...], packed: Tensor, first: int, kept: bool = False
-    ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...], tuple[int, int, int], list[Tensor]]:
+        self, solver: SegmentSolver, state: tuple[Tensor, ...], packed: Tensor, first: int, kept: bool = False,
+        full: bool = False,
+    ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...], tuple[int, int, int], list[Tensor]]:  # fmt: skip
         """(state after the chain, statistics (K, ...) each, lowest node of the window, what `adjoint` takes as `tape`).
 
-        kept: leave all substeps on the tape, else nothing. Errors: as `SegmentSolver.advance`."""
+        kept: leave all substeps on the tape, else nothing; full: in the buffers of the backward pass, which kept needs and any
+        rollout with one has anyway. Errors: as `SegmentSolver.advance`."""
         dx, dt, total = self.numerics.dx, self.numerics.dt, self.substeps
-        work = self._full() if kept else self.light
+        work = self._full() if full else self._light()
         for margin in (4, 3 + total // 2):
             origin, dims = grid_window(state[0], state[1], dx, 2 * total * dt, margin, bounds=solver.bounds(state))
             self.dims = tuple(max(-(-a // COARSE) * COARSE, b) for a, b in zip(dims, self.dims))
@@ -93,7 +95,7 @@ class Chain:
             work.set_window(origin, self.dims)
             work.load(state, {"parameters": packed}, solver.volume, solver.mass, solver.cutoff)
             self._capture(solver.cutoff)
-            self._play(("forward", kept))
+            self._play(("forward", full))
             final = work.final()
             flags = solver.look(work.flags, final)
             if not solver.left_window(flags, first, dt):
@@ -128,10 +130,15 @@ class Chain:
         """One named tuple per evaluation, of tensors (K, ...)."""
         return [self._kind(*parts) for parts in zip(*statistics, strict=True)] if self._kind is not None else []
 
+    def _light(self) -> Workspace:
+        if self.light is None:
+            self.light = Workspace(self.numerics, **self._shape, with_adjoint=False, pointed=True)
+        return self.light
+
     def _full(self) -> Workspace:
         """The buffers of the backward pass, made when they are first needed."""
         if self.full is None:
-            self.full = Workspace(self.numerics, **self._shape, with_adjoint=True)
+            self.full = Workspace(self.numerics, **self._shape, with_adjoint=True, pointed=True)
             self.adj_weights = [torch.zeros_like(w) for w in self.weights]
         return self.full
 
@@ -179,8 +186,8 @@ class Chain:
         with warp_stream(self.numerics.device):
             work.advance_steps(step, length)
 
-    def _forward(self, kept: bool) -> None:
-        collected = self._advance_all(self._full() if kept else self.light, self.collects)
+    def _forward(self, full: bool) -> None:
+        collected = self._advance_all(self._full() if full else self._light(), self.collects)
         self.statistics = tuple(torch.stack(parts) for parts in zip(*collected))
 
     @torch.no_grad()
@@ -280,11 +287,12 @@ def _add(sums: Sequence[Tensor], found: Sequence[Tensor | None]) -> None:
 
 class _Chained(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, chain: Chain, solver: SegmentSolver, first: int, kept: bool, *inputs):
-        """inputs: state (5), packed parameters, the adapter's weights."""
+    def forward(ctx, chain: Chain, solver: SegmentSolver, first: int, kept: bool, differentiated: bool, *inputs):
+        """inputs: state (5), packed parameters, the adapter's weights. differentiated: whether autograd is on outside."""
         state, packed = tuple(t.detach().contiguous() for t in inputs[:5]), inputs[5].detach().contiguous()
         ctx.set_materialize_grads(False)
-        result, statistics, origin, tape = chain.advance(solver, state, packed, first, kept and any(ctx.needs_input_grad))
+        full = differentiated and any(ctx.needs_input_grad)
+        result, statistics, origin, tape = chain.advance(solver, state, packed, first, kept and full, full)
         ctx.chain, ctx.solver, ctx.origin, ctx.tape = chain, solver, origin, tape
         ctx.states = 5 if solver.numerics.law.plastic else 4
         ctx.save_for_backward(*state, packed)
@@ -296,7 +304,7 @@ class _Chained(torch.autograd.Function):
         *state, packed = ctx.saved_tensors
         tape, ctx.tape = ctx.tape, []  # free it as soon as it is used
         found, adj_packed, adj_weights = ctx.chain.adjoint(ctx.solver, tuple(state), packed, ctx.origin, seeds, tape)
-        return None, None, None, None, *found, *[None] * (5 - ctx.states), adj_packed, *adj_weights
+        return *[None] * 5, *found, *[None] * (5 - ctx.states), adj_packed, *adj_weights
 
 
 def advance_chain(
@@ -305,8 +313,8 @@ def advance_chain(
     """((x, v, C_affine, F, F_tot) after the chain, statistics of each evaluation), differentiable in state, parameters and the
     adapter's weights. first: number of the first substep, for messages; kept: keep the states of all substeps for the backward
     pass. Errors: SimulationDiverged."""
-    kept = kept and torch.is_grad_enabled()  # inside, gradients are off, and inputs say what they would need with them on
-    result = _Chained.apply(chain, solver, first, kept, *state, packed, *chain.weights)
+    # inside, gradients are off, and inputs say what they would need with them on
+    result = _Chained.apply(chain, solver, first, kept, torch.is_grad_enabled(), *state, packed, *chain.weights)
     count = 5 if solver.numerics.law.plastic else 4
     final = result[:count] if count == 5 else (*result[:4], result[3])
     return final, chain.named(result[count:])

@@ -91,12 +91,14 @@ def copies(tensors: Sequence[Tensor]) -> list[Tensor]:
 class Workspace:
     """Buffers for N particles and `slots` stored substeps (2 states and 1 grid when nothing is stored).
 
-    adapted, plastic_adapted: whether a stress operator and a plastic operator act; with_adjoint: also buffers for the adjoint.
+    adapted, plastic_adapted: whether a stress operator and a plastic operator act; with_adjoint: also buffers for the adjoint;
+    pointed: no buffers for the operators, which only `point` gives.
     """
 
     def __init__(
-        self, numerics: Numerics, particles: int, substeps: int, *, adapted: bool, plastic_adapted: bool, with_adjoint: bool
-    ) -> None:
+        self, numerics: Numerics, particles: int, substeps: int, *, adapted: bool, plastic_adapted: bool, with_adjoint: bool,
+        pointed: bool = False,
+    ) -> None:  # fmt: skip
         self.numerics, self.particles, self.substeps, self.with_adjoint = numerics, particles, substeps, with_adjoint
         self.scalar = SCALARS[numerics.dtype]
         self.kernels = transfer_kernels(self.scalar)
@@ -121,7 +123,8 @@ class Workspace:
         }  # fmt: skip
         self.held, self.held_wp = {}, {}
         for name, (shape, kind) in shapes.items():
-            self.held[name], self.held_wp[name] = self._array(shape, kind)
+            size = shape if name == "parameters" or not pointed else (1, *shape[1:])
+            self.held[name], self.held_wp[name] = self._array(size, kind)
         if with_adjoint:
             self.adj_x, self.adj_x_wp = self._per_slot(2, (n, 3), self.kernels.vec3)
             self.adj_v, self.adj_v_wp = self._per_slot(2, (n, 3), self.kernels.vec3)

@@ -199,8 +199,10 @@ def _backward(
     )  # fmt: skip
     if wanted:
         sums(14, b.l1, out, jobs=2 if inside else 5)
+    del gl2  # what the rest needs goes where this was
     normals_adjoint[launch.lanes](b.t, b.s1, gl1[hidden:], gt, gs1, m, scale, BLOCK=LANES)
-    x, gplanes, out, gw_psi, gs_psi = empty(12), empty(36), empty(hidden), empty(6), empty(6)
+    x, gplanes, out = (empty(rows if outside else 0) for rows in (12, 36, hidden))
+    gw_psi, gs_psi = empty(6), empty(6)
     psi1_backward[grid](
         w, b.s1, b.t, gt, gl1, b.l1, *weights[6:14], h1, h2, g1, g2, x, gplanes, out, partial, gw_psi, gs_psi, first[6],
         partial.shape[1], n, m, scale, alpha, **size,
