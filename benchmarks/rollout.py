@@ -178,6 +178,16 @@ def spread(seconds: list[float], substeps: int) -> str:
     return f"{statistics.median(milli):.3f} ({min(milli):.3f} to {max(milli):.3f})"
 
 
+def measured(run: Case, options: argparse.Namespace) -> list[list[float]]:
+    """Seconds of each repeat, forward and, unless --forward-only, forward + backward."""
+    figures = []
+    for call in (run.forward, run.both)[: 1 if options.forward_only else 2]:
+        for _ in range(3 if options.device == "cuda" else 1):
+            call()
+        figures.append([timed(call, options.device) for _ in range(options.repeats)])
+    return figures
+
+
 def table(options: argparse.Namespace, settings: dict) -> None:
     unit, total = "ms" if options.device == "cuda" else "CPU-ms", options.frames * options.substeps
     length = f"{options.frames} x {options.substeps} substeps"
@@ -190,12 +200,9 @@ def table(options: argparse.Namespace, settings: dict) -> None:
         bases: list[float] = []
         for variant in options.variants:
             run = case(variant, particles, options.substeps, options.frames, options.device, settings, options.order)
-            figures = []
             with memory:
-                for call in (run.forward, run.both)[: len(names)]:
-                    for _ in range(3 if options.device == "cuda" else 1):
-                        call()
-                    figures.append([timed(call, options.device) for _ in range(options.repeats)])
+                figures = measured(run, options)
+            del run  # with its buffers: the next one's memory is its own
             medians = [statistics.median(f) for f in figures]
             bases = medians if variant == "none" else bases
             over = ", ".join(f"{a / b:.2f}" for a, b in zip(medians, bases)) if bases else "-"

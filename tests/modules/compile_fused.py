@@ -18,7 +18,7 @@ FORWARD = ("phi_forward", "psi1_forward", "psi2_forward", "theta_forward")
 BACKWARD = ("phi_backward", "psi1_backward", "psi2_backward", "theta_backward")
 BETWEEN = ("assemble", "assemble_adjoint", "normals", "normals_adjoint", "finish")
 FLAGS = {"BOUNDED": True, "EXTRA": False, "RESTED": True, "OPERATOR": True}
-INTEGERS, FLOATS = ("N", "M", "start", "size", "rows"), ("scale", "bound", "alpha")
+INTEGERS, FLOATS = ("N", "M", "start", "size"), ("scale", "bound", "alpha")
 
 
 def compiled(module: str, name: str, options: dict) -> dict:
@@ -45,7 +45,6 @@ def main(precision: str, hidden: int) -> None:
     found = {name: compiled("network", name, launch.forward()[1]) for name in FORWARD}
     found |= {name: compiled("adjoint", name, launch.backward(True)[1]) for name in BACKWARD}
     found |= {name: compiled("assembly", name, {"BLOCK": LANES, "num_warps": 4}) for name in BETWEEN}
-    found["column_sums"] = compiled("sum", "column_sums", {"TILE": 32, "BLOCK": LANES, "num_warps": 4})
     print(json.dumps(found))
 
 

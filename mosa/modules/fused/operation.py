@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 from mosa.modules.fused.adjoint_kernels import phi_backward, psi1_backward, psi2_backward, theta_backward
 from mosa.modules.fused.assembly_kernels import assemble, assemble_adjoint, finish, normals, normals_adjoint
 from mosa.modules.fused.network_kernels import phi_forward, psi1_forward, psi2_forward, theta_forward
-from mosa.modules.fused.sum_kernels import column_sums, weight_gradients
+from mosa.modules.fused.sum_kernels import weight_gradients
 from mosa.physics.activations import backward_at_hand
 
 LANES = 128
@@ -218,9 +218,7 @@ def _backward(
         sums(0, x, out)
     if not wanted:
         return gw, gs, [None] * len(weights)
-    total = w.new_empty(partial.shape[1])
-    column_sums[(-(-len(total) // LANES),)](partial, total, programs, len(total), TILE=32, BLOCK=LANES)
-    parts = total.split([p.numel() for p in weights])
+    parts = partial.sum(0).split([p.numel() for p in weights])
     return gw, gs, [part.view_as(p) for part, p in zip(parts, weights, strict=True)]
 
 

@@ -99,15 +99,3 @@ def weight_gradients(
             layer_gradient(g1, x1, at, M, H, IN1, 0, TILE, TILE, BLOCK, P)
         if OUT4 > 0:
             layer_gradient(g4, x4, at3 + OUT3 * H + OUT3, M, OUT4, H, 0, 0, TILE, BLOCK, P)
-
-
-@triton.jit(do_not_specialize=["rows", "size"])
-def column_sums(x, out, rows, size, TILE: tl.constexpr, BLOCK: tl.constexpr):
-    """out (size,) of x (rows, size), always in the same order."""
-    c = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)[None, :]
-    total = tl.zeros((TILE, BLOCK), tl.float32)
-    for first in range(0, rows, TILE):
-        r = first + tl.arange(0, TILE)[:, None]
-        total += tl.load(x + r * size + c, mask=(r < rows) & (c < size), other=0.0)
-    total = tl.sum(total, 0)[None, :]
-    tl.store(out + c, total, mask=c < size)
