@@ -1,6 +1,8 @@
 """Operations on each particle alone, around the segments: the state that an adapter reads, the first advance of F under a return
 mapping, and the stress of the law."""
 
+from collections.abc import Sequence
+
 import torch
 import warp as wp
 from torch import Tensor
@@ -16,6 +18,14 @@ def _arrays(tensors: list[Tensor | None], kinds: list) -> list:
     return [
         None if t is None else wp.from_torch(aligned(t.detach()), dtype=kind) for t, kind in zip(tensors, kinds, strict=True)
     ]
+
+
+def _targets(tensors: Sequence[Tensor], kinds: list) -> list:
+    """What adjoints add to: never a copy, which nobody would read. Matrices of 3 x 3 are moved one number at a time and may begin
+    anywhere; the others begin at a multiple of 16 bytes where they are made."""
+    if not all(t.is_contiguous() for t in tensors):
+        raise ValueError(f"gradients: expected contiguous tensors, found strides {[t.stride() for t in tensors]}")
+    return [wp.from_torch(t.detach(), dtype=kind) for t, kind in zip(tensors, kinds)]
 
 
 def _zeros(tensors: list[Tensor]) -> list[Tensor]:
@@ -63,7 +73,8 @@ class _MaterialState(torch.autograd.Function):
         gradients, blank = _zeros(inputs) if ctx.into is None else ctx.into, inputs[0].new_empty(1, 6)
         with warp_stream(blank.device):
             arrays = _arrays([*inputs, blank, blank, blank], ctx.kinds)
-            launch(ctx.kernel, len(inputs[0]), arrays, arrays[0].device, _arrays([*gradients, *seeds], ctx.kinds))
+            adjoints = [*_targets(gradients, ctx.kinds), *_arrays(seeds, ctx.kinds[3:])]
+            launch(ctx.kernel, len(inputs[0]), arrays, arrays[0].device, adjoints)
         return None, None, *(gradients if ctx.into is None else (None, None, None))
 
 
@@ -73,7 +84,8 @@ def material_state(
     """(w, s, e) that an adapter reads, differentiable.
 
     w: (N, 6) vech(W - I); s: (N, 6) vech(R^T tau R) [Pa] of the prior; e: (N, 6) vech(dev log W), None for elastic laws.
-    into: add the gradients of F, C_affine and parameters to these contiguous tensors, and give autograd none.
+    into: add the gradients of F, C_affine and parameters to these contiguous tensors, and give autograd none. That of the
+    parameters begins at a multiple of 16 bytes.
     """
     result = _MaterialState.apply(law, into, F, C_affine, parameters)
     return result if law.plastic else (*result, None)
@@ -105,7 +117,7 @@ class _Return(torch.autograd.Function):
         with warp_stream(seed.device):
             arrays = _arrays(inputs, ctx.kinds)
             blank, seeds = _arrays([seed.new_empty(1, 3, 3), seed], ctx.kinds[:1] * 2)
-            adjoints = [*_arrays(gradients, ctx.kinds), 0.0, 0.0, 0, seeds]
+            adjoints = [*_targets(gradients, ctx.kinds), 0.0, 0.0, 0, seeds]
             launch(ctx.kernel, len(seed), [*arrays, *ctx.constants, blank], arrays[0].device, adjoints)
         return None, *gradients[:3], *(gradients[3:] if ctx.adapted else (None, None))
 

@@ -77,6 +77,20 @@ def test_a_chain_is_its_segments(device, law, plastic, penalised, source, make_b
 
 
 @pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("law, plastic", [("corotated", False), ("von_mises", True)])
+@pytest.mark.parametrize("source", ["tape", "graphs"])
+@pytest.mark.parametrize("dtype, tolerance", [(torch.float64, 1e-9), (torch.float32, 2e-3)])
+def test_evaluations_after_an_odd_number_of_substeps(device, law, plastic, source, dtype, tolerance, make_block):
+    """Of 125 particles the second slot of the adjoints begins at no multiple of 16 bytes, and gradients are added to it in place."""
+    adapter = adapter_of(device, dtype, plastic)
+    make = (law, device, dtype, make_block(n=5, velocity=(0.3, -1.0, 0.2)), adapter)
+    expected, evaluations = rolled(False, *make, stride=1, substeps=5)()
+    found, count = rolled(True, *make, stride=1, substeps=5, source=source)()
+    assert count == evaluations == 15 + plastic
+    assert_same(found, expected, tolerance)
+
+
+@pytest.mark.parametrize("device", DEVICES)
 def test_graphs_follow_new_weights_states_and_windows(device, make_block):
     """What a graph holds by value or address may not outlive it: weights change in place and by copy, the body moves."""
     adapter = adapter_of(device, torch.float64, False)
