@@ -63,7 +63,7 @@ class Chain:
         self.light: Workspace | None = None
         self.full: Workspace | None = None
         self.dims = (0, 0, 0)
-        self.statistics: tuple[Tensor, ...] = ()
+        self.statistics: dict[bool, tuple[Tensor, ...]] = {}  # in light and in full buffers: each graph has its own
         self.statistics_seeds: tuple[Tensor, ...] = ()
         self._kind: type | None = None
         self.attempts = ATTEMPTS if numerics.device.type == "cuda" else 0
@@ -99,7 +99,7 @@ class Chain:
             final = work.final()
             flags = solver.look(work.flags, final)
             if not solver.left_window(flags, first, dt):
-                return final, tuple(copies(self.statistics)), origin, copies(work.tape()) if kept else []
+                return final, tuple(copies(self.statistics[full])), origin, copies(work.tape()) if kept else []
         raise solver.left_behind(flags, first, dt)
 
     def adjoint(
@@ -109,7 +109,7 @@ class Chain:
         """Gradients of (state, parameters, weights). seeds: adjoints of what `advance` returned: state, then statistics."""
         work = self._full()
         if not self.statistics_seeds:
-            self.statistics_seeds = tuple(torch.zeros_like(t) for t in self.statistics)
+            self.statistics_seeds = tuple(torch.zeros_like(t) for t in self.statistics[True])
         work.set_window(origin, self.dims)
         if tape and tape[-1].shape != work.tape()[-1].shape:
             tape = ()  # the window has grown since
@@ -188,7 +188,7 @@ class Chain:
 
     def _forward(self, full: bool) -> None:
         collected = self._advance_all(self._full() if full else self._light(), self.collects)
-        self.statistics = tuple(torch.stack(parts) for parts in zip(*collected))
+        self.statistics[full] = tuple(torch.stack(parts) for parts in zip(*collected))
 
     @torch.no_grad()
     def _advance_all(self, work: Workspace, collects: bool) -> list[tuple[Tensor, ...]]:
@@ -221,7 +221,8 @@ class Chain:
         elif source == "states":
             self._advance_all(work, False)
         work.adj_held["parameters"].zero_()
-        torch._foreach_zero_(self.adj_weights)
+        if self.adj_weights:
+            torch._foreach_zero_(self.adj_weights)
         for index in reversed(range(len(self.lengths))):
             step -= self.lengths[index]
             leaves, answer, statistics = made.pop() if made else self._evaluate(step, penalised)
@@ -257,9 +258,10 @@ class Chain:
         if not self.attempts:
             return
         missing = [name for name in self._passes if name in self._warm and name not in self._graphs]
-        if missing and self.full is not None:
-            self.full.set_window(self.full.lowest, self.dims)
-            self.full.cutoff = cutoff
+        for work in (self.light, self.full):  # this rollout uses one, the other has the window and cutoff of an earlier one
+            if missing and work is not None:
+                work.set_window(work.lowest, self.dims)
+                work.cutoff = cutoff
         for name in missing:
             graph = torch.cuda.CUDAGraph()
             try:

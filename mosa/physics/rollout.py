@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from mosa.errors import ConfigError
 from mosa.physics.adaptive import StepChooser, StepControl, check_counts
 from mosa.physics.boundary import Plane, ground_plane, pack_planes
-from mosa.physics.chain import advance_chain
+from mosa.physics.chain import ANSWER, advance_chain
 from mosa.physics.chains import SEGMENT, Chains, grouped
 from mosa.physics.collider_motion import Motion, Trajectory, sample_frame, sample_poses
 from mosa.physics.colliders import Collider, pack_colliders, reach
@@ -45,8 +45,8 @@ class MaterialState(NamedTuple):
 class AdapterOperator(NamedTuple):
     """What an adapter answers, held in the material frame until it is asked again.
 
-    G: (N, 6, 6), h: (N, 6) [Pa]: tau_hat = tau + R mat(G vech(R^T tau R) + h) R^T. plastic_G: (N, 6, 6), plastic_h: (N, 6) or
-    None: the yield function takes |dev(mat((I + plastic_G) vech(E) + plastic_h))| for |E|.
+    G: (N, 6, 6), h: (N, 6) [Pa]: tau_hat = tau + R mat(G vech(R^T tau R) + h) R^T. plastic_G: (N, 6, 6), plastic_h: (N, 6), both or
+    neither: the yield function takes |dev(mat((I + plastic_G) vech(E) + plastic_h))| for |E|.
     """
 
     G: Tensor
@@ -335,15 +335,15 @@ class Simulator:
         """The adapter's answer by name, checked. into: as `material_state`."""
         n = len(F)
         answer = AdapterOperator(*adapter(MaterialState(*material_state(self.law, F, C, packed, into))))
-        plastic = answer.plastic_G if self.law.plastic else None
-        plastic_h = None if plastic is None else answer.plastic_h
-        result = {"G": answer.G, "h": answer.h, "plastic_G": plastic, "plastic_h": plastic_h}
+        plastic = (answer.plastic_G, answer.plastic_h) if self.law.plastic else (None, None)
+        result = dict(zip(ANSWER, (answer.G, answer.h, *plastic)))
         for name, value in result.items():
+            if name.startswith("plastic") and all(part is None for part in plastic):
+                continue
             shape = (n, 6, 6) if name.endswith("G") else (n, 6)
-            if value is not None and (tuple(value.shape) != shape or value.dtype != self.dtype):
-                raise ConfigError(
-                    f"adapter output {name}: expected shape {shape} of {self.dtype}, found {tuple(value.shape)} of {value.dtype}"
-                )
+            if value is None or tuple(value.shape) != shape or value.dtype != self.dtype:
+                found = "none" if value is None else f"{tuple(value.shape)} of {value.dtype}"
+                raise ConfigError(f"adapter output {name}: expected shape {shape} of {self.dtype}, found {found}")
         if collect is not None:
             collect(adapter.statistics())
         return result

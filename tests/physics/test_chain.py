@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch import nn
 
-from mosa.errors import SimulationDiverged
+from mosa.errors import ConfigError, SimulationDiverged
 from mosa.modules.adapter import StressAdapter, pool
 from mosa.physics.chain import ATTEMPTS
 from mosa.physics.chains import Plan, chain_length, grouped
-from mosa.physics.rollout import SEGMENT, Simulator
+from mosa.physics.rollout import SEGMENT, AdapterOperator, Simulator
 from mosa.types import Ground, ParticleState
 
 CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -81,7 +81,7 @@ def test_a_chain_is_its_segments(device, law, plastic, penalised, source, make_b
 @pytest.mark.parametrize("source", ["tape", "graphs"])
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float64, 1e-9), (torch.float32, 2e-3)])
 def test_evaluations_after_an_odd_number_of_substeps(device, law, plastic, source, dtype, tolerance, make_block):
-    """Of 125 particles the second slot of the adjoints begins at no multiple of 16 bytes, and gradients are added to it in place."""
+    """Of 125 particles the second slot of the adjoints begins at no multiple of 16 bytes; gradients are added to it in place."""
     adapter = adapter_of(device, dtype, plastic)
     make = (law, device, dtype, make_block(n=5, velocity=(0.3, -1.0, 0.2)), adapter)
     expected, evaluations = rolled(False, *make, stride=1, substeps=5)()
@@ -111,6 +111,64 @@ def test_graphs_follow_new_weights_states_and_windows(device, make_block):
         expected, _ = rolled(False, *make)()
         assert_same(rolled(True, *make)()[0], expected, 1e-9)
         once()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("collects", [True, False])
+def test_rollouts_with_and_without_gradients_take_turns(device, collects, make_block):
+    """They share a chain where their segments are alike. Neither replays what the other left: statistics, windows, mass cutoffs."""
+    adapter, near = adapter_of(device, torch.float64, False), make_block(n=5, velocity=(0.3, -1.0, 0.2))
+    far = replace(near, v=near.v + torch.tensor([60.0, 40.0, -30.0], dtype=torch.float64) * near.x[:, :1])
+    weights = list(adapter.parameters())
+    sims = [
+        Simulator("corotated", dx=0.04, substeps=8, frame_dt=3.2e-3, dtype=torch.float64, device=device, chained=chained)
+        for chained in (False, True)
+    ]
+    volume = torch.full((len(near.x),), 8e-6, dtype=torch.float64, device=device)
+
+    def result(sim, state, cutoff, differentiated):
+        sim.mass_cutoff, collected = cutoff, []
+        state = ParticleState(*(getattr(state, name).to(device) for name in ("x", "v", "C_affine", "F", "F_tot")))
+        with torch.set_grad_enabled(differentiated):
+            x = sim.rollout(state, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 3, adapter=adapter, stride=2,
+                            collect=collected.append if collects else None).x
+        gradients = torch.autograd.grad(x.square().sum(), weights) if differentiated else []
+        return [t.detach().cpu() for t in (x, *gradients, *(part for each in collected for part in each))]
+
+    for state, cutoff, differentiated in [
+        (near, 0.0, True), (near, 0.0, False), (near, 0.0, True), (near, 0.0, False), (near, 0.0, True), (far, 0.0, True),
+        (near, 0.0, False), (far, 1e-4, True), (near, 1e-4, False), (near, 1e-4, True), (far, 0.0, False), (far, 0.0, True),
+    ]:  # fmt: skip
+        expected, found = (result(sim, state, cutoff, differentiated) for sim in sims)
+        assert_same(found, expected, 1e-9 if device == "cuda" else 1e-11)
+        with torch.no_grad():
+            for weight in weights:
+                weight.mul_(0.97)
+
+
+@pytest.mark.parametrize("source", ["tape", "states", "graphs"])
+def test_a_frozen_adapter_passes_gradients_on(source, make_block):
+    adapter = adapter_of("cpu", torch.float64, False).requires_grad_(False)
+    make = ("corotated", "cpu", torch.float64, make_block(n=5, velocity=(0.3, -1.0, 0.2)), adapter)
+    expected, _ = rolled(False, *make, stride=1, substeps=5)()
+    assert_same(rolled(True, *make, stride=1, substeps=5, source=source)()[0], expected, 1e-9)
+
+
+@pytest.mark.parametrize("missing", ["G", "h", "plastic_G", "plastic_h"])
+def test_half_an_answer_is_refused(missing, make_block):
+    """A kernel would read whatever lies behind a buffer of one particle."""
+
+    class Half(nn.Module):
+        def forward(self, state):
+            G, h = state.w.new_zeros(len(state.w), 6, 6), torch.zeros_like(state.w)
+            return AdapterOperator(G, h, G, h)._replace(**{missing: None})
+
+    state = make_block(n=3)
+    for chained in (False, True):
+        sim = Simulator("von_mises", dx=0.04, substeps=4, frame_dt=1.6e-3, dtype=torch.float64, chained=chained)
+        with pytest.raises(ConfigError, match=f"adapter output {missing}: .*found none"):
+            sim.rollout(state, {"mu": 8e3, "lam": 1e4, "yield_stress": 300.0}, torch.full((27,), 8e-6, dtype=torch.float64),
+                        1000.0, 2, adapter=Half())  # fmt: skip
 
 
 def test_weights_that_are_freed_later_get_their_gradient(make_block):
