@@ -140,8 +140,11 @@ def ssim(rendered: Tensor, real: Tensor) -> float:
 
     Over all pixels, with borders reflected (torchmetrics; others leave 5 px at the border out). At least 6 x 6 px.
     """
+    if rendered.shape != real.shape:
+        raise ValueError(f"ssim: expected images of one shape, found {tuple(rendered.shape)} and {tuple(real.shape)}")
     if rendered.device.type == "cpu":
-        return float(np.mean([_ssim_on_cpu(a, b) for a, b in zip(rendered.detach().numpy(), real.detach().numpy())]))
+        pairs = zip(rendered.detach().numpy(), real.detach().numpy())
+        return float(np.mean([_ssim_on_cpu(a, b) for a, b in pairs]))
     # in float64: convolutions on a GPU may round to TF32, and variances are small differences
     a, b = rendered.movedim(-1, 1).double(), real.movedim(-1, 1).double()
     return float(structural_similarity_index_measure(a, b, data_range=1.0, sigma=1.5, kernel_size=11))

@@ -176,6 +176,8 @@ def test_ssim_against_its_definition_and_averaged_over_images():
     assert metrics.ssim(a[:1], b[:1]) == pytest.approx(each[0], abs=1e-6)
     assert metrics.ssim(a, b) == pytest.approx(np.mean(each), abs=1e-6)
     assert metrics.ssim(a, a) == pytest.approx(1, abs=1e-9)
+    with pytest.raises(ValueError, match="one shape"):
+        metrics.ssim(a, b[:1])
 
 
 @pytest.mark.gpu

@@ -110,6 +110,7 @@ class Chain:
         work = self._full()
         if not self.statistics_seeds:
             self.statistics_seeds = tuple(torch.zeros_like(t) for t in self.statistics[True])
+        self._check_graphs(solver)  # another rollout may have gone forward since, with another cutoff
         work.set_window(origin, self.dims)
         if tape and tape[-1].shape != work.tape()[-1].shape:
             tape = ()  # the window has grown since

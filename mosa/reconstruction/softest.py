@@ -76,11 +76,14 @@ def softest_vectors(matrix: sparse.csr_matrix, points: Tensor, known: Tensor, co
     """Eigenvalues (count,) in ascending order and orthonormal eigenvectors (N, count), float64, that are orthogonal to `known`.
 
     matrix: (N, N) symmetric, no eigenvalue below 0; points: (N, 3), over which the vectors are smooth; known: (N, k) orthonormal
-    eigenvectors; its device is where the work is done. None where MOST_FILTERS do not reach TOLERANCE.
+    eigenvectors; its device is where the work is done. None where MOST_FILTERS do not reach TOLERANCE, or where there is no room
+    for the guard vectors beside the known ones.
     """
     points, known = points.to(known), known.double()
-    A = _on(matrix, known, torch.float64)
     last = count + max(8, round(GUARD * count))
+    if last + known.shape[1] > len(points):
+        return None
+    A = _on(matrix, known, torch.float64)
     high = 1.1 * largest_eigenvalue(A)
     limit = count + 2 * (last - count) // 3  # the very last ones converge slowest: what lies above is suppressed
     X = cosines(points.double(), last)

@@ -236,6 +236,23 @@ def test_the_floor_is_the_truth_itself_on_the_truth_s_own_particles_and_grid(tra
     assert walled[..., 0].max() < right + 0.005 < coarse[..., 0].max() - 0.005  # spreading by 13 mm is held within 2
 
 
+def test_an_object_of_another_spacing_is_filled_anew(monkeypatch):
+    """What is kept for the next sequence is of the object, not of its name."""
+    counts = []
+
+    def counted(body, material, particles, *args, **kwargs):
+        counts.append(len(particles))
+        raise InterruptedError
+
+    monkeypatch.setattr(takes, "simulate", counted)
+    for factor in (1.0, 1.5):
+        coarser = replace(OBJECTS["tiny"], spacing=factor * OBJECTS["tiny"].spacing)
+        with monkeypatch.context() as patch, pytest.raises(InterruptedError):
+            patch.setitem(OBJECTS, "tiny", coarser)
+            takes.film_drop("tiny", "train", "anisotropic", 0, False)
+    assert counts[1] < 0.5 * counts[0]
+
+
 @pytest.mark.parametrize("size", [(24, 24), (12, 12), (17, 17)])
 def test_pictures_are_composited_on_white_at_every_size(size):
     """A window around the object is enough: beside it all is white. The last picture is empty."""

@@ -118,6 +118,7 @@ def test_graphs_follow_new_weights_states_and_windows(device, make_block):
 def test_rollouts_with_and_without_gradients_take_turns(device, collects, make_block):
     """They share a chain where their segments are alike. Neither replays what the other left: statistics, windows, mass cutoffs."""
     adapter, near = adapter_of(device, torch.float64, False), make_block(n=5, velocity=(0.3, -1.0, 0.2))
+    near = replace(near, v=near.v + torch.tensor([4.0, 3.0, -2.0], dtype=torch.float64) * near.x[:, :1])
     far = replace(near, v=near.v + torch.tensor([60.0, 40.0, -30.0], dtype=torch.float64) * near.x[:, :1])
     weights = list(adapter.parameters())
     sims = [
@@ -132,7 +133,7 @@ def test_rollouts_with_and_without_gradients_take_turns(device, collects, make_b
         with torch.set_grad_enabled(differentiated):
             x = sim.rollout(state, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 3, adapter=adapter, stride=2,
                             collect=collected.append if collects else None).x
-        gradients = torch.autograd.grad(x.square().sum(), weights) if differentiated else []
+        gradients = torch.autograd.grad(1e4 * x.square().sum(), weights) if differentiated else []
         return [t.detach().cpu() for t in (x, *gradients, *(part for each in collected for part in each))]
 
     for state, cutoff, differentiated in [
@@ -144,6 +145,27 @@ def test_rollouts_with_and_without_gradients_take_turns(device, collects, make_b
         with torch.no_grad():
             for weight in weights:
                 weight.mul_(0.97)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_two_rollouts_before_their_backward_passes(device, make_block):
+    """Of different mass cutoffs, which a graph holds by value."""
+    adapter, state = adapter_of(device, torch.float64, False), make_block(n=5, velocity=(0.3, -1.0, 0.2))
+    state = ParticleState(*(getattr(state, name).to(device) for name in ("x", "v", "C_affine", "F", "F_tot")))
+    volume = torch.full((len(state.x),), 8e-6, dtype=torch.float64, device=device)
+    weights, found = list(adapter.parameters()), []
+    for chained in (False, True):
+        sim = Simulator("corotated", dx=0.04, substeps=4, frame_dt=1.6e-3, dtype=torch.float64, device=device, chained=chained)
+        for _ in range(3):
+            losses = []
+            for sim.mass_cutoff in (1e-3, 1e-2):
+                x = sim.rollout(state, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 3, adapter=adapter, stride=1).x
+                losses.append(1e4 * x.square().sum())
+            found.append([g.cpu() for loss in losses for g in torch.autograd.grad(loss, weights)])
+    assert float((found[0][0] - found[0][len(weights)]).abs().max()) > 1e-3 * float(found[0][0].abs().max())
+    assert float(found[0][0].abs().max()) > 1e-3
+    for gradients in found[3:]:
+        assert_same(gradients, found[0], 1e-9)
 
 
 @pytest.mark.parametrize("source", ["tape", "states", "graphs"])
@@ -189,6 +211,7 @@ def test_weights_that_are_freed_later_get_their_gradient(make_block):
 def test_a_window_that_grows_between_the_passes_does_not_change_the_gradient(make_block):
     """A rollout of a faster body, without gradients, widens the grid of a chain whose backward pass is still to come."""
     adapter, near = adapter_of("cpu", torch.float64, False), make_block(n=5)
+    near = replace(near, v=near.v + torch.tensor([4.0, 3.0, -2.0], dtype=torch.float64) * near.x[:, :1])
     far = replace(near, v=near.v + torch.tensor([40.0, 30.0, -20.0], dtype=torch.float64) * near.x[:, :1])
     volume = torch.full((len(near.x),), 8e-6, dtype=torch.float64)
     gradients = []
@@ -196,7 +219,7 @@ def test_a_window_that_grows_between_the_passes_does_not_change_the_gradient(mak
         sim = Simulator("corotated", dx=0.04, substeps=8, frame_dt=3.2e-3, dtype=torch.float64, chained=True)
 
         def end(state, sim=sim):
-            return sim.rollout(state, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 3, adapter=adapter, stride=2).x[-1].square().sum()
+            return sim.rollout(state, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 3, adapter=adapter, stride=2).x[-1].square().sum() * 1e4
 
         loss = end(near)
         if disturbed:
@@ -205,6 +228,7 @@ def test_a_window_that_grows_between_the_passes_does_not_change_the_gradient(mak
                 end(replace(far, v=30 * far.v))
             assert next(iter(sim._chains.chains.values())).dims != before
         gradients.append(torch.autograd.grad(loss, list(adapter.parameters())))
+    assert float(gradients[0][0].abs().max()) > 1e-2
     assert_same(gradients[1], gradients[0], 1e-11)
 
 

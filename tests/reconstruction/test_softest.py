@@ -48,6 +48,13 @@ def test_modes_of_large_bodies_are_those_of_small_ones(body, monkeypatch):
     )
 
 
+def test_more_vectors_than_there_is_room_for_are_refused(body):
+    """Beside 596 vectors orthogonal to the four known ones, guards would be found among the known ones."""
+    points, around = body[0][:600], neighbourhood(body[0][:600])
+    known = torch.linalg.qr(torch.cat([torch.ones(600, 1), points], 1).double())[0]
+    assert softest_vectors(modes.bending_matrix(around), points, known, 399) is None
+
+
 def test_what_does_not_converge_is_factorised(body, monkeypatch):
     points, around = body
     direct = modes.deformation_modes(points, around, count=24)

@@ -89,21 +89,20 @@ def make(
 
 
 @functools.lru_cache(maxsize=1)
-def built(name: str, seed: int) -> tuple[Surface, np.ndarray, Skin]:
+def built(shape_name: str, pitch: float, spacing: float, seed: int) -> tuple[Surface, np.ndarray, Skin]:
     """Surface, particles (N, 3) [m] and skin of an object, the same in every sequence and material: not to be changed."""
-    body = OBJECTS[name]
-    shape = SHAPES[body.shape]
+    shape = SHAPES[shape_name]
     # one generator a purpose: the same texture, lattice and cameras in every sequence and material of a seed
-    surface = extract_surface(shape, body.pitch, np.random.default_rng([seed, 1]))
-    particles = fill(shape, body.spacing, np.random.default_rng([seed, 2]))
-    return surface, particles, bind(surface.vertices, particles, body.spacing)
+    surface = extract_surface(shape, pitch, np.random.default_rng([seed, 1]))
+    particles = fill(shape, spacing, np.random.default_rng([seed, 2]))
+    return surface, particles, bind(surface.vertices, particles, spacing)
 
 
 def film_drop(name: str, sequence: str, material: str, seed: int, progress: bool) -> Take:
     """Simulate and film, without the cache."""
     body, drop = OBJECTS[name], drop_named(name, sequence)
     film = body.footage
-    surface, particles, skin = built(name, seed)
+    surface, particles, skin = built(body.shape, body.pitch, body.spacing, seed)
     label = f"{name}/{sequence} (synthetic, {material})"
     with tqdm(
         total=film.frames - 1, desc=f"{label}: simulate", unit="frame", disable=not progress, dynamic_ncols=True
