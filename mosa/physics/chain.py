@@ -30,6 +30,7 @@ ANSWER = ("G", "h", "plastic_G", "plastic_h")
 COARSE = 8
 """Node counts of a chain's window are multiples of this: each change of them costs a new capture."""
 LARGE = 2**14
+"""Numbers of a weight from which its gradient is added in a launch of its own."""
 ATTEMPTS = 3
 """Captures that may fail before a chain gives up: libraries that set themselves up when they are first captured spoil one."""
 
