@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from mosa.data.builtin.hidden_material import HiddenMaterial
-from mosa.data.builtin.hidden_yield import HiddenYield
+from mosa.data.builtin.hidden import Hidden
 from mosa.data.builtin.objects import BuiltinObject, Drop
 from mosa.physics.rollout import Simulator
 from mosa.physics.time_step import required_substeps
@@ -46,7 +45,7 @@ def place(points: np.ndarray, center: np.ndarray, drop: Drop, lowest: np.ndarray
 
 
 def simulate(
-    body: BuiltinObject, material: HiddenMaterial | HiddenYield, particles: np.ndarray, surface: np.ndarray, drop: Drop,
+    body: BuiltinObject, material: Hidden, particles: np.ndarray, surface: np.ndarray, drop: Drop,
     training: Drop, *, progress: Callable[[int], None] | None = None,
 ) -> Fall:  # fmt: skip
     """Particles (N, 3) of the shape's frame through a drop; surface: (M, 3) points of the shape's frame."""

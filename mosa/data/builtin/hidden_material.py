@@ -1,14 +1,12 @@
 """The material of the built-in scenes, which no prior of the learner can express: fibres, and stiffness that varies."""
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import warp as wp
 from torch import Tensor
 
-from mosa.errors import ConfigError
-from mosa.physics.elasticity import lame
+from mosa.data.builtin.hidden import Hidden
 from mosa.physics.laws import LawParameters, register_law
 
 LAW = "fibre_neo_hookean"
@@ -49,57 +47,32 @@ def fibre_stiffness(E: float, nu: float, ratio: float) -> float:
     return 0.25 * (ratio - 1) * E / (1 - nu**2)
 
 
-@dataclass(frozen=True)
-class HiddenMaterial:
-    """E [Pa], nu of the matrix; ratio of Young's moduli along the fibre and across; fibre: rest direction, any length;
-    amplitude and period [m] of the stiffness factor 1 + amplitude sin(2 pi X.axis/period) over rest positions."""
+@dataclass(frozen=True, kw_only=True)
+class HiddenMaterial(Hidden):
+    """The elastic part is the matrix; ratio of Young's moduli along the fibre and across; fibre: rest direction, any length."""
 
-    E: float
-    nu: float
     ratio: float
     fibre: tuple[float, float, float]
-    amplitude: float
-    period: float
-    axis: tuple[float, float, float] = (1.0, 0.0, 0.0)
-    density: float = 1000.0
 
     @property
     def law(self) -> str:
         return LAW
 
-    @property
-    def known(self) -> dict[str, float]:
-        """What a prior can be compared with."""
-        return {"E": self.E, "nu": self.nu}
-
-    def variant(self, kind: str) -> "HiddenMaterial":
-        """`anisotropic`: this one; `isotropic`: its twin without fibres and with one stiffness everywhere.
-
-        Errors: ConfigError for another kind.
-        """
-        if kind == "anisotropic":
-            return self
-        if kind == "isotropic":
-            return HiddenMaterial(self.E, self.nu, 1.0, self.fibre, 0.0, self.period, self.axis, self.density)
-        raise ConfigError(f"scene.material: expected anisotropic or isotropic, found {kind!r}")
-
-    def factor(self, rest: Tensor) -> Tensor:
-        """(N,) stiffness factor at rest positions (N, 3) [m]."""
-        axis = torch.tensor(self.axis, dtype=rest.dtype)
-        return 1 + self.amplitude * torch.sin(2 * math.pi * (rest @ axis) / self.period)
+    def isotropic(self) -> "HiddenMaterial":
+        """Its twin without fibres and with one stiffness everywhere."""
+        return replace(self, ratio=1.0, amplitude=0.0)
 
     def parameters(self, rest: Tensor) -> dict[str, Tensor]:
         """What the law `fibre_neo_hookean` takes, per particle."""
         factor = self.factor(rest)
-        mu, lam = lame(self.E * factor, torch.full_like(factor, self.nu))
+        mu, lam = self.elastic(factor)
         fibre = torch.tensor(self.fibre, dtype=rest.dtype)
         kf = fibre_stiffness(self.E, self.nu, self.ratio) * factor
         return {"mu": mu, "lam": lam, "kf": kf, "fibre": (fibre / fibre.norm()).expand(len(rest), 3)}
 
-    def wave_modulus(self) -> float:
-        """Largest P wave modulus [Pa]: lam + 2 mu + 4 kf where the stiffness is highest."""
-        mu, lam = lame(torch.tensor(self.E), torch.tensor(self.nu))
-        return (1 + abs(self.amplitude)) * (float(lam + 2 * mu) + 4 * fibre_stiffness(self.E, self.nu, self.ratio))
+    def mean_modulus(self) -> float:
+        """lam + 2 mu + 4 kf [Pa]."""
+        return super().mean_modulus() + 4 * fibre_stiffness(self.E, self.nu, self.ratio)
 
     def summary(self) -> dict[str, float]:
         """Numbers for Truth.parameters: E, nu of the matrix, moduli along and across the fibre [Pa], their ratio."""

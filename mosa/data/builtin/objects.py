@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from mosa.data.builtin.hidden import Hidden
 from mosa.data.builtin.hidden_material import HiddenMaterial
 from mosa.data.builtin.hidden_yield import HiddenYield
 from mosa.errors import ConfigError
@@ -52,7 +53,7 @@ class BuiltinObject:
 
     shape: str
     height: float
-    material: HiddenMaterial | HiddenYield
+    material: Hidden
     drops: dict[str, Drop]
     footage: Footage = field(default_factory=Footage)
     spacing: float = 0.0075
