@@ -12,7 +12,7 @@ states and nothing is asked a third time.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -29,8 +29,6 @@ from mosa.physics.workspace import Numerics, Workspace, copies
 ANSWER = ("G", "h", "plastic_G", "plastic_h")
 COARSE = 8
 """Node counts of a chain's window are multiples of this: each change of them costs a new capture."""
-LARGE = 2**14
-"""Numbers of a weight from which its gradient is added in a launch of its own."""
 ATTEMPTS = 3
 """Captures that may fail before a chain gives up: libraries that set themselves up when they are first captured spoil one."""
 
@@ -182,53 +180,44 @@ class Chain:
             leaves = [t.detach().requires_grad_() for t in inputs]
             return _Evaluation(leaves, *self._ask(*leaves[:3], collects, leaves[3:], into))
 
-    def _advance(self, work: Workspace, step: int, length: int, answer: dict[str, Tensor | None]) -> None:
-        """Launches a segment with the operator in `answer`."""
-        work.point({name: None if t is None else t.detach() for name, t in answer.items()})
-        with warp_stream(self.numerics.device):
-            work.advance_steps(step, length)
+    @torch.no_grad()
+    def _answer(self, work: Workspace, collects: bool, step: int) -> _Evaluation:
+        """The same without a graph, in either workspace."""
+        slot = step % len(work.x)
+        return _Evaluation([], *self._ask(work.F[slot], work.C[slot], work.held["parameters"], collects))
 
     def _forward(self, full: bool) -> None:
-        collected = self._advance_all(self._full() if full else self._light(), self.collects)
+        work = self._full() if full else self._light()
+        collected = [evaluation.statistics for evaluation in self._segments(work, partial(self._answer, work, self.collects))]
         self.statistics[full] = tuple(torch.stack(parts) for parts in zip(*collected))
 
-    @torch.no_grad()
-    def _advance_all(self, work: Workspace, collects: bool) -> list[tuple[Tensor, ...]]:
-        """Launches all segments; returns the statistics of each evaluation."""
+    def _segments(self, work: Workspace, evaluate: Callable[[int], _Evaluation]) -> Iterator[_Evaluation]:
+        """Launches all segments, one after each answer of `evaluate` to the state at its start, and passes the answers on."""
         work.flags.fill_(NO_EVENT)
-        step, collected = 0, []
+        step = 0
         for length in self.lengths:
-            slot = step % len(work.x)
-            answer, statistics = self._ask(work.F[slot], work.C[slot], work.held["parameters"], collects)
-            collected.append(statistics)
-            self._advance(work, step, length, answer)
+            evaluation = evaluate(step)
+            work.point(evaluation.answer)
+            with warp_stream(self.numerics.device):
+                work.advance_steps(step, length)
             step += length
-        return collected
-
-    def _advance_with_graphs(self, penalised: bool) -> list[_Evaluation]:
-        """Launches all segments again."""
-        self.full.flags.fill_(NO_EVENT)
-        step, made = 0, []
-        for length in self.lengths:
-            made.append(self._evaluate(step, penalised))
-            self._advance(self.full, step, length, made[-1].answer)
-            step += length
-        return made
+            yield evaluation
 
     def _adjoint(self, source: str, penalised: bool) -> None:
         """source: of the states, tape | states | graphs: loaded, or made again, without or with the evaluations' graphs."""
         work, step, made = self.full, self.substeps, []
         if source == "graphs":
-            made = self._advance_with_graphs(penalised)
+            made = list(self._segments(work, partial(self._evaluate, collects=penalised)))
         elif source == "states":
-            self._advance_all(work, False)
+            for _ in self._segments(work, partial(self._answer, work, False)):
+                pass
         work.adj_held["parameters"].zero_()
         if self.adj_weights:
             torch._foreach_zero_(self.adj_weights)
         for index in reversed(range(len(self.lengths))):
             step -= self.lengths[index]
             leaves, answer, statistics = made.pop() if made else self._evaluate(step, penalised)
-            work.point({name: None if t is None else t.detach() for name, t in answer.items()})
+            work.point(answer)
             with warp_stream(self.numerics.device):
                 work.adjoint_steps(step, self.lengths[index], more=True)
             pairs = [(answer[name], work.adj_held[name]) for name in ANSWER if answer[name] is not None]
@@ -237,8 +226,11 @@ class Chain:
             if not pairs:
                 continue
             outputs, seeds = zip(*pairs)
-            found = torch.autograd.grad(outputs, leaves, seeds, allow_unused=True)
-            _add(self.adj_weights, found[3:])
+            # the first three leaves get theirs in place, see `_evaluate`
+            found = torch.autograd.grad(outputs, leaves, seeds, allow_unused=True)[3:]
+            sums = [(total, part) for total, part in zip(self.adj_weights, found, strict=True) if part is not None]
+            if sums:
+                torch._foreach_add_(*zip(*sums))
 
     def _check_graphs(self, solver: SegmentSolver) -> None:
         """Forget captured graphs where what they have by value or address is another one."""
@@ -260,8 +252,10 @@ class Chain:
         if not self.attempts:
             return
         missing = [name for name in self._passes if name in self._warm and name not in self._graphs]
+        if not missing:
+            return
         for work in (self.light, self.full):  # this rollout uses one, the other has the window and cutoff of an earlier one
-            if missing and work is not None:
+            if work is not None:
                 work.set_window(work.lowest, self.dims)
                 work.cutoff = cutoff
         for name in missing:
@@ -277,16 +271,6 @@ class Chain:
                     warnings.warn(f"{name} cannot be captured as a CUDA graph and runs uncaptured: {error}", stacklevel=2)
                 return
             self._graphs[name] = graph
-
-
-def _add(sums: Sequence[Tensor], found: Sequence[Tensor | None]) -> None:
-    """In place. Large ones each in a launch of their own, on all of a GPU: one launch for many gives a block 65536 numbers."""
-    pairs = [(s, f) for s, f in zip(sums, found, strict=True) if f is not None]
-    for total, part in pairs:
-        if total.numel() >= LARGE:
-            total.add_(part)
-    if small := [(s, f) for s, f in pairs if s.numel() < LARGE]:
-        torch._foreach_add_(*zip(*small))
 
 
 class _Chained(torch.autograd.Function):

@@ -10,8 +10,8 @@ from torch import Tensor
 from mosa.physics.laws import Law
 from mosa.physics.material_kernels import field_types, return_kernel, state_kernel, stress_kernel
 from mosa.physics.mpm import warp_stream
-from mosa.physics.particle_memory import aligned
-from mosa.physics.workspace import ALIGNED, SCALARS, Numerics, launch
+from mosa.physics.particle_memory import aligned, zeros_in_one
+from mosa.physics.workspace import SCALARS, Numerics, launch
 
 
 def _arrays(tensors: list[Tensor | None], kinds: list) -> list:
@@ -29,10 +29,8 @@ def _targets(tensors: Sequence[Tensor], kinds: list) -> list:
 
 
 def _zeros(tensors: list[Tensor]) -> list[Tensor]:
-    """Contiguous, of the tensors' shapes, made in one launch: what adjoints add gradients to."""
-    sizes = [-(-t.numel() // ALIGNED) * ALIGNED for t in tensors]
-    flat = tensors[0].new_zeros(sum(sizes))
-    return [part[: t.numel()].view(t.shape) for part, t in zip(flat.split(sizes), tensors)]
+    """Of the tensors' shapes: what adjoints add gradients to."""
+    return zeros_in_one([t.shape for t in tensors], tensors[0].dtype, tensors[0].device)[1]
 
 
 @torch.no_grad()

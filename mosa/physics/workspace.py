@@ -20,7 +20,7 @@ from mosa.physics.colliders import PackedColliders
 from mosa.physics.laws import SLOTS, Law
 from mosa.physics.material_kernels import kernels_of
 from mosa.physics.mpm_kernels import NO_EVENT, transfer_kernels
-from mosa.physics.particle_memory import aligned
+from mosa.physics.particle_memory import aligned, zeros_in_one
 
 SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
 
@@ -65,8 +65,6 @@ WINDOWS = 2**27
 """Bytes of other windows' buffers that a workspace on a CPU keeps, with their graphs: a falling body comes back to them."""
 GRID = ("grid", "grid_wp", "velocity", "velocity_wp", "adj_grid", "adj_grid_wp", "adj_velocity", "adj_velocity_wp", "_graphs")
 """What belongs to a size of the window."""
-ALIGNED = 32
-"""Numbers: where arrays in one buffer begin."""
 BLOCK = 64
 """Threads of a CUDA block: small ones, so that ten thousand particles are spread over all multiprocessors."""
 
@@ -134,7 +132,12 @@ class Workspace:
             if self.plastic:
                 self.adj_A, self.adj_A_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
             self.adj_tau, self.adj_tau_wp = self._array((n, 3, 3), self.kernels.mat33)
-            self.adj_held, self.adj_held_wp, (self.all_adj_wp, self.adj_operator_wp) = self._in_one(shapes)
+            buffer, parts = zeros_in_one([shape for shape, _ in shapes.values()], numerics.dtype, numerics.device)
+            self.adj_held = dict(zip(shapes, parts))
+            self.adj_held_wp = {name: wp.from_torch(part, dtype=shapes[name][1]) for name, part in self.adj_held.items()}
+            # to clear in one launch: all of it, and all but the parameters' part, which comes first
+            self.all_adj_wp = wp.from_torch(buffer, dtype=self.scalar)
+            self.adj_operator_wp = wp.from_torch(buffer[parts[1].storage_offset() :], dtype=self.scalar)
         self.flags, self.flags_wp = self._array((4,), wp.int64, torch.int64)
         self.origin, self.origin_wp = self._array((1, 3), wp.vec3i, torch.int32)
         self.planes_wp = wp.from_torch(numerics.planes, dtype=self.scalar)
@@ -153,16 +156,6 @@ class Workspace:
     def _array(self, shape: tuple[int, ...], kind, dtype: torch.dtype | None = None):
         tensor = torch.zeros(shape, dtype=dtype or self.numerics.dtype, device=self.numerics.device)
         return tensor, wp.from_torch(tensor, dtype=kind)
-
-    def _in_one(self, shapes: dict[str, tuple[tuple[int, ...], type]]) -> tuple[dict[str, Tensor], dict, tuple[wp.array, wp.array]]:
-        """Arrays by name, as `_array`, and (one of all their numbers, one of all but the first's): cleared in one launch."""
-        sizes = [-(-math.prod(shape) // ALIGNED) * ALIGNED for shape, _ in shapes.values()]
-        whole, whole_wp = self._array((sum(sizes),), self.scalar)
-        others_wp = wp.from_torch(whole[sizes[0] :], dtype=self.scalar)
-        parts = zip(shapes.items(), whole.split(sizes))
-        tensors = {name: part[: math.prod(shape)].view(shape) for (name, (shape, _)), part in parts}
-        arrays = {name: wp.from_torch(t, dtype=shapes[name][1]) for name, t in tensors.items()}
-        return tensors, arrays, (whole_wp, others_wp)
 
     def _per_slot(self, slots: int, shape: tuple[int, ...], kind):
         tensor = torch.zeros((slots, *shape), dtype=self.numerics.dtype, device=self.numerics.device)
@@ -233,10 +226,10 @@ class Workspace:
         torch._foreach_copy_([self.held[name] for name in given], list(given.values()))
 
     def point(self, held: dict[str, Tensor | None]) -> None:
-        """As `hold`, without a copy: the next launches read these tensors. The caller keeps them."""
+        """As `hold`, without a copy or a graph: the next launches read these tensors. The caller keeps them."""
         for name, value in held.items():
             if value is not None:
-                self.held_wp[name] = wp.from_torch(aligned(value), dtype=self.held_wp[name].dtype)
+                self.held_wp[name] = wp.from_torch(aligned(value.detach()), dtype=self.held_wp[name].dtype)
 
     def final(self) -> tuple[Tensor, ...]:
         """Copies of (x, v, C_affine, F, F_tot) after the segment; F_tot is F itself where the law does not yield."""
