@@ -142,6 +142,8 @@ def ssim(rendered: Tensor, real: Tensor) -> float:
     """
     if rendered.shape != real.shape:
         raise ValueError(f"ssim: expected images of one shape, found {tuple(rendered.shape)} and {tuple(real.shape)}")
+    if min(rendered.shape[1:3]) < 6:
+        raise ValueError(f"ssim: expected images of at least 6 x 6 px, found {tuple(rendered.shape[1:3])}")
     if rendered.device.type == "cpu":
         pairs = zip(rendered.detach().numpy(), real.detach().numpy())
         return float(np.mean([_ssim_on_cpu(a, b) for a, b in pairs]))

@@ -178,6 +178,8 @@ def test_ssim_against_its_definition_and_averaged_over_images():
     assert metrics.ssim(a, a) == pytest.approx(1, abs=1e-9)
     with pytest.raises(ValueError, match="one shape"):
         metrics.ssim(a, b[:1])
+    with pytest.raises(ValueError, match="at least 6 x 6 px"):
+        metrics.ssim(a[:, :5], b[:, :5])
 
 
 @pytest.mark.gpu
