@@ -1,10 +1,15 @@
-"""Whether what a network computed on the way is better kept than computed again."""
+"""What evaluations of a network may know of those before and after them."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import TypeVar
 
+from torch import Tensor
+
+Made = TypeVar("Made")
 _AT_HAND = ContextVar("at_hand", default=False)
+_FROM_WEIGHTS: ContextVar[dict | None] = ContextVar("from_weights", default=None)
 
 
 @contextmanager
@@ -19,3 +24,24 @@ def at_hand() -> Iterator[None]:
 
 def backward_at_hand() -> bool:
     return _AT_HAND.get()
+
+
+@contextmanager
+def same_weights() -> Iterator[None]:
+    """No weight changes between the evaluations inside. A pass that is captured opens its own: a replay may find others."""
+    token = _FROM_WEIGHTS.set({})
+    try:
+        yield
+    finally:
+        _FROM_WEIGHTS.reset(token)
+
+
+def from_weights(make: Callable[[], Made], weights: Sequence[Tensor], *key: Hashable) -> Made:
+    """What `make` makes of weights, inside `same_weights` once for all evaluations with the same key."""
+    known = _FROM_WEIGHTS.get()
+    if known is None:
+        return make()
+    key += tuple(p.data_ptr() for p in weights)
+    if key not in known:
+        known[key] = make(), weights  # which are held, so that their addresses stay their own
+    return known[key][0]

@@ -11,6 +11,7 @@ states and nothing is asked a third time.
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -20,8 +21,9 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from mosa.physics.activations import at_hand
-from mosa.physics.mpm import SegmentSolver, warp_stream
+from mosa.physics.activations import at_hand, same_weights
+from mosa.physics.capturing import uninterrupted
+from mosa.physics.mpm import SegmentSolver, wants_gradient, warp_stream
 from mosa.physics.mpm_kernels import NO_EVENT
 from mosa.physics.window import grid_window
 from mosa.physics.workspace import Numerics, Workspace, copies
@@ -29,6 +31,8 @@ from mosa.physics.workspace import Numerics, Workspace, copies
 ANSWER = ("G", "h", "plastic_G", "plastic_h")
 COARSE = 8
 """Node counts of a chain's window are multiples of this: each change of them costs a new capture."""
+MARGIN = 4
+"""Nodes of a window beyond what the speeds at the start ask for."""
 ATTEMPTS = 3
 """Captures that may fail before a chain gives up: libraries that set themselves up when they are first captured spoil one."""
 
@@ -41,9 +45,38 @@ class _Evaluation(NamedTuple):
     statistics: tuple[Tensor, ...]
 
 
+class LeftWindow(Exception):
+    """A particle left the window of a chain with marks: shorter ones have room for any speed."""
+
+
+class Learned(NamedTuple):
+    """Of an adapter: names and tensors of the weights that are learned, and the addresses of all parameters and buffers.
+
+    Looking for them takes as long as a substep: once a rollout, and once for each chain of the backward pass."""
+
+    names: tuple[str, ...]
+    weights: tuple[Tensor, ...]
+    addresses: tuple[int, ...]
+
+
+def addresses_of(adapter: nn.Module) -> tuple[int, ...]:
+    return tuple(t.data_ptr() for t in (*adapter.parameters(), *adapter.buffers()))
+
+
+def learned_of(adapter: nn.Module) -> Learned:
+    wanted = {name: p for name, p in adapter.named_parameters() if p.requires_grad}
+    return Learned(tuple(wanted), tuple(wanted.values()), addresses_of(adapter))
+
+
+def fallen(bounds: Sequence[float], numerics: Numerics, substeps: int) -> list[float]:
+    """`window.extent` with the speed of a body that gravity pulls on for so many substeps."""
+    return [*bounds[:6], bounds[6] + math.hypot(*numerics.gravity) * substeps * numerics.dt]
+
+
 class Chain:
     """Buffers and captured graphs of K segments of `lengths` substeps for N particles and one adapter.
 
+    marks: numbers of segments after which the state is wanted too, besides the last; only without a gradient.
     ask: (adapter, F, C_affine, packed parameters, into=None) -> its answer by name (`ANSWER`, None where it has none),
     differentiable; into: as `material_state`.
     collects: also return `adapter.statistics()`, a named tuple of tensors, of every evaluation.
@@ -53,11 +86,12 @@ class Chain:
 
     def __init__(
         self, numerics: Numerics, adapter: nn.Module, ask: Callable[..., dict[str, Tensor | None]], particles: int,
-        lengths: Sequence[int], *, plastic_adapted: bool, collects: bool, graphs: bool = False,
+        lengths: Sequence[int], *, marks: Sequence[int] = (), plastic_adapted: bool, collects: bool, graphs: bool = False,
     ) -> None:  # fmt: skip
         self.numerics, self.adapter, self.ask, self.lengths, self.collects = numerics, adapter, ask, tuple(lengths), collects
+        self.marks, self.marked = frozenset(marks), []
         self.substeps = sum(lengths)
-        self.names = [name for name, p in adapter.named_parameters() if p.requires_grad]
+        self.learned = learned_of(adapter)
         self._shape = {"particles": particles, "substeps": self.substeps, "adapted": True, "plastic_adapted": plastic_adapted}
         self.light: Workspace | None = None
         self.full: Workspace | None = None
@@ -77,20 +111,25 @@ class Chain:
             for penalised in (False, True):
                 self._passes["adjoint", source, penalised] = partial(self._adjoint, source, penalised)
 
+    @torch.no_grad()
     def advance(
-        self, solver: SegmentSolver, state: tuple[Tensor, ...], packed: Tensor, first: int, kept: bool = False,
+        self, solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...], packed: Tensor, first: int, kept: bool = False,
         full: bool = False,
-    ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...], tuple[int, int, int], list[Tensor]]:  # fmt: skip
-        """(state after the chain, statistics (K, ...) each, lowest node of the window, what `adjoint` takes as `tape`).
+    ) -> tuple[list[tuple[Tensor, ...]], tuple[Tensor, ...], tuple[int, int, int], list[Tensor]]:  # fmt: skip
+        """(states at the marks and after the chain, statistics (K, ...) each, lowest node of the window, what `adjoint` takes as
+        `tape`).
 
-        kept: leave all substeps on the tape, else nothing; full: in the buffers of the backward pass, which kept needs and any
-        rollout with one has anyway. Errors: as `SegmentSolver.advance`."""
+        learned: of the adapter as it is now; kept: leave all substeps on the tape, else nothing; full: in the buffers of the
+        backward pass, which kept needs and any rollout with one has anyway. Errors: as `SegmentSolver.advance`; LeftWindow."""
         dx, dt, total = self.numerics.dx, self.numerics.dt, self.substeps
         work = self._full() if full else self._light()
-        for margin in (4, 3 + total // 2):
-            origin, dims = grid_window(state[0], state[1], dx, 2 * total * dt, margin, bounds=solver.bounds(state))
+        bounds = solver.bounds(state)
+        if self.marks:
+            bounds = fallen(bounds, self.numerics, total)
+        for margin in (MARGIN, 3 + total // 2):
+            origin, dims = grid_window(state[0], state[1], dx, 2 * total * dt, margin, bounds=bounds)
             self.dims = tuple(max(-(-a // COARSE) * COARSE, b) for a, b in zip(dims, self.dims))
-            self._check_graphs(solver)
+            self._check_graphs(solver, learned)
             work.set_window(origin, self.dims)
             work.load(state, {"parameters": packed}, solver.volume, solver.mass, solver.cutoff)
             self._capture(solver.cutoff)
@@ -98,18 +137,22 @@ class Chain:
             final = work.final()
             flags = solver.look(work.flags, final)
             if not solver.left_window(flags, first, dt):
-                return final, tuple(copies(self.statistics[full])), origin, copies(work.tape()) if kept else []
+                states = [*(work.whole(copies(state)) for state in self.marked), final]
+                return states, tuple(copies(self.statistics[full])), origin, copies(work.tape()) if kept else []
+            if self.marks:
+                raise LeftWindow
         raise solver.left_behind(flags, first, dt)
 
     def adjoint(
-        self, solver: SegmentSolver, state: tuple[Tensor, ...], packed: Tensor, origin: tuple[int, int, int],
+        self, solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...], packed: Tensor, origin: tuple[int, int, int],
         seeds: Sequence[Tensor | None], tape: Sequence[Tensor],
     ) -> tuple[list[Tensor], Tensor, list[Tensor]]:  # fmt: skip
-        """Gradients of (state, parameters, weights). seeds: adjoints of what `advance` returned: state, then statistics."""
+        """Gradients of (state, parameters, weights). learned: with the names and weights of `advance`; seeds: adjoints of what it
+        returned: state, then statistics."""
         work = self._full()
         if not self.statistics_seeds:
             self.statistics_seeds = tuple(torch.zeros_like(t) for t in self.statistics[True])
-        self._check_graphs(solver)  # another rollout may have gone forward since, with another cutoff
+        self._check_graphs(solver, learned)  # another rollout may have gone forward since, with another cutoff
         work.set_window(origin, self.dims)
         if tape and tape[-1].shape != work.tape()[-1].shape:
             tape = ()  # the window has grown since
@@ -139,17 +182,13 @@ class Chain:
         """The buffers of the backward pass, made when they are first needed."""
         if self.full is None:
             self.full = Workspace(self.numerics, **self._shape, with_adjoint=True, pointed=True)
-            self.adj_weights = [torch.zeros_like(w) for w in self.weights]
+            self.adj_weights = [torch.zeros_like(w) for w in self.learned.weights]
         return self.full
 
     def _targets(self, slot: int) -> list[Tensor]:
         work = self.full
         targets = [work.adj_x, work.adj_v, work.adj_C, work.adj_F] + ([work.adj_A] if work.plastic else [])
         return [t[slot] for t in targets]
-
-    @property
-    def weights(self) -> list[Tensor]:
-        return [self.adapter.get_parameter(name) for name in self.names]
 
     def _ask(
         self, F: Tensor, C: Tensor, packed: Tensor, collects: bool, weights: Sequence[Tensor] | None = None,
@@ -158,7 +197,7 @@ class Chain:
         """weights: in place of the adapter's own."""
         adapter = self.adapter
         if weights is not None:
-            named = dict(zip(self.names, weights, strict=True))
+            named = dict(zip(self.learned.names, weights, strict=True))
 
             def adapter(state):
                 return functional_call(self.adapter, named, (state,))
@@ -175,7 +214,7 @@ class Chain:
         work, slot = self.full, step % 2
         into = (work.adj_F[slot], work.adj_C[slot], work.adj_held["parameters"])
         with torch.enable_grad(), at_hand():
-            inputs = (work.F[step], work.C[step], work.held["parameters"], *self.weights)
+            inputs = (work.F[step], work.C[step], work.held["parameters"], *self.learned.weights)
             # aliases: autograd ties a leaf to the stream it was first used on, which a capture on another one may not touch
             leaves = [t.detach().requires_grad_() for t in inputs]
             return _Evaluation(leaves, *self._ask(*leaves[:3], collects, leaves[3:], into))
@@ -186,10 +225,15 @@ class Chain:
         slot = step % len(work.x)
         return _Evaluation([], *self._ask(work.F[slot], work.C[slot], work.held["parameters"], collects))
 
+    @same_weights()
     def _forward(self, full: bool) -> None:
-        work = self._full() if full else self._light()
-        collected = [evaluation.statistics for evaluation in self._segments(work, partial(self._answer, work, self.collects))]
+        work, collected, marked = self._full() if full else self._light(), [], []
+        for count, evaluation in enumerate(self._segments(work, partial(self._answer, work, self.collects)), 1):
+            collected.append(evaluation.statistics)
+            if count in self.marks:
+                marked.append(work.state(sum(self.lengths[:count])))
         self.statistics[full] = tuple(torch.stack(parts) for parts in zip(*collected))
+        self.marked = marked
 
     def _segments(self, work: Workspace, evaluate: Callable[[int], _Evaluation]) -> Iterator[_Evaluation]:
         """Launches all segments, one after each answer of `evaluate` to the state at its start, and passes the answers on."""
@@ -203,6 +247,7 @@ class Chain:
             step += length
             yield evaluation
 
+    @same_weights()
     def _adjoint(self, source: str, penalised: bool) -> None:
         """source: of the states, tape | states | graphs: loaded, or made again, without or with the evaluations' graphs."""
         work, step, made = self.full, self.substeps, []
@@ -232,11 +277,12 @@ class Chain:
             if sums:
                 torch._foreach_add_(*zip(*sums))
 
-    def _check_graphs(self, solver: SegmentSolver) -> None:
+    def _check_graphs(self, solver: SegmentSolver, learned: Learned) -> None:
         """Forget captured graphs where what they have by value or address is another one."""
-        key = (self.dims, solver.cutoff, *(t.data_ptr() for t in (*self.adapter.parameters(), *self.adapter.buffers())))
+        self.learned = learned
+        key = (self.dims, solver.cutoff, learned.addresses, tuple(w.data_ptr() for w in learned.weights))
         if key != self._key:
-            self._key = key
+            self._key, self.marked = key, []
             self._graphs.clear()
 
     def _play(self, name: tuple) -> None:
@@ -261,7 +307,7 @@ class Chain:
         for name in missing:
             graph = torch.cuda.CUDAGraph()
             try:
-                with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+                with uninterrupted(), torch.cuda.graph(graph, capture_error_mode="thread_local"):
                     self._passes[name]()
             except RuntimeError as error:
                 self.attempts -= 1
@@ -275,34 +321,38 @@ class Chain:
 
 class _Chained(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, chain: Chain, solver: SegmentSolver, first: int, kept: bool, differentiated: bool, *inputs):
-        """inputs: state (5), packed parameters, the adapter's weights. differentiated: whether autograd is on outside."""
+    def forward(ctx, chain: Chain, solver: SegmentSolver, learned: Learned, first: int, kept: bool, *inputs):
+        """inputs: state (5), packed parameters, the adapter's weights."""
         state, packed = tuple(t.detach().contiguous() for t in inputs[:5]), inputs[5].detach().contiguous()
         ctx.set_materialize_grads(False)
-        full = differentiated and any(ctx.needs_input_grad)
-        result, statistics, origin, tape = chain.advance(solver, state, packed, first, kept and full, full)
+        (result,), statistics, origin, tape = chain.advance(solver, learned, state, packed, first, kept, full=True)
         ctx.chain, ctx.solver, ctx.origin, ctx.tape = chain, solver, origin, tape
-        ctx.states = 5 if solver.numerics.law.plastic else 4
-        ctx.save_for_backward(*state, packed)
+        ctx.states, ctx.names = 5 if solver.numerics.law.plastic else 4, learned.names
+        ctx.save_for_backward(*state, packed, *inputs[6:])  # weights too: autograd tells if one is changed before the backward pass
         return *result[: ctx.states], *statistics
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, *seeds):
-        *state, packed = ctx.saved_tensors
+        state, packed, weights = ctx.saved_tensors[:5], ctx.saved_tensors[5], ctx.saved_tensors[6:]
+        learned = Learned(ctx.names, weights, addresses_of(ctx.chain.adapter))
         tape, ctx.tape = ctx.tape, []  # free it as soon as it is used
-        found, adj_packed, adj_weights = ctx.chain.adjoint(ctx.solver, tuple(state), packed, ctx.origin, seeds, tape)
+        found, adj_packed, adj_weights = ctx.chain.adjoint(ctx.solver, learned, state, packed, ctx.origin, seeds, tape)
         return *[None] * 5, *found, *[None] * (5 - ctx.states), adj_packed, *adj_weights
 
 
 def advance_chain(
-    chain: Chain, solver: SegmentSolver, state: tuple[Tensor, ...], packed: Tensor, first: int, kept: bool = False
-) -> tuple[tuple[Tensor, ...], list]:
-    """((x, v, C_affine, F, F_tot) after the chain, statistics of each evaluation), differentiable in state, parameters and the
-    adapter's weights. first: number of the first substep, for messages; kept: keep the states of all substeps for the backward
-    pass. Errors: SimulationDiverged."""
-    # inside, gradients are off, and inputs say what they would need with them on
-    result = _Chained.apply(chain, solver, first, kept, torch.is_grad_enabled(), *state, packed, *chain.weights)
+    chain: Chain, solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...], packed: Tensor, first: int,
+    kept: bool = False,
+) -> tuple[list[tuple[Tensor, ...]], list]:  # fmt: skip
+    """([(x, v, C_affine, F, F_tot) at the chain's marks and after it], statistics of each evaluation), differentiable in state,
+    parameters and the adapter's weights. learned: of the adapter as it is now; first: number of the first substep, for messages;
+    kept: keep the states of all substeps for the backward pass. Errors: SimulationDiverged; LeftWindow."""
+    if not wants_gradient((*state, packed, *learned.weights)):
+        state = tuple(t.detach().contiguous() for t in state)
+        states, statistics, *_ = chain.advance(solver, learned, state, packed.detach(), first)
+        return states, chain.named(statistics)
+    result = _Chained.apply(chain, solver, learned, first, kept, *state, packed, *learned.weights)
     count = 5 if solver.numerics.law.plastic else 4
     final = result[:count] if count == 5 else (*result[:4], result[3])
-    return final, chain.named(result[count:])
+    return [final], chain.named(result[count:])

@@ -3,34 +3,38 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import accumulate, pairwise
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from mosa.errors import SimulationDiverged
 from mosa.physics.activations import at_hand
-from mosa.physics.chain import Chain
+from mosa.physics.chain import MARGIN, Chain, Learned, LeftWindow, advance_chain, fallen, learned_of
 from mosa.physics.memory import free_memory, room
-from mosa.physics.mpm import substep_bytes, wants_gradient
+from mosa.physics.mpm import SMALL, SegmentSolver, substep_bytes, wants_gradient
+from mosa.physics.window import MAX_NODES, window_of
 from mosa.physics.workspace import Numerics
 
 SEGMENT = 32
 """Most substeps of a chain: what the backward pass stores at once."""
-WITHOUT_GRADIENT = 96
-"""The same where no gradient is wanted."""
+WITHOUT_GRADIENT = 192
+"""The same where no gradient is wanted: whole frames, several where they fit, as each chain costs a look at the host."""
 CHAIN_SHARE = 0.08
 """Of a GPU's free memory, for the starts of all chains and what the backward pass of one stores, where that holds graphs."""
 MAX_CHAINS = 8
 
 
 class Plan(NamedTuple):
-    """Most substeps of a chain; kept: all states stay between the passes; graphs: if not, keep those of a chain's evaluations."""
+    """Most substeps of a chain; kept: all states stay between the passes; graphs: if not, keep those of a chain's evaluations;
+    several: a chain may go over several frames, without a gradient."""
 
     limit: int
     kept: bool
     graphs: bool = False
+    several: bool = False
 
 
 class Chains:
@@ -41,13 +45,15 @@ class Chains:
         self.chains: dict[tuple, Chain] = {}
         self._probes: dict[tuple, tuple[nn.Module, bool, int]] = {}
 
-    def plan(self, adapter: nn.Module, state: tuple[Tensor, ...], packed: Tensor, substeps: int, stride: int) -> Plan:
+    def plan(
+        self, adapter: nn.Module, learned: Learned, state: tuple[Tensor, ...], packed: Tensor, substeps: int, stride: int
+    ) -> Plan:
         """How to run a rollout of `substeps` substeps, by memory."""
         device = self.numerics.device
         if device.type != "cuda":
             return Plan(SEGMENT, kept=True)
-        if not wants_gradient((*state, packed, *adapter.parameters())):
-            return Plan(WITHOUT_GRADIENT, kept=False)
+        if not wants_gradient((*state, packed, *learned.weights)):
+            return Plan(WITHOUT_GRADIENT, kept=False, several=True)
         each = substep_bytes(self.numerics, len(packed))
         if room(device, substeps * each) > 0:
             return Plan(SEGMENT, kept=True)
@@ -57,20 +63,75 @@ class Chains:
         graphs = needed <= CHAIN_SHARE * free_memory(device)
         return Plan(limit if graphs else chain_length(substeps, start, each)[0], kept=False, graphs=graphs)
 
+    def frames(
+        self, solver: SegmentSolver, adapter: nn.Module, state: tuple[Tensor, ...], packed: Tensor, frames: int,
+        lengths: Sequence[int], collect: Callable | None,
+    ) -> Iterator[tuple[Tensor, ...]]:  # fmt: skip
+        """The states after each of `frames` frames, each of segments of `lengths` substeps. collect: as `Simulator.rollout`.
+
+        Where a chain goes over several frames, they arrive together; if it fails, what can be had one by one still does. Errors:
+        SimulationDiverged."""
+        learned, substeps, done = learned_of(adapter), sum(lengths), 0
+        plan = self.plan(adapter, learned, state, packed, frames * substeps, max(lengths))
+        most = plan.limit // substeps if plan.several else 1
+
+        def advanced(group: tuple[int, ...], first: int, marks: tuple[int, ...] = ()) -> list[tuple[Tensor, ...]]:
+            chain = self.chain(adapter, learned, group, state, packed, collect is not None, plan.graphs, marks)
+            states, statistics = advance_chain(chain, solver, learned, state, packed, first, plan.kept)
+            for each in statistics:
+                collect(each)
+            return states
+
+        while done < frames:
+            count, first = self._together(solver, state, min(most, frames - done), substeps), done * substeps
+            if count > 1:
+                try:
+                    states = advanced(tuple(lengths) * count, first, tuple(len(lengths) * k for k in range(1, count)))
+                except (LeftWindow, SimulationDiverged) as error:
+                    most = count // 2 if isinstance(error, LeftWindow) else 1
+                    continue
+                yield from states
+                state = states[-1]
+            else:
+                for group in grouped(lengths, plan.limit):
+                    state = advanced(group, first)[-1]
+                    first += sum(group)
+                yield state
+            done += count
+
+    def _together(self, solver: SegmentSolver, state: tuple[Tensor, ...], count: int, substeps: int) -> int:
+        """How many frames, `count` at most, the next chain goes over: as many as keep its window not much larger than one frame's,
+        and as there is room for the states of."""
+        bounds, size = solver.bounds(state), sum(t.nbytes for t in state)
+        if count <= 1 or not all(math.isfinite(b) for b in bounds):
+            return 1
+
+        def nodes(count: int) -> int:
+            total = count * substeps
+            reach = fallen(bounds, self.numerics, total)
+            return math.prod(window_of(reach, self.numerics.dx, 2 * total * self.numerics.dt, MARGIN)[1])
+
+        # a state is in the graph and in the answer
+        while count > 1 and (nodes(count) > min(nodes(1) + SMALL, MAX_NODES) or not room(self.numerics.device, 2 * count * size)):
+            count //= 2
+        return count
+
     def chain(
-        self, adapter: nn.Module, lengths: tuple[int, ...], state: tuple[Tensor, ...], packed: Tensor, collects: bool,
-        graphs: bool = False,
+        self, adapter: nn.Module, learned: Learned, lengths: tuple[int, ...], state: tuple[Tensor, ...], packed: Tensor,
+        collects: bool, graphs: bool = False, marks: tuple[int, ...] = (),
     ) -> Chain:  # fmt: skip
-        learned = tuple(p.requires_grad for p in adapter.parameters())
-        key = (id(adapter), len(packed), lengths, collects, graphs, learned)  # the chain holds the adapter: its id stays its own
-        if key not in self.chains:
-            if len(self.chains) >= MAX_CHAINS:
-                self.chains.clear()
-            self.chains[key] = Chain(
-                self.numerics, adapter, self.ask, len(packed), lengths, collects=collects, graphs=graphs,
+        # the chain holds the adapter: its id stays its own
+        key = (id(adapter), len(packed), lengths, marks, collects, graphs, learned.names)
+        chain = self.chains.pop(key, None)
+        if chain is None:
+            while len(self.chains) >= MAX_CHAINS:
+                self.chains.pop(next(iter(self.chains)))
+            chain = Chain(
+                self.numerics, adapter, self.ask, len(packed), lengths, marks=marks, collects=collects, graphs=graphs,
                 plastic_adapted=self._probe(adapter, state, packed)[1],
             )  # fmt: skip
-        return self.chains[key]
+        self.chains[key] = chain  # last: the first is the one that was not used for longest
+        return chain
 
     def _probe(self, adapter: nn.Module, state: tuple[Tensor, ...], packed: Tensor) -> tuple[nn.Module, bool, int]:
         """(the adapter, whether it corrects the yield function, bytes that an evaluation's graph holds), from one evaluation."""

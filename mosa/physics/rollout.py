@@ -18,8 +18,8 @@ from torch import Tensor, nn
 from mosa.errors import ConfigError
 from mosa.physics.adaptive import StepChooser, StepControl, check_counts
 from mosa.physics.boundary import Plane, ground_plane, pack_planes
-from mosa.physics.chain import ANSWER, advance_chain
-from mosa.physics.chains import SEGMENT, Chains, grouped
+from mosa.physics.chain import ANSWER
+from mosa.physics.chains import SEGMENT, Chains
 from mosa.physics.collider_motion import Motion, Trajectory, sample_frame, sample_poses
 from mosa.physics.colliders import Collider, pack_colliders, reach
 from mosa.physics.laws import SLOTS, law_named
@@ -241,7 +241,8 @@ class Simulator:
         chained = self.chained and isinstance(adapter, nn.Module) and not variable and not self.colliders
         current = (state.x, state.v, C, F, F_tot)
         if chained:
-            plan = self._chains.plan(adapter, current, packed, (frames - 1) * self.substeps, stride)
+            lengths = _segments(self.substeps, stride)
+            states = self._chains.frames(solver, adapter, current, packed, frames - 1, lengths, collect)
         poses = () if variable else self._poses(motions, frames, start_time)
         reactions = []
         wanted = wants_gradient((*current, *held.values(), *poses))
@@ -261,13 +262,7 @@ class Simulator:
                 steps, along = None, tuple(part[first : first + count] for part in poses)
                 lengths = _segments(count, None if adapter is None else stride, most_alone)
             if chained:
-                forces = None
-                for group in grouped(lengths, plan.limit):
-                    chain = self._chains.chain(adapter, group, current, packed, collect is not None, plan.graphs)
-                    current, statistics = advance_chain(chain, solver, current, packed, first, plan.kept)
-                    first += sum(group)
-                    for each in statistics:
-                        collect(each)
+                current, forces = next(states), None
             else:
                 current, forces = self._frame(solver, adapter, packed, current, held, lengths, first, along, steps, collect)
             lag = dt

@@ -15,6 +15,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from mosa.physics.capturing import uninterrupted
 from mosa.physics.collider_workspace import ColliderBuffers
 from mosa.physics.colliders import PackedColliders
 from mosa.physics.laws import SLOTS, Law
@@ -233,9 +234,17 @@ class Workspace:
 
     def final(self) -> tuple[Tensor, ...]:
         """Copies of (x, v, C_affine, F, F_tot) after the segment; F_tot is F itself where the law does not yield."""
-        last = self.substeps % len(self.x)
-        found = copies([part[last] for part in (self.x, self.v, self.C, self.F, *((self.A,) if self.plastic else ()))])
-        return tuple(found) if self.plastic else (*found, found[3])
+        return self.whole(self.state(self.substeps))
+
+    def state(self, step: int) -> list[Tensor]:
+        """Copies of (x, v, C_affine, F), where the law yields of F_tot too, after `step` substeps: the last ones, or any of those
+        whose states are kept."""
+        slot = step % len(self.x)
+        return copies([part[slot] for part in (self.x, self.v, self.C, self.F, *((self.A,) if self.plastic else ()))])
+
+    def whole(self, parts: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """(x, v, C_affine, F, F_tot) from `state`."""
+        return tuple(parts) if self.plastic else (*parts, parts[3])
 
     def advance(self) -> None:
         """All substeps of the segment; events are left in `flags` for the caller to read."""
@@ -255,7 +264,7 @@ class Workspace:
             self._graphs.clear()
         if graph == "loaded":
             # on Warp's own stream: torch's default one cannot be captured
-            with wp.ScopedCapture(device=self.origin_wp.device, force_module_load=False) as capture:
+            with uninterrupted(), wp.ScopedCapture(device=self.origin_wp.device, force_module_load=False) as capture:
                 body()
             graph = self._graphs[key] = capture.graph
         if graph is None:

@@ -1,13 +1,19 @@
 """A chain of segments against the same segments one by one: states, gradients and statistics; captured graphs on CUDA."""
 
+import gc
+import weakref
 from dataclasses import replace
 
 import pytest
 import torch
 from torch import nn
+from torch.func import functional_call
 
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.modules.adapter import StressAdapter, pool
+from mosa.physics import chain as chain_module
+from mosa.physics import chains as chains_module
+from mosa.physics.capturing import uninterrupted
 from mosa.physics.chain import ATTEMPTS
 from mosa.physics.chains import Plan, chain_length, grouped
 from mosa.physics.rollout import SEGMENT, AdapterOperator, Simulator
@@ -168,6 +174,109 @@ def test_two_rollouts_before_their_backward_passes(device, make_block):
         assert_same(gradients, found[0], 1e-9)
 
 
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("law, plastic", [("corotated", False), ("von_mises", True)])
+@pytest.mark.parametrize("pull, foreseen", [(9.8, True), (3000.0, False)])
+def test_frames_in_one_chain_are_the_frames_one_by_one(device, law, plastic, pull, foreseen, make_block, monkeypatch):
+    """Without a gradient a chain goes over several frames. A pull that is not foreseen takes the body out of their window."""
+    if not foreseen:
+        for module in (chain_module, chains_module):
+            monkeypatch.setattr(module, "fallen", lambda bounds, *_: bounds)
+    adapter, state = adapter_of(device, torch.float64, plastic), make_block(n=5, velocity=(0.3, -1.0, 0.2))
+    state = ParticleState(*(getattr(state, name).to(device) for name in ("x", "v", "C_affine", "F", "F_tot")))
+    volume = torch.full((len(state.x),), 8e-6, dtype=torch.float64, device=device)
+    parameters = {"mu": 8e3, "lam": 1e4, **({"yield_stress": 300.0} if law == "von_mises" else {})}
+    found = {}
+    for chained in (False, True):
+        sim = Simulator(law, dx=0.04, substeps=11, frame_dt=4.4e-3, gravity=(0.0, -pull, 0.0), dtype=torch.float64, device=device,
+                        chained=chained)  # fmt: skip
+        sim._chains.plan = lambda *_: Plan(40, kept=False, several=True)
+        for _ in range(3):  # on CUDA: eager, captured, replayed
+            collected, frames = [], []
+            with torch.no_grad():
+                rollout = sim.rollout(state, parameters, volume, 1000.0, 6, adapter=adapter, stride=2, collect=collected.append,
+                                      progress=frames.append)  # fmt: skip
+            assert frames == [1, 2, 3, 4, 5] and len(collected) == 30 + plastic
+            values = [rollout.x, rollout.v, rollout.F, rollout.F_tot, rollout.final.C_affine, rollout.final.F]
+            values += [part for each in collected for part in each]
+            found.setdefault(chained, []).append([t.cpu() for t in values])
+    for values in found[True]:
+        assert_same(values, found[False][0], 1e-9 if device == "cuda" else 1e-11)
+    marks = [chain.marks for chain in sim._chains.chains.values()]
+    assert {6, 12} in marks and (({6} in marks) == foreseen)
+
+
+def test_a_body_at_rest_falls_several_frames_in_one_chain(make_block):
+    """Its window foresees what gravity does."""
+    adapter, x = adapter_of("cpu", torch.float64, False), make_block(n=4, jitter=0.0).x
+    still = torch.eye(3, dtype=torch.float64).expand(len(x), 3, 3).contiguous()
+    state = ParticleState(x, torch.zeros_like(x), torch.zeros_like(still), still, still)
+    sim = Simulator("corotated", dx=0.02, substeps=40, frame_dt=1 / 24, dtype=torch.float64, chained=True)
+    sim._chains.plan = lambda *_: Plan(160, kept=False, several=True)
+    volume, calls = torch.full((len(state.x),), 8e-6, dtype=torch.float64), []
+    chain_of = sim._chains.chain
+    sim._chains.chain = lambda *args: calls.append(args[-1]) or chain_of(*args)
+    with torch.no_grad():
+        x = sim.rollout(state, {"mu": 8e2, "lam": 1e3}, volume, 1000.0, 5, adapter=adapter, stride=8).x
+    assert calls[0] and len(calls) < 4 and x[-1].mean(0)[1] < x[0].mean(0)[1] - 0.12
+
+
+def test_an_error_after_some_frames_comes_where_it_would_one_by_one(make_block):
+    adapter, state = adapter_of("cpu", torch.float64, False), make_block(n=4, velocity=(0.0, -2.0, 0.0))
+    low, volume = state.x.min(0).values, torch.full((len(state.x),), 8e-6, dtype=torch.float64)
+    box = torch.stack([low - torch.tensor([1.0, 0.03, 1.0], dtype=torch.float64), low + 2])
+    seen = []
+    for chained in (False, True):
+        sim = Simulator("corotated", dx=0.04, substeps=10, frame_dt=4e-3, dtype=torch.float64, box=box, chained=chained)
+        sim._chains.plan = lambda *_: Plan(60, kept=False, several=True)
+        frames, collected = [], []
+        with torch.no_grad(), pytest.raises(SimulationDiverged, match="outside the box") as error:
+            sim.rollout(state, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 9, adapter=adapter, stride=5, progress=frames.append,
+                        collect=collected.append)  # fmt: skip
+        seen.append((str(error.value), frames))
+    assert seen[0] == seen[1] and frames == [1, 2, 3] and len(collected) == 6
+
+
+class _Holder(nn.Module):
+    """A module whose weights `functional_call` can replace around a rollout."""
+
+    def __init__(self, adapter: nn.Module, rollout) -> None:
+        super().__init__()
+        self.adapter, self.rollout = adapter, rollout
+
+    def forward(self):
+        return self.rollout(self.adapter)
+
+
+def test_gradients_are_of_the_weights_of_the_forward_pass(make_block):
+    """Also where they are no parameters of the adapter, or no longer learned, when the backward pass comes."""
+    state = make_block(n=4, velocity=(0.3, -1.0, 0.2))
+    volume, found = torch.full((len(state.x),), 8e-6, dtype=torch.float64), []
+    for chained in (False, True):
+        sim = Simulator("corotated", dx=0.04, substeps=6, frame_dt=2.4e-3, dtype=torch.float64, chained=chained)
+        adapter, mu = adapter_of("cpu", torch.float64, False), torch.tensor(8e3, dtype=torch.float64, requires_grad=True)
+
+        def rolled_with(adapter, sim=sim, mu=mu):
+            x = sim.rollout(state, {"mu": mu, "lam": 1e4}, volume, 1000.0, 3, adapter=adapter, stride=2).x
+            return 1e4 * x.square().sum()
+
+        replaced = {f"adapter.{name}": 0.8 * p.detach() for name, p in adapter.named_parameters()}
+        leaves = [p.requires_grad_() for p in replaced.values()]
+        gradients = list(torch.autograd.grad(functional_call(_Holder(adapter, rolled_with), replaced, ()), leaves))
+        for learned_before, learned_after in ((True, False), (False, True)):
+            loss = rolled_with(adapter.requires_grad_(learned_before))
+            adapter.requires_grad_(learned_after)
+            gradients += torch.autograd.grad(loss, [mu])
+        loss = rolled_with(adapter.requires_grad_(True))
+        with torch.no_grad():
+            next(adapter.parameters()).mul_(0.5)
+        with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+            loss.backward()
+        found.append(gradients)
+    assert max(float(g.abs().max()) for g in found[0]) > 0.1
+    assert_same(found[1], found[0], 1e-10)
+
+
 @pytest.mark.parametrize("source", ["tape", "states", "graphs"])
 def test_a_frozen_adapter_passes_gradients_on(source, make_block):
     adapter = adapter_of("cpu", torch.float64, False).requires_grad_(False)
@@ -260,6 +369,53 @@ def test_segments_are_grouped_evenly_and_in_order():
     assert grouped([1] * 40, 32) == [(1,) * 20, (1,) * 20]
     assert grouped([5, 5, 1], 32) == [(5, 5, 1)]
     assert grouped([8, 8, 3], 4) == [(8,), (8,), (3,)]
+
+
+def test_no_garbage_is_collected_while_a_graph_is_captured():
+    class Freed:
+        pass
+
+    for was in (True, False):
+        gc.enable() if was else gc.disable()
+        try:
+            with uninterrupted():
+                one = Freed()
+                one.itself, ends = one, []
+                weakref.finalize(one, ends.append, True)
+                del one
+                made = [[] for _ in range(200_000)]  # many times what starts a collection
+                assert not ends and len(made) == 200_000
+            assert gc.isenabled() == was
+        finally:
+            gc.enable()
+        gc.collect()
+        assert ends
+
+
+@pytest.mark.gpu
+@CUDA
+@pytest.mark.parametrize("precision", ["accurate", "tf32", "half"])
+def test_replayed_kernels_find_the_weights_of_today(precision, make_block):
+    """What the kernels make of the weights, once for all evaluations of a pass, is made again in every replay."""
+    adapter = StressAdapter(fused=True, precision=precision)
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for p in adapter.parameters():
+            p.copy_(0.3 * torch.randn(p.shape, generator=generator))
+    adapter.switch_on(E, NU)
+    make = ("corotated", "cuda", torch.float32, make_block(n=5, velocity=(0.3, -1.0, 0.2)), adapter.cuda())
+    chained, alone = rolled(True, *make, stride=1, penalised=False), rolled(False, *make, stride=1, penalised=False)
+    changes = []
+    for _ in range(4):
+        before = alone()[0]
+        with torch.no_grad():
+            for p in adapter.parameters():
+                p.mul_(0.8)
+        expected = alone()[0]
+        changes.append(float((before[0] - expected[0]).abs().max()))
+        assert_same(chained()[0], expected, 2e-3)
+        assert float((chained()[0][0] - expected[0]).abs().max()) < 0.1 * changes[-1]
+    assert min(changes) > 1e-5
 
 
 @pytest.mark.gpu
