@@ -117,7 +117,8 @@ class StressAdapter(Adapter):
     major_symmetry: a projection after which a constant operator has an energy; state_dependence: full | constant;
     recompute: evaluate the networks again in the backward pass instead of storing 4 kB per particle and evaluation;
     fused: auto | true | false: Triton kernels on CUDA, which always recompute; auto: where they can take these options;
-    precision: of their products, accurate (as float32) | tf32 (relative errors to 2e-3, of gradients to 1e-2; faster);
+    precision: of their products, accurate (as float32) | tf32 (relative errors to 2e-3, of gradients to 1e-2; faster) | half
+    (forward in float16, backward in tf32: the same errors, fastest);
     no_C, no_pre, no_post, no_prior_stress: ablations. Errors: ConfigError naming the key for values out of range.
     """
 

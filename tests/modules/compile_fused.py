@@ -18,11 +18,11 @@ FORWARD = ("phi_forward", "psi1_forward", "psi2_forward", "theta_forward")
 BACKWARD = ("phi_backward", "psi1_backward", "psi2_backward", "theta_backward")
 BETWEEN = ("assemble", "assemble_adjoint", "normals", "normals_adjoint", "finish")
 FLAGS = {"BOUNDED": True, "EXTRA": False, "RESTED": True, "OPERATOR": True}
-INTEGERS, FLOATS = ("N", "M", "start", "size"), ("scale", "bound", "alpha")
+INTEGERS, FLOATS = ("N", "M", "known", "start", "size"), ("scale", "bound", "alpha")
 
 
 def compiled(module: str, name: str, options: dict) -> dict:
-    function = getattr(importlib.import_module(f"mosa.modules.fused.{module}_kernels"), name)
+    function = getattr(importlib.import_module(f"mosa.modules.fused.{module}"), name)
     values = FLAGS | options
     signature, constants, divisible = {}, {}, {}
     for place, argument in enumerate(inspect.signature(function.fn).parameters):
@@ -31,8 +31,8 @@ def compiled(module: str, name: str, options: dict) -> dict:
         elif argument in INTEGERS or argument in FLOATS:
             signature[argument] = "i32" if argument in INTEGERS else "fp32"
         else:
-            signature[argument] = "*fp32"
-        if argument == "M" or signature[argument] == "*fp32":
+            signature[argument] = "*fp16" if argument == "packed" else "*fp32"
+        if argument == "M" or signature[argument].startswith("*"):
             divisible[(place,)] = [["tt.divisibility", 16]]
     launch = {key: options[key] for key in ("num_warps", "num_stages", "maxnreg") if key in options}
     source = ASTSource(fn=function, signature=signature, constexprs=constants, attrs=divisible)
@@ -42,9 +42,13 @@ def compiled(module: str, name: str, options: dict) -> dict:
 
 def main(precision: str, hidden: int) -> None:
     launch = _Launch(Settings(0.1, 0.1, 10.0, True, precision), 1000, hidden, torch.device("cpu"))
-    found = {name: compiled("network", name, launch.forward()[1]) for name in FORWARD}
-    found |= {name: compiled("adjoint", name, launch.backward(True)[1]) for name in BACKWARD}
-    found |= {name: compiled("assembly", name, {"BLOCK": LANES, "num_warps": 4}) for name in BETWEEN}
+    found = {name: compiled("network_kernels", name, launch.forward()[1]) for name in FORWARD}
+    found |= {name: compiled("adjoint_kernels", name, launch.backward(True)[1]) for name in BACKWARD}
+    found |= {name: compiled("assembly_kernels", name, {"BLOCK": LANES, "num_warps": 4}) for name in BETWEEN}
+    if launch.half:
+        for stored, operator in ((False, True), (True, True), (True, False)):
+            options = launch.forward_half()[1] | {"STORE": stored, "OPERATOR": operator}
+            found[f"half {stored} {operator} forward"] = compiled("half_kernel", "operator_half", options)
     print(json.dumps(found))
 
 

@@ -7,6 +7,8 @@ on pre are made in one pass. `finish` turns b (6, M), row N the state at rest, i
 h, rest (6,): its sum over the particles.
 """
 
+import os
+
 import triton
 import triton.language as tl
 
@@ -78,14 +80,15 @@ def on_plane(v, r, M, plane: tl.constexpr, c1: tl.constexpr, c2: tl.constexpr, C
 
 
 @triton.jit
-def store_moved(out, r, M, K, x, y, z):
-    """(I + G) v (6, M) from (I + C) of v on the three planes; K: entries of C_xyz."""
-    tl.store(out + r, x[0] + K[0] * x[0] + K[1] * y[0] + K[2] * z[0])
-    tl.store(out + M + r, y[0] + K[3] * x[0] + K[4] * y[0] + K[5] * z[0])
-    tl.store(out + 2 * M + r, z[0] + K[6] * x[0] + K[7] * y[0] + K[8] * z[0])
-    tl.store(out + 3 * M + r, 0.5 * (y[1] + z[2]))
-    tl.store(out + 4 * M + r, 0.5 * (z[1] + x[2]))
-    tl.store(out + 5 * M + r, 0.5 * (x[1] + y[2]))
+def store_moved(v, out, r, M, X, Y, Z, K, mine):
+    """Rows r of (I + G) v (6, M) where `mine`. X, Y, Z: corrections of the planes, K: entries of C_xyz."""
+    x, y, z = on_plane(v, r, M, 0, 5, 4, X), on_plane(v, r, M, 1, 3, 5, Y), on_plane(v, r, M, 2, 4, 3, Z)
+    tl.store(out + r, x[0] + K[0] * x[0] + K[1] * y[0] + K[2] * z[0], mask=mine)
+    tl.store(out + M + r, y[0] + K[3] * x[0] + K[4] * y[0] + K[5] * z[0], mask=mine)
+    tl.store(out + 2 * M + r, z[0] + K[6] * x[0] + K[7] * y[0] + K[8] * z[0], mask=mine)
+    tl.store(out + 3 * M + r, 0.5 * (y[1] + z[2]), mask=mine)
+    tl.store(out + 4 * M + r, 0.5 * (z[1] + x[2]), mask=mine)
+    tl.store(out + 5 * M + r, 0.5 * (x[1] + y[2]), mask=mine)
 
 
 @triton.jit
@@ -106,39 +109,65 @@ def shear_columns(C, D, p: tl.constexpr, k0, k1, k2, m0, m1, m2):
     return k0 * c + m0 * d + own0, k1 * c + m1 * d + own1, k2 * c + m2 * d + own2
 
 
+if os.environ.get("TRITON_INTERPRET") == "1":
+
+    @triton.jit
+    def store_four(G, r, first: tl.constexpr, a, b, c, d, mine):
+        p = G + r * 36 + first
+        tl.store(p, a, mask=mine)
+        tl.store(p + 1, b, mask=mine)
+        tl.store(p + 2, c, mask=mine)
+        tl.store(p + 3, d, mask=mine)
+
+else:
+
+    @triton.jit
+    def store_four(G, r, first: tl.constexpr, a, b, c, d, mine):
+        """Entries first to first + 3 of rows r of G (N, 36), where `mine`: in one access, of which each alone would be one."""
+        tl.inline_asm_elementwise(
+            "{ .reg .pred p; setp.ne.s32 p, $6, 0; @p st.global.v4.f32 [$1], {$2, $3, $4, $5}; mov.b32 $0, 0; }",
+            "=r,l,f,f,f,f,r",
+            [(G + r * 36 + first).to(tl.uint64), a, b, c, d, mine.to(tl.int32)],
+            dtype=tl.int32, is_pure=False, pack=1,
+        )  # fmt: skip
+
+
 @triton.jit
-def store_four(G, r, N, first: tl.constexpr, a, b, c, d, BLOCK: tl.constexpr):
-    """Entries first to first + 3 of G (N, 36), in one access: one by one, each would be a transaction of its own."""
-    value = tl.reshape(tl.join(tl.join(a, c), tl.join(b, d)), (BLOCK, 4))
-    tl.store(G + r[:, None] * 36 + first + tl.arange(0, 4)[None, :], value, mask=r[:, None] < N)
+def store_operator(G, r, X, Y, Z, K, mine, others):
+    """Rows r of G (N, 6, 6): of the nine groups of four entries the odd ones where `mine`, the rest where `others`."""
+    a00, a10, a20 = normal_columns(X, 0, K[0], K[3], K[6])
+    a01, a11, a21 = normal_columns(Y, 1, K[1], K[4], K[7])
+    a02, a12, a22 = normal_columns(Z, 2, K[2], K[5], K[8])
+    a05, a15, a25 = shear_columns(X, Y, 0, K[0], K[3], K[6], K[1], K[4], K[7])
+    a03, a13, a23 = shear_columns(Y, Z, 1, K[1], K[4], K[7], K[2], K[5], K[8])
+    a04, a14, a24 = shear_columns(Z, X, 2, K[2], K[5], K[8], K[0], K[3], K[6])
+    none = tl.zeros_like(a00)  # no plane holds both
+    store_four(G, r, 0, a00, a01, a02, a03, mine)
+    store_four(G, r, 4, a04, a05, a10, a11, others)
+    store_four(G, r, 8, a12, a13, a14, a15, mine)
+    store_four(G, r, 12, a20, a21, a22, a23, others)
+    store_four(G, r, 16, a24, a25, none, 0.5 * Y[3], mine)
+    store_four(G, r, 20, 0.5 * Z[6], 0.5 * (Y[4] + Z[8]), 0.5 * Z[7], 0.5 * Y[5], others)
+    store_four(G, r, 24, 0.5 * X[6], none, 0.5 * Z[3], 0.5 * Z[5], mine)
+    store_four(G, r, 28, 0.5 * (Z[4] + X[8]), 0.5 * X[7], 0.5 * X[3], 0.5 * Y[6], others)
+    store_four(G, r, 32, none, 0.5 * Y[7], 0.5 * X[5], 0.5 * (X[4] + Y[8]), mine)
+
+
+@triton.jit
+def corrections(t, r, M):
+    """Entries of C_x, C_y, C_z and C_xyz."""
+    return correction(t, r, M, 0), correction(t, r, M, 12), correction(t, r, M, 24), correction(t, r, M, 36)
 
 
 @triton.jit(do_not_specialize=["N"])
 def assemble(t, s1, pre, G, s2, moved, N, M, OPERATOR: tl.constexpr, BLOCK: tl.constexpr):
-    """s2 = (I + G) s1 and moved = (I + G) pre, each (6, M); OPERATOR: also G (N, 6, 6)."""
+    """s2 = (I + G) s1 (6, M); OPERATOR: also moved = (I + G) pre (6, M), and G (N, 6, 6)."""
     r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    X, Y, Z, K = correction(t, r, M, 0), correction(t, r, M, 12), correction(t, r, M, 24), correction(t, r, M, 36)
-    store_moved(s2, r, M, K, on_plane(s1, r, M, 0, 5, 4, X), on_plane(s1, r, M, 1, 3, 5, Y), on_plane(s1, r, M, 2, 4, 3, Z))
+    X, Y, Z, K = corrections(t, r, M)
+    store_moved(s1, s2, r, M, X, Y, Z, K, r < M)
     if OPERATOR:
-        store_moved(
-            moved, r, M, K, on_plane(pre, r, M, 0, 5, 4, X), on_plane(pre, r, M, 1, 3, 5, Y), on_plane(pre, r, M, 2, 4, 3, Z)
-        )
-        a00, a10, a20 = normal_columns(X, 0, K[0], K[3], K[6])
-        a01, a11, a21 = normal_columns(Y, 1, K[1], K[4], K[7])
-        a02, a12, a22 = normal_columns(Z, 2, K[2], K[5], K[8])
-        a05, a15, a25 = shear_columns(X, Y, 0, K[0], K[3], K[6], K[1], K[4], K[7])
-        a03, a13, a23 = shear_columns(Y, Z, 1, K[1], K[4], K[7], K[2], K[5], K[8])
-        a04, a14, a24 = shear_columns(Z, X, 2, K[2], K[5], K[8], K[0], K[3], K[6])
-        none = tl.zeros_like(a00)  # no plane holds both
-        store_four(G, r, N, 0, a00, a01, a02, a03, BLOCK)
-        store_four(G, r, N, 4, a04, a05, a10, a11, BLOCK)
-        store_four(G, r, N, 8, a12, a13, a14, a15, BLOCK)
-        store_four(G, r, N, 12, a20, a21, a22, a23, BLOCK)
-        store_four(G, r, N, 16, a24, a25, none, 0.5 * Y[3], BLOCK)
-        store_four(G, r, N, 20, 0.5 * Z[6], 0.5 * (Y[4] + Z[8]), 0.5 * Z[7], 0.5 * Y[5], BLOCK)
-        store_four(G, r, N, 24, 0.5 * X[6], none, 0.5 * Z[3], 0.5 * Z[5], BLOCK)
-        store_four(G, r, N, 28, 0.5 * (Z[4] + X[8]), 0.5 * X[7], 0.5 * X[3], 0.5 * Y[6], BLOCK)
-        store_four(G, r, N, 32, none, 0.5 * Y[7], 0.5 * X[5], 0.5 * (X[4] + Y[8]), BLOCK)
+        store_moved(pre, moved, r, M, X, Y, Z, K, r < M)
+        store_operator(G, r, X, Y, Z, K, r < N, r < N)
 
 
 @triton.jit
@@ -157,12 +186,16 @@ def store_normal(t, s1, out, r, M, scale, plane: tl.constexpr, c1: tl.constexpr,
 
 
 @triton.jit
-def normals(t, s1, out, M, scale, BLOCK: tl.constexpr):
-    """The last three inputs of Psi2 (3, M): scaled normal tractions on the corrected planes."""
-    r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+def store_normals(t, s1, out, r, M, scale):
+    """Rows r of the last three inputs of Psi2 (3, M): scaled normal tractions on the corrected planes."""
     store_normal(t, s1, out, r, M, scale, 0, 5, 4)
     store_normal(t, s1, out, r, M, scale, 1, 3, 5)
     store_normal(t, s1, out, r, M, scale, 2, 4, 3)
+
+
+@triton.jit
+def normals(t, s1, out, M, scale, BLOCK: tl.constexpr):
+    store_normals(t, s1, out, tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), M, scale)
 
 
 @triton.jit

@@ -1,7 +1,7 @@
 """The fused networks as one torch operation: what `ProgressiveOperator` computes, with nothing stored but inputs and weights.
 
-Sources of the kernels: network_kernels.py (forward), assembly_kernels.py, adjoint_kernels.py, sum_kernels.py. Their torch twin is
-mosa/modules/progressive.py.
+Sources of the kernels: network_kernels.py and half_kernel.py (forward), assembly_kernels.py, adjoint_kernels.py, sum_kernels.py.
+Their torch twin is mosa/modules/progressive.py.
 """
 
 from __future__ import annotations
@@ -15,9 +15,11 @@ from torch.autograd.function import once_differentiable
 
 from mosa.modules.fused.adjoint_kernels import phi_backward, psi1_backward, psi2_backward, theta_backward
 from mosa.modules.fused.assembly_kernels import assemble, assemble_adjoint, finish, normals, normals_adjoint
+from mosa.modules.fused.half_kernel import operator_half
+from mosa.modules.fused.half_weights import packed
 from mosa.modules.fused.network_kernels import phi_forward, psi1_forward, psi2_forward, theta_forward
 from mosa.modules.fused.sum_kernels import weight_gradients
-from mosa.physics.activations import backward_at_hand
+from mosa.physics.activations import backward_at_hand, from_weights
 
 LANES = 128
 """Particles a program of the assembly; rows are padded to a multiple, so that arrays stored by column need no mask."""
@@ -26,10 +28,14 @@ BLOCK = 64
 INTERPRETED_PROGRAMS = 2
 REGISTERS, PROGRAMS = 168, 3
 """Of a thread in the forward kernels, and programs a multiprocessor, which that many registers leave room for."""
+HALF_PROGRAMS = 2
+"""The same of the kernel in float16, by its shared memory."""
+HALF_SHARED = 113 * 1024
+"""Bytes that it takes of it at most, with a hidden width of 64."""
 
 
 class Settings(NamedTuple):
-    """alpha, l_max, scale: as `ProgressiveOperator`; rest_free: as `StressAdapter`; precision: of products, tf32x3 | tf32."""
+    """alpha, l_max, scale: as `ProgressiveOperator`; rest_free: as `StressAdapter`; precision: tf32x3 | tf32 | half."""
 
     alpha: float
     l_max: float | None
@@ -56,6 +62,10 @@ def hopper(device: torch.device) -> bool:
     return torch.cuda.get_device_capability(device)[0] == 9
 
 
+def _shared(device: torch.device) -> int:
+    return torch.cuda.get_device_properties(device).shared_memory_per_block_optin
+
+
 class _Launch:
     """How the kernels of networks of one width are launched for one number of particles."""
 
@@ -64,8 +74,10 @@ class _Launch:
         self.rows = -(-(n + 1) // LANES) * LANES  # the particles, the state at rest, and as many more of these as fill the last one
         self.lanes = (self.rows // LANES,)
         # whether all weights of a network fit beside its activations in a multiprocessor's shared memory (200 of Hopper's 227 kB)
-        self.small = settings.precision == "tf32" and hidden <= 64 and (device.type != "cuda" or hopper(device))
-        self.size = {"H": hidden, "P": settings.precision}
+        precision = "tf32" if settings.precision == "half" else settings.precision  # half is of the forward kernel alone
+        self.small = precision == "tf32" and hidden <= 64 and (device.type != "cuda" or hopper(device))
+        self.half = settings.precision == "half" and hidden <= 64 and (device.type != "cuda" or _shared(device) >= HALF_SHARED)
+        self.size = {"H": hidden, "P": precision}
         self.warps = 8 if hidden > 64 else 4  # a warp group for 64 rows of 64 columns
 
     def programs(self, block: int, per_multiprocessor: int) -> int:
@@ -79,6 +91,9 @@ class _Launch:
         tiles = self.programs(BLOCK, PROGRAMS) if self.small else self.rows // BLOCK
         options = {"KEEP": self.small, "BLOCK": BLOCK, "num_warps": self.warps, "num_stages": 1}
         return (tiles,), self.size | options | ({"maxnreg": REGISTERS} if self.hidden <= 64 else {})
+
+    def forward_half(self) -> tuple[tuple[int], dict]:
+        return (self.programs(BLOCK, HALF_PROGRAMS),), {"H": self.hidden, "BLOCK": BLOCK, "num_warps": 4, "num_stages": 1}
 
     def backward(self, wanted: bool) -> tuple[tuple[int], dict]:
         if not (self.small and wanted):
@@ -104,25 +119,81 @@ def _evaluate(launch: _Launch, w: Tensor, s: Tensor, unit: Tensor, settings: Set
     return b
 
 
+def _evaluate_all(
+    launch: _Launch, w: Tensor, s: Tensor, unit: Tensor, settings: Settings, weights: Sequence[Tensor], G: Tensor, h: Tensor
+) -> tuple[_Buffers, Tensor]:
+    """(buffers, post (6, M)); fills G (N, 6, 6) and h (N, 6)."""
+    n, m, bound = launch.n, launch.rows, settings.l_max or 0.0
+    b = _evaluate(launch, w, s, unit, settings, weights, G)
+    post, sums = torch.empty_like(b.pre), torch.empty_like(b.pre)
+    grid, size = launch.forward()
+    theta_forward[grid](
+        b.l2, w, b.s2, b.moved, *weights[20:], post, sums, n, m, settings.scale, bound, BOUNDED=settings.l_max is not None, **size
+    )
+    finish[launch.lanes](sums, w, s, unit, h, n, m, RESTED=settings.rest_free, BLOCK=LANES)
+    return b, post
+
+
+class _FromWeights(NamedTuple):
+    """packed: see half_weights.py; rest: (6,) b of the state at rest; known: False for zeros in place of it."""
+
+    packed: Tensor
+    rest: Tensor
+    known: bool
+
+
+def _from_weights(settings: Settings, weights: Sequence[Tensor], hidden: int, stored: bool) -> _FromWeights:
+    """For `_evaluate_half`. The rest is one more evaluation, of a particle in this state, by the same program."""
+
+    def make() -> _FromWeights:
+        zero = weights[0].new_zeros(1, 6)
+        made = _FromWeights(packed(weights), zero[0], False)
+        if not settings.rest_free:
+            return made
+        outputs = zero.new_empty(1, 6, 6), zero.new_empty(1, 6)
+        launch = _Launch(settings, 1, hidden, zero.device)
+        _evaluate_half(launch, zero, zero, zero.new_ones(1), settings, made, outputs, stored)
+        return made._replace(rest=outputs[1][0], known=True)
+
+    return from_weights(make, weights, settings, stored)
+
+
+def _evaluate_half(
+    launch: _Launch, w: Tensor, s: Tensor, unit: Tensor, settings: Settings, made: _FromWeights,
+    outputs: tuple[Tensor, Tensor] | None, stored: bool,
+) -> tuple[_Buffers, Tensor]:  # fmt: skip
+    """(buffers, post (6, M)) in float16. outputs: G (N, 6, 6) and h (N, 6) to be filled, None for steps 1 to 4 alone; stored: l1
+    and l2 too."""
+    m, hidden, operator = launch.rows, launch.hidden, outputs is not None
+    sizes = (6, 6, (hidden if stored else 0) + 3, 48, hidden + 12 if stored else 0, 6, 6 if operator else 0)
+    b = _Buffers(*(w.new_empty(k, m) for k in sizes))
+    post = w.new_empty(6 if operator else 0, m)
+    grid, size = launch.forward_half()
+    operator_half[grid](
+        w, s, unit, made.packed, made.rest, b.pre, b.s1, b.l1, b.l1[-3:], b.t, b.l2, b.s2, b.moved, post,
+        *(outputs or (b.t, b.t)), launch.n, m, int(made.known), settings.scale, settings.l_max or 0.0, settings.alpha,
+        BOUNDED=settings.l_max is not None, OPERATOR=operator, STORE=stored, **size,
+    )  # fmt: skip
+    return b, post
+
+
 class _FusedOperator(torch.autograd.Function):
     @staticmethod
     def forward(ctx, settings: Settings, unit: Tensor, w: Tensor, s: Tensor, *weights: Tensor):
         w, s = w.contiguous(), s.contiguous()
-        weights = tuple(weight.contiguous() for weight in weights)
+        given, weights = weights, tuple(weight.contiguous() for weight in weights)
         n = len(w)
         launch = _Launch(settings, n, weights[0].shape[0], w.device)
         G, h = w.new_empty(n, 6, 6), w.new_empty(n, 6)
+        stored, made = backward_at_hand(), None
         with torch.cuda.device_of(w):
-            buffers = _evaluate(launch, w, s, unit, settings, weights, G)
-            post, b = torch.empty_like(buffers.pre), torch.empty_like(buffers.pre)
-            grid, size = launch.forward()
-            theta_forward[grid](
-                buffers.l2, w, buffers.s2, buffers.moved, *weights[20:], post, b, n, launch.rows, settings.scale,
-                settings.l_max or 0.0, BOUNDED=settings.l_max is not None, **size,
-            )  # fmt: skip
-            finish[launch.lanes](b, w, s, unit, h, n, launch.rows, RESTED=settings.rest_free, BLOCK=LANES)
-        ctx.settings, ctx.launch = settings, launch
-        ctx.buffers = buffers if backward_at_hand() else None
+            if launch.half:
+                made = _from_weights(settings, given, launch.hidden, stored)
+                buffers, post = _evaluate_half(launch, w, s, unit, settings, made, (G, h), stored)
+            else:
+                buffers, post = _evaluate_all(launch, w, s, unit, settings, weights, G, h)
+        ctx.settings, ctx.launch, ctx.made = settings, launch, made
+        ctx.buffers = buffers if stored else None
         ctx.save_for_backward(unit, w, s, post, *weights)
         ctx.set_materialize_grads(False)
         return G, h, buffers.t.T[:n], buffers.pre.T[:n], post.T[:n]
@@ -141,21 +212,21 @@ class _FusedOperator(torch.autograd.Function):
             seeds[name] = w if seed is None else seed.contiguous()  # w: never read
         needs = ctx.needs_input_grad[4:]
         with torch.cuda.device_of(w):
-            gw, gs, gradients = _backward(
-                ctx.launch, unit, w, s, post, ctx.settings, weights, seeds, extra, any(needs), ctx.buffers
-            )  # fmt: skip
+            buffers, inputs = ctx.buffers, (ctx.launch, w, s, unit, ctx.settings)
+            if buffers is None:
+                buffers = _evaluate_half(*inputs, ctx.made, None, True)[0] if ctx.launch.half else _evaluate(*inputs, weights, None)
+            gw, gs, gradients = _backward(*inputs, weights, post, seeds, extra, any(needs), buffers)
         gradients = [g if need else None for g, need in zip(gradients, needs, strict=True)]
         return None, None, gw, gs, *gradients
 
 
 def _backward(
-    launch: _Launch, unit: Tensor, w: Tensor, s: Tensor, post: Tensor, settings: Settings, weights: Sequence[Tensor],
-    seeds: dict[str, Tensor], extra: bool, wanted: bool, buffers: _Buffers | None,
+    launch: _Launch, w: Tensor, s: Tensor, unit: Tensor, settings: Settings, weights: Sequence[Tensor], post: Tensor,
+    seeds: dict[str, Tensor], extra: bool, wanted: bool, b: _Buffers,
 ) -> tuple[Tensor, Tensor, Sequence[Tensor | None]]:  # fmt: skip
-    """Adjoints of w, s (N, 6) and, where wanted, of the weights. post: (6, M) of the forward pass; seeds: adjoints of the outputs;
-    extra: of the last three too; buffers: of the forward pass, None where they are to be computed again."""
+    """Adjoints of w, s (N, 6) and, where wanted, of the weights. post (6, M), b: of the forward pass; seeds: adjoints of the
+    outputs; extra: of the last three too."""
     n, m, hidden = launch.n, launch.rows, launch.hidden
-    b = _evaluate(launch, w, s, unit, settings, weights, None) if buffers is None else buffers
     grid, size = launch.backward(wanted)
     inside = size["SUMS"] == "inside"
     h1, h2, g1, g2 = (w.new_empty(hidden if wanted and not inside else 0, m) for _ in range(4))  # of one network after the other
@@ -174,7 +245,7 @@ def _backward(
         weight_gradients[(programs, jobs)](
             g1, inputs, g2, h1, outputs, h2, g4, x4, partial, first[layer], partial.shape[1], m, IN1=weights[layer].shape[1],
             OUT3=weights[layer + 4].shape[0], OUT4=len(g4) if more else 0, H=hidden, TILE=max(64, hidden), BLOCK=BLOCK // 2,
-            P=settings.precision, num_warps=launch.warps,
+            P=size["P"], num_warps=launch.warps,
         )  # fmt: skip
 
     outside = wanted and not inside
