@@ -1,8 +1,11 @@
-"""What a thread may not do while it captures a CUDA graph."""
+"""Capturing launches as a graph, which anything else that the thread does meanwhile may break."""
 
 import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+ATTEMPTS = 3
+"""Captures in a row that may fail before there are no more: a library that sets itself up when it is first captured spoils one."""
 
 
 @contextmanager

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from mosa.physics.activations import at_hand, same_weights
-from mosa.physics.capturing import uninterrupted
+from mosa.physics.capturing import ATTEMPTS, uninterrupted
 from mosa.physics.mpm import SegmentSolver, wants_gradient, warp_stream
 from mosa.physics.mpm_kernels import NO_EVENT
 from mosa.physics.window import grid_window
@@ -33,8 +33,6 @@ COARSE = 8
 """Node counts of a chain's window are multiples of this: each change of them costs a new capture."""
 MARGIN = 4
 """Nodes of a window beyond what the speeds at the start ask for."""
-ATTEMPTS = 3
-"""Captures that may fail before a chain gives up: libraries that set themselves up when they are first captured spoil one."""
 
 
 class _Evaluation(NamedTuple):
