@@ -1,8 +1,9 @@
 """Capturing launches as a graph, which anything else that the thread does meanwhile may break."""
 
 import gc
-from collections.abc import Iterator
-from contextlib import contextmanager
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 
 ATTEMPTS = 3
 """Captures in a row that may fail before there are no more: a library that sets itself up when it is first captured spoils one."""
@@ -18,3 +19,25 @@ def uninterrupted() -> Iterator[None]:
     finally:
         if enabled:
             gc.enable()
+
+
+class Captures:
+    """Tries captures until too many failed in a row. failing: what the warning then says, before the last error."""
+
+    def __init__(self, failing: str, attempts: int = ATTEMPTS) -> None:
+        self.failing, self.attempts = failing, attempts
+
+    def succeeds(self, capture: AbstractContextManager, body: Callable[[], None]) -> bool:
+        """Whether the launches of `body` were captured; a failure says nothing of the launches themselves."""
+        if not self.attempts:
+            return False
+        try:
+            with uninterrupted(), capture:
+                body()
+        except RuntimeError as error:
+            self.attempts -= 1
+            if not self.attempts:
+                warnings.warn(f"{self.failing}: {error}", stacklevel=2)
+            return False
+        self.attempts = ATTEMPTS
+        return True

@@ -12,7 +12,6 @@ states and nothing is asked a third time.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
@@ -22,7 +21,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from mosa.physics.activations import at_hand, same_weights
-from mosa.physics.capturing import ATTEMPTS, uninterrupted
+from mosa.physics.capturing import ATTEMPTS, Captures
 from mosa.physics.mpm import SegmentSolver, wants_gradient, warp_stream
 from mosa.physics.mpm_kernels import NO_EVENT
 from mosa.physics.window import grid_window
@@ -97,7 +96,10 @@ class Chain:
         self.statistics: dict[bool, tuple[Tensor, ...]] = {}  # in light and in full buffers: each graph has its own
         self.statistics_seeds: tuple[Tensor, ...] = ()
         self._kind: type | None = None
-        self.attempts = ATTEMPTS if numerics.device.type == "cuda" else 0
+        self._captures = Captures(
+            f"{type(adapter).__name__} cannot be captured as a CUDA graph and runs uncaptured",
+            ATTEMPTS if numerics.device.type == "cuda" else 0,
+        )
         self._warm: set[tuple] = set()
         self._graphs: dict[tuple, torch.cuda.CUDAGraph] = {}
         self._key: tuple = ()
@@ -121,9 +123,7 @@ class Chain:
         backward pass, which kept needs and any rollout with one has anyway. Errors: as `SegmentSolver.advance`; LeftWindow."""
         dx, dt, total = self.numerics.dx, self.numerics.dt, self.substeps
         work = self._full() if full else self._light()
-        bounds = solver.bounds(state)
-        if self.marks:
-            bounds = fallen(bounds, self.numerics, total)
+        bounds = fallen(solver.bounds(state), self.numerics, total)
         for margin in (MARGIN, 3 + total // 2):
             origin, dims = grid_window(state[0], state[1], dx, 2 * total * dt, margin, bounds=bounds)
             self.dims = tuple(max(-(-a // COARSE) * COARSE, b) for a, b in zip(dims, self.dims))
@@ -293,7 +293,7 @@ class Chain:
 
     def _capture(self, cutoff: float) -> None:
         """Capture every pass that has run once. Here for both: the backward pass runs in a thread of autograd's own."""
-        if not self.attempts:
+        if not self._captures.attempts:
             return
         missing = [name for name in self._passes if name in self._warm and name not in self._graphs]
         if not missing:
@@ -304,15 +304,8 @@ class Chain:
                 work.cutoff = cutoff
         for name in missing:
             graph = torch.cuda.CUDAGraph()
-            try:
-                with uninterrupted(), torch.cuda.graph(graph, capture_error_mode="thread_local"):
-                    self._passes[name]()
-            except RuntimeError as error:
-                self.attempts -= 1
+            if not self._captures.succeeds(torch.cuda.graph(graph, capture_error_mode="thread_local"), self._passes[name]):
                 torch.cuda.synchronize()
-                if not self.attempts:
-                    name = type(self.adapter).__name__
-                    warnings.warn(f"{name} cannot be captured as a CUDA graph and runs uncaptured: {error}", stacklevel=2)
                 return
             self._graphs[name] = graph
 

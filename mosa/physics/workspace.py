@@ -6,7 +6,6 @@ them, on a CPU the 10 us that Python takes for each.
 """
 
 import math
-import warnings
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from mosa.physics.capturing import ATTEMPTS, uninterrupted
+from mosa.physics.capturing import Captures
 from mosa.physics.collider_workspace import ColliderBuffers
 from mosa.physics.colliders import PackedColliders
 from mosa.physics.laws import SLOTS, Law
@@ -153,7 +152,7 @@ class Workspace:
         self.lowest, self.dims = (0, 0, 0), (0, 0, 0)
         self.steps = Steps(numerics.dt, numerics.dt)
         self._graphs: dict[tuple, object] = {}
-        self.attempts = ATTEMPTS
+        self._captures = Captures("substeps cannot be captured as a graph and are launched one by one")
         self._windows: dict[tuple[int, int, int], dict] = {}
 
     def _array(self, shape: tuple[int, ...], kind, dtype: torch.dtype | None = None):
@@ -265,31 +264,17 @@ class Workspace:
         if len(self._graphs) > MAX_GRAPHS:
             self._graphs.clear()
         if graph == "loaded":
-            graph = self._captured(body)
-            if graph is not None:
-                self._graphs[key] = graph
+            # on Warp's own stream: torch's default one cannot be captured
+            capture = wp.ScopedCapture(device=self.origin_wp.device, force_module_load=False)
+            graph = None
+            if self._captures.succeeds(capture, body):
+                graph = self._graphs[key] = capture.graph
         if graph is None:
             with wp.ScopedStream(stream) if cuda else nullcontext():
                 body()  # the first pass compiles and loads the kernels, which a capture must not do
             self._graphs[key] = "loaded"
         else:
             wp.capture_launch(graph, stream=stream)
-
-    def _captured(self, body):
-        """A graph of the launches of `body`, None where the capture fails, which says nothing of the launches themselves."""
-        if not self.attempts:
-            return None
-        try:
-            # on Warp's own stream: torch's default one cannot be captured
-            with uninterrupted(), wp.ScopedCapture(device=self.origin_wp.device, force_module_load=False) as capture:
-                body()
-        except RuntimeError as error:
-            self.attempts -= 1
-            if not self.attempts:
-                warnings.warn(f"substeps cannot be captured as a graph and are launched one by one: {error}", stacklevel=2)
-            return None
-        self.attempts = ATTEMPTS
-        return capture.graph
 
     def _run(self, kernel, dim: int, inputs: list, adj_inputs: list | None = None) -> None:
         launch(kernel, dim, inputs, self.origin_wp.device, adj_inputs)

@@ -106,9 +106,10 @@ def operator_half(
     ones = tl.where(c[None, :] == 12, 1.0, 0.0)
     two = tl.arange(0, 2 * BLOCK)  # lanes of the assembly, two for each particle: they share the stores
     first, second = two < BLOCK, two >= BLOCK
-    square = packed + 80 * H
+    # `half_weights._tiles`: five of 16 x H, eight of H x H, three of H x 16, then H x 64, 16 x 16 and 16 x 64
+    square = packed + 5 * 16 * H
     narrow = square + 8 * H * H
-    wide = narrow + 48 * H
+    wide = narrow + 3 * 16 * H
     F1, A1 = tile(packed, 16, H), tile(packed + 16 * H, 16, H)
     Bn, Tx = tile(packed + 32 * H, 16, H), tile(packed + 48 * H, 16, H)
     biases, plane_bias = tile(packed + 64 * H, 16, H), tile(wide + 64 * H + 256, 16, 64)

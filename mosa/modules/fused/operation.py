@@ -73,8 +73,8 @@ class _Launch:
         self.n, self.hidden, self.device = n, hidden, device
         self.rows = -(-(n + 1) // LANES) * LANES  # the particles, the state at rest, and as many more of these as fill the last one
         self.lanes = (self.rows // LANES,)
-        # whether all weights of a network fit beside its activations in a multiprocessor's shared memory (200 of Hopper's 227 kB)
         precision = "tf32" if settings.precision == "half" else settings.precision  # half is of the forward kernel alone
+        # whether all weights of a network fit beside its activations in a multiprocessor's shared memory (200 of Hopper's 227 kB)
         self.small = precision == "tf32" and hidden <= 64 and (device.type != "cuda" or hopper(device))
         self.half = settings.precision == "half" and hidden <= 64 and (device.type != "cuda" or _shared(device) >= HALF_SHARED)
         self.size = {"H": hidden, "P": precision}
@@ -142,7 +142,7 @@ class _FromWeights(NamedTuple):
     known: bool
 
 
-def _from_weights(settings: Settings, weights: Sequence[Tensor], hidden: int, stored: bool) -> _FromWeights:
+def _from_weights(settings: Settings, weights: Sequence[Tensor], stored: bool) -> _FromWeights:
     """For `_evaluate_half`. The rest is one more evaluation, of a particle in this state, by the same program."""
 
     def make() -> _FromWeights:
@@ -151,7 +151,7 @@ def _from_weights(settings: Settings, weights: Sequence[Tensor], hidden: int, st
         if not settings.rest_free:
             return made
         outputs = zero.new_empty(1, 6, 6), zero.new_empty(1, 6)
-        launch = _Launch(settings, 1, hidden, zero.device)
+        launch = _Launch(settings, 1, weights[0].shape[0], zero.device)
         _evaluate_half(launch, zero, zero, zero.new_ones(1), settings, made, outputs, stored)
         return made._replace(rest=outputs[1][0], known=True)
 
@@ -187,8 +187,8 @@ class _FusedOperator(torch.autograd.Function):
         G, h = w.new_empty(n, 6, 6), w.new_empty(n, 6)
         stored, made = backward_at_hand(), None
         with torch.cuda.device_of(w):
-            if launch.half:
-                made = _from_weights(settings, given, launch.hidden, stored)
+            if launch.half:  # from the weights as given: another copy of them each time would not be known again
+                made = _from_weights(settings, given, stored)
                 buffers, post = _evaluate_half(launch, w, s, unit, settings, made, (G, h), stored)
             else:
                 buffers, post = _evaluate_all(launch, w, s, unit, settings, weights, G, h)
