@@ -16,8 +16,7 @@ from mosa.physics.chains import Plan, chain_length, grouped
 from mosa.physics.rollout import SEGMENT, AdapterOperator, Simulator
 from mosa.types import Ground, ParticleState
 
-CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-DEVICES = ["cpu", pytest.param("cuda", marks=[pytest.mark.gpu, CUDA])]
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 E, NU = 2e4, 0.3
 
 
@@ -369,7 +368,6 @@ def test_segments_are_grouped_evenly_and_in_order():
 
 
 @pytest.mark.gpu
-@CUDA
 @pytest.mark.parametrize("precision", ["accurate", "tf32", "half"])
 def test_replayed_kernels_find_the_weights_of_today(precision, make_block):
     """What the kernels make of the weights, once for all evaluations of a pass, is made again in every replay."""
@@ -395,7 +393,6 @@ def test_replayed_kernels_find_the_weights_of_today(precision, make_block):
 
 
 @pytest.mark.gpu
-@CUDA
 def test_an_adapter_that_looks_at_the_host_runs_uncaptured(make_block):
     class Looking(StressAdapter):
         def forward(self, state):

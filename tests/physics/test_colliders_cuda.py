@@ -8,7 +8,7 @@ from mosa.physics.colliders import Box, Capsule, Collider, Cylinder, HalfSpace, 
 from mosa.physics.rollout import Simulator
 from mosa.types import ParticleState
 
-pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")]
+pytestmark = pytest.mark.gpu
 SHAPES = [HalfSpace(), Sphere(0.12), Capsule(0.07, 0.15), Cylinder(0.09, 0.3), Box((0.3, 0.1, 0.25))]
 
 

@@ -9,7 +9,7 @@ import torch
 from mosa.physics.rollout import AdapterOperator, Simulator
 from mosa.types import Ground, ParticleState
 
-pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")]
+pytestmark = pytest.mark.gpu
 
 
 def run(state, law, device, dtype, substeps, frames, adapted):

@@ -10,7 +10,7 @@ from mosa.physics.laws import SLOTS, law_named
 from mosa.physics.material_kernels import state_kernel, stress_kernel
 from mosa.physics.particle_memory import aligned, particle_memory
 
-GPU = pytest.param("cuda", marks=[pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")])
+GPU = pytest.param("cuda", marks=pytest.mark.gpu)
 SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
 SHAPES = {"matrix33": (3, 3), "vector6": (6,), "matrix66": (6, 6), "parameters": (SLOTS,)}
 

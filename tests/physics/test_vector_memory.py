@@ -9,7 +9,7 @@ import warp as wp
 from mosa.physics.mpm_kernels import transfer_kernels
 from mosa.physics.vector_memory import vector_memory
 
-GPU = pytest.param("cuda", marks=[pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")])
+GPU = pytest.param("cuda", marks=pytest.mark.gpu)
 KINDS = {torch.float32: (wp.float32, wp.vec4f), torch.float64: (wp.float64, wp.vec4d)}
 
 
