@@ -28,8 +28,6 @@ from mosa.physics.window import grid_window
 from mosa.physics.workspace import Numerics, Workspace, copies
 
 ANSWER = ("G", "h", "plastic_G", "plastic_h")
-COARSE = 8
-"""Node counts of a chain's window are multiples of this: each change of them costs a new capture."""
 MARGIN = 4
 """Nodes of a window beyond what the speeds at the start ask for."""
 
@@ -92,7 +90,6 @@ class Chain:
         self._shape = {"particles": particles, "substeps": self.substeps, "adapted": True, "plastic_adapted": plastic_adapted}
         self.light: Workspace | None = None
         self.full: Workspace | None = None
-        self.dims = (0, 0, 0)
         self.statistics: dict[bool, tuple[Tensor, ...]] = {}  # in light and in full buffers: each graph has its own
         self.statistics_seeds: tuple[Tensor, ...] = ()
         self._kind: type | None = None
@@ -115,9 +112,8 @@ class Chain:
     def advance(
         self, solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...], packed: Tensor, first: int, kept: bool = False,
         full: bool = False,
-    ) -> tuple[list[tuple[Tensor, ...]], tuple[Tensor, ...], tuple[int, int, int], list[Tensor]]:  # fmt: skip
-        """(states at the marks and after the chain, statistics (K, ...) each, lowest node of the window, what `adjoint` takes as
-        `tape`).
+    ) -> tuple[list[tuple[Tensor, ...]], tuple[Tensor, ...], tuple[tuple, tuple], list[Tensor]]:  # fmt: skip
+        """(states at the marks and after the chain, statistics (K, ...) each, grid window used, what `adjoint` takes as `tape`).
 
         learned: of the adapter as it is now; kept: leave all substeps on the tape, else nothing; full: in the buffers of the
         backward pass, which kept needs and any rollout with one has anyway. Errors: as `SegmentSolver.advance`; LeftWindow."""
@@ -125,24 +121,21 @@ class Chain:
         work = self._full() if full else self._light()
         bounds = fallen(solver.bounds(state), self.numerics, total)
         for margin in (MARGIN, 3 + total // 2):
-            origin, dims = grid_window(state[0], state[1], dx, 2 * total * dt, margin, bounds=bounds)
-            self.dims = tuple(max(-(-a // COARSE) * COARSE, b) for a, b in zip(dims, self.dims))
-            self._check_graphs(solver, learned)
-            work.set_window(origin, self.dims)
-            work.load(state, {"parameters": packed}, solver.volume, solver.mass, solver.cutoff)
-            self._capture(solver.cutoff)
+            window = grid_window(state[0], state[1], dx, 2 * total * dt, margin, bounds=bounds)
+            self._load(work, window, solver, learned, state, packed)
+            self._capture()
             self._play(("forward", full))
             final = work.final()
             flags = solver.look(work.flags, final)
             if not solver.left_window(flags, first, dt):
                 states = [*(work.whole(copies(state)) for state in self.marked), final]
-                return states, tuple(copies(self.statistics[full])), origin, copies(work.tape()) if kept else []
+                return states, tuple(copies(self.statistics[full])), window, work.tape() if kept else []
             if self.marks:
                 raise LeftWindow
         raise solver.left_behind(flags, first, dt)
 
     def adjoint(
-        self, solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...], packed: Tensor, origin: tuple[int, int, int],
+        self, solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...], packed: Tensor, window: tuple[tuple, tuple],
         seeds: Sequence[Tensor | None], tape: Sequence[Tensor],
     ) -> tuple[list[Tensor], Tensor, list[Tensor]]:  # fmt: skip
         """Gradients of (state, parameters, weights). learned: with the names and weights of `advance`; seeds: adjoints of what it
@@ -150,13 +143,9 @@ class Chain:
         work = self._full()
         if not self.statistics_seeds:
             self.statistics_seeds = tuple(torch.zeros_like(t) for t in self.statistics[True])
-        self._check_graphs(solver, learned)  # another rollout may have gone forward since, with another cutoff
-        work.set_window(origin, self.dims)
-        if tape and tape[-1].shape != work.tape()[-1].shape:
-            tape = ()  # the window has grown since
-        work.load(state, {"parameters": packed}, solver.volume, solver.mass, solver.cutoff)
+        self._load(work, window, solver, learned, state, packed)  # another rollout may have gone forward since
         if tape:
-            torch._foreach_copy_(work.tape(), list(tape))
+            work.rewind(tape)
         slot = self.substeps % 2
         targets = self._targets(slot) + list(self.statistics_seeds)
         for target, seed in zip(targets, seeds, strict=True):
@@ -275,10 +264,19 @@ class Chain:
             if sums:
                 torch._foreach_add_(*zip(*sums))
 
-    def _check_graphs(self, solver: SegmentSolver, learned: Learned) -> None:
-        """Forget captured graphs where what they have by value or address is another one."""
+    def _load(
+        self, work: Workspace, window: tuple[tuple, tuple], solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...],
+        packed: Tensor,
+    ) -> None:  # fmt: skip
+        """Place the chain's start in `work`. Forget captured graphs where what they have by value or address is another one."""
+        work.set_window(*window)
+        for each in (self.light, self.full):
+            if each is not None:  # this rollout uses one, the other may have had the cutoff of an earlier one
+                each.cutoff = solver.cutoff
+        work.load(state, {"parameters": packed}, solver.volume, solver.mass, solver.cutoff)
         self.learned = learned
-        key = (self.dims, solver.cutoff, learned.addresses, tuple(w.data_ptr() for w in learned.weights))
+        rooms = tuple(each.capacity if each is not None else 0 for each in (self.light, self.full))
+        key = (rooms, solver.cutoff, learned.addresses, tuple(w.data_ptr() for w in learned.weights))
         if key != self._key:
             self._key, self.marked = key, []
             self._graphs.clear()
@@ -291,17 +289,13 @@ class Chain:
             self._passes[name]()  # the first time this also compiles and loads the kernels, which a capture must not do
             self._warm.add(name)
 
-    def _capture(self, cutoff: float) -> None:
+    def _capture(self) -> None:
         """Capture every pass that has run once. Here for both: the backward pass runs in a thread of autograd's own."""
         if not self._captures.attempts:
             return
         missing = [name for name in self._passes if name in self._warm and name not in self._graphs]
         if not missing:
             return
-        for work in (self.light, self.full):  # this rollout uses one, the other has the window and cutoff of an earlier one
-            if work is not None:
-                work.set_window(work.lowest, self.dims)
-                work.cutoff = cutoff
         for name in missing:
             graph = torch.cuda.CUDAGraph()
             if not self._captures.succeeds(torch.cuda.graph(graph, capture_error_mode="thread_local"), self._passes[name]):
@@ -316,8 +310,8 @@ class _Chained(torch.autograd.Function):
         """inputs: state (5), packed parameters, the adapter's weights."""
         state, packed = tuple(t.detach().contiguous() for t in inputs[:5]), inputs[5].detach().contiguous()
         ctx.set_materialize_grads(False)
-        (result,), statistics, origin, tape = chain.advance(solver, learned, state, packed, first, kept, full=True)
-        ctx.chain, ctx.solver, ctx.origin, ctx.tape = chain, solver, origin, tape
+        (result,), statistics, window, tape = chain.advance(solver, learned, state, packed, first, kept, full=True)
+        ctx.chain, ctx.solver, ctx.window, ctx.tape = chain, solver, window, tape
         ctx.states, ctx.names = 5 if solver.numerics.law.plastic else 4, learned.names
         ctx.save_for_backward(*state, packed, *inputs[6:])  # weights too: autograd tells if one is changed before the backward pass
         return *result[: ctx.states], *statistics
@@ -328,7 +322,7 @@ class _Chained(torch.autograd.Function):
         state, packed, weights = ctx.saved_tensors[:5], ctx.saved_tensors[5], ctx.saved_tensors[6:]
         learned = Learned(ctx.names, weights, addresses_of(ctx.chain.adapter))
         tape, ctx.tape = ctx.tape, []  # free it as soon as it is used
-        found, adj_packed, adj_weights = ctx.chain.adjoint(ctx.solver, learned, state, packed, ctx.origin, seeds, tape)
+        found, adj_packed, adj_weights = ctx.chain.adjoint(ctx.solver, learned, state, packed, ctx.window, seeds, tape)
         return *[None] * 5, *found, *[None] * (5 - ctx.states), adj_packed, *adj_weights
 
 

@@ -14,8 +14,8 @@ from mosa.errors import SimulationDiverged
 from mosa.physics.activations import at_hand
 from mosa.physics.chain import MARGIN, Chain, Learned, LeftWindow, advance_chain, fallen, learned_of
 from mosa.physics.memory import free_memory, room
-from mosa.physics.mpm import SMALL, SegmentSolver, substep_bytes, wants_gradient
-from mosa.physics.window import MAX_NODES, window_of
+from mosa.physics.mpm import SegmentSolver, substep_bytes, wants_gradient
+from mosa.physics.window import MAX_NODES, SMALL, window_of
 from mosa.physics.workspace import Numerics
 
 SEGMENT = 32

@@ -28,7 +28,8 @@ def collider_kernels(scalar) -> SimpleNamespace:
     adj_collide_normal = make_normal_adjoint(scalar)
     shape = shape_functions(scalar)
     signed_distance, curvature = shape.signed_distance, shape.curvature
-    node_position = transfer_kernels(scalar).node_position
+    transfers = transfer_kernels(scalar)
+    node_position, node_count = transfers.node_position, transfers.node_count
     load3, store3 = vector_memory(scalar).load3, vector_memory(scalar).store3
     module = f"mosa.physics.colliders_{scalar.__name__}"
 
@@ -68,31 +69,31 @@ def collider_kernels(scalar) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def collide_nodes(
-        grid: wp.array(dtype=vec4), cutoff: scalar, origin: wp.array(dtype=wp.vec3i), dims: wp.vec3i, dx: scalar,
+        window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4), cutoff: scalar, dx: scalar,
         inv_dt: scalar, count: int, substep: int, shapes: wp.array2d(dtype=scalar), codes: wp.array2d(dtype=int),
         fields: wp.array(dtype=scalar), position: wp.array2d(dtype=vec3), rotation: wp.array2d(dtype=mat33),
         linear: wp.array2d(dtype=vec3), angular: wp.array2d(dtype=vec3), velocity: wp.array(dtype=vec4),
         force: wp.array2d(dtype=vec3), torque: wp.array2d(dtype=vec3),
     ):  # fmt: skip
         """Changes velocity in place, adds to force and torque of the substep."""
-        node = wp.tid()
-        m = grid[node][3]
-        if m > cutoff:
-            now = velocity[node]  # changed in place, which `load3` is not for
-            u = vec3(now[0], now[1], now[2])
-            y = node_position(node, origin[0], dims, dx)
-            for k in range(count):
-                after = respond(u, y, k, substep, shapes, codes, fields, position, rotation, linear, angular)
-                f = (m * inv_dt) * (u - after)
-                if wp.dot(f, f) > scalar(0.0):
-                    wp.atomic_add(force, substep, k, f)
-                    wp.atomic_add(torque, substep, k, wp.cross(y - position[substep, k], f))
-                u = after
-            store3(velocity, node, u)
+        for node in range(wp.tid(), node_count(window), threads):
+            m = grid[node][3]
+            if m > cutoff:
+                now = velocity[node]  # changed in place, which `load3` is not for
+                u = vec3(now[0], now[1], now[2])
+                y = node_position(node, window[0], window[1], dx)
+                for k in range(count):
+                    after = respond(u, y, k, substep, shapes, codes, fields, position, rotation, linear, angular)
+                    f = (m * inv_dt) * (u - after)
+                    if wp.dot(f, f) > scalar(0.0):
+                        wp.atomic_add(force, substep, k, f)
+                        wp.atomic_add(torque, substep, k, wp.cross(y - position[substep, k], f))
+                    u = after
+                store3(velocity, node, u)
 
     @wp.kernel(module=module, enable_backward=False)
     def adj_collide_nodes(
-        grid: wp.array(dtype=vec4), cutoff: scalar, origin: wp.array(dtype=wp.vec3i), dims: wp.vec3i, dx: scalar,
+        window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4), cutoff: scalar, dx: scalar,
         inv_dt: scalar, count: int, substep: int, shapes: wp.array2d(dtype=scalar), codes: wp.array2d(dtype=int),
         fields: wp.array(dtype=scalar), position: wp.array2d(dtype=vec3), rotation: wp.array2d(dtype=mat33),
         linear: wp.array2d(dtype=vec3), angular: wp.array2d(dtype=vec3), before: wp.array(dtype=vec4),
@@ -102,63 +103,65 @@ def collider_kernels(scalar) -> SimpleNamespace:
     ):  # fmt: skip
         """before: node velocities as the first collider finds them. Turns adj_velocity into theirs, writes adj_mass, adds to the
         adjoints of the pose and of the velocities."""
-        node = wp.tid()
-        m = grid[node][3]
-        am = scalar(0.0)
-        if m > cutoff:
-            now = adj_velocity[node]
-            a = vec3(now[0], now[1], now[2])
-            y = node_position(node, origin[0], dims, dx)
-            for reverse in range(count):
-                k = count - 1 - reverse
-                r = y - position[substep, k]
-                Q = rotation[substep, k]
-                q = wp.transpose(Q) * r
-                phi, g = signed_distance(q, k, shapes, codes, fields)
-                w, slope = weight(phi, shapes[k, 3])
-                if w > scalar(0.0):
-                    u = load3(before, node)
-                    for j in range(k):
-                        u = respond(u, y, j, substep, shapes, codes, fields, position, rotation, linear, angular)
-                    omega = angular[substep, k]
-                    local = wp.normalize(g)
-                    n = Q * local
-                    V = linear[substep, k] + wp.cross(omega, r)
-                    D = V + collide(u - V, n, codes[k, 1], shapes[k, 4]) - u
-                    # u' = u + w D,  f = -(m w/dt) D,  torque = r x f
-                    at = adj_torque[substep, k]
-                    af = adj_force[substep, k] + wp.cross(at, r)
-                    f = (-m * w * inv_dt) * D
-                    am = am - (w * inv_dt) * wp.dot(D, af)
-                    aD = w * a - (m * w * inv_dt) * af
-                    aw = wp.dot(D, a) - (m * inv_dt) * wp.dot(D, af)
-                    ar = wp.cross(f, at)
-                    # D = V + collide(u - V, n) - u
-                    relative = adj_collide(u - V, n, codes[k, 1], shapes[k, 4], aD)
-                    an = adj_collide_normal(u - V, n, codes[k, 1], shapes[k, 4], aD)
-                    a = a - aD + relative
-                    aV = aD - relative
-                    # V = linear + angular x r
-                    ar = ar + wp.cross(aV, omega)
-                    # n = Q local, local = g/|g|, g = grad phi(q), w(phi)
-                    al = wp.transpose(Q) * an
-                    ag = (al - wp.dot(local, al) * local) / wp.length(g)
-                    aq = curvature(q, k, shapes, codes, fields, ag) + (slope * aw) * g
-                    # q = Q^T r, r = y - position
-                    ar = ar + Q * aq
-                    wp.atomic_add(adj_linear, substep, k, aV)
-                    wp.atomic_add(adj_angular, substep, k, wp.cross(r, aV))
-                    wp.atomic_add(adj_rotation, substep, k, wp.outer(an, local) + wp.outer(r, aq))
-                    wp.atomic_add(adj_position, substep, k, -ar)
-            store3(adj_velocity, node, a)
-        adj_mass[node] = am
+        for node in range(wp.tid(), node_count(window), threads):
+            m = grid[node][3]
+            am = scalar(0.0)
+            if m > cutoff:
+                now = adj_velocity[node]
+                a = vec3(now[0], now[1], now[2])
+                y = node_position(node, window[0], window[1], dx)
+                for reverse in range(count):
+                    k = count - 1 - reverse
+                    r = y - position[substep, k]
+                    Q = rotation[substep, k]
+                    q = wp.transpose(Q) * r
+                    phi, g = signed_distance(q, k, shapes, codes, fields)
+                    w, slope = weight(phi, shapes[k, 3])
+                    if w > scalar(0.0):
+                        u = load3(before, node)
+                        for j in range(k):
+                            u = respond(u, y, j, substep, shapes, codes, fields, position, rotation, linear, angular)
+                        omega = angular[substep, k]
+                        local = wp.normalize(g)
+                        n = Q * local
+                        V = linear[substep, k] + wp.cross(omega, r)
+                        D = V + collide(u - V, n, codes[k, 1], shapes[k, 4]) - u
+                        # u' = u + w D,  f = -(m w/dt) D,  torque = r x f
+                        at = adj_torque[substep, k]
+                        af = adj_force[substep, k] + wp.cross(at, r)
+                        f = (-m * w * inv_dt) * D
+                        am = am - (w * inv_dt) * wp.dot(D, af)
+                        aD = w * a - (m * w * inv_dt) * af
+                        aw = wp.dot(D, a) - (m * inv_dt) * wp.dot(D, af)
+                        ar = wp.cross(f, at)
+                        # D = V + collide(u - V, n) - u
+                        relative = adj_collide(u - V, n, codes[k, 1], shapes[k, 4], aD)
+                        an = adj_collide_normal(u - V, n, codes[k, 1], shapes[k, 4], aD)
+                        a = a - aD + relative
+                        aV = aD - relative
+                        # V = linear + angular x r
+                        ar = ar + wp.cross(aV, omega)
+                        # n = Q local, local = g/|g|, g = grad phi(q), w(phi)
+                        al = wp.transpose(Q) * an
+                        ag = (al - wp.dot(local, al) * local) / wp.length(g)
+                        aq = curvature(q, k, shapes, codes, fields, ag) + (slope * aw) * g
+                        # q = Q^T r, r = y - position
+                        ar = ar + Q * aq
+                        wp.atomic_add(adj_linear, substep, k, aV)
+                        wp.atomic_add(adj_angular, substep, k, wp.cross(r, aV))
+                        wp.atomic_add(adj_rotation, substep, k, wp.outer(an, local) + wp.outer(r, aq))
+                        wp.atomic_add(adj_position, substep, k, -ar)
+                store3(adj_velocity, node, a)
+            adj_mass[node] = am
 
     @wp.kernel(module=module, enable_backward=False)
-    def add_mass(adj_mass: wp.array(dtype=scalar), adj_grid: wp.array(dtype=vec4)):
+    def add_mass(
+        window: wp.array(dtype=wp.vec3i), threads: int, adj_mass: wp.array(dtype=scalar), adj_grid: wp.array(dtype=vec4)
+    ):
         """What the reaction adds to the adjoint of node masses."""
-        node = wp.tid()
         z = scalar(0.0)
-        adj_grid[node] = adj_grid[node] + vec4(z, z, z, adj_mass[node])
+        for node in range(wp.tid(), node_count(window), threads):
+            adj_grid[node] = adj_grid[node] + vec4(z, z, z, adj_mass[node])
 
     return SimpleNamespace(
         collide_nodes=collide_nodes, adj_collide_nodes=adj_collide_nodes, add_mass=add_mass, vec3=vec3, vec4=vec4, mat33=mat33

@@ -8,16 +8,17 @@ from mosa.physics.colliders import PackedColliders
 
 
 class ColliderBuffers:
-    """K colliders over `substeps` substeps. allocate: `Workspace`'s (shape, kind) -> (tensor, Warp array); run: its launcher.
+    """K colliders over `substeps` substeps. allocate: `Workspace`'s (shape, kind) -> (tensor, Warp array); over_nodes: its
+    launcher of (kernel, inputs).
 
     poses, adj_poses: position (S, K, 3), rotation (S, K, 3, 3), linear, angular (S, K, 3); reaction: force [N] and torque [N m]
     about the collider's origin (S, K, 3), as the body exerts them on the collider in world axes.
     """
 
-    def __init__(self, packed: PackedColliders, scalar, substeps: int, allocate, run, with_adjoint: bool) -> None:
+    def __init__(self, packed: PackedColliders, scalar, substeps: int, allocate, over_nodes, with_adjoint: bool) -> None:
         self.count = len(packed)
         self.kernels = collider_kernels(scalar)
-        self._scalar, self._allocate, self._run, self.with_adjoint = scalar, allocate, run, with_adjoint
+        self._scalar, self._allocate, self._over_nodes, self.with_adjoint = scalar, allocate, over_nodes, with_adjoint
         self._packed = [
             wp.from_torch(packed.shapes, dtype=scalar), wp.from_torch(packed.codes, dtype=wp.int32),
             wp.from_torch(packed.fields, dtype=scalar),
@@ -37,7 +38,7 @@ class ColliderBuffers:
             self.adj_reaction, self._adj_reaction = buffers(pose[2:])
 
     def set_nodes(self, nodes: int) -> None:
-        """Buffers of the size of the grid window, for the adjoint."""
+        """Buffers for so many grid nodes, for the adjoint."""
         if self.with_adjoint:
             self.before, self.before_wp = self._allocate((nodes, 4), self.kernels.vec4)
             self.adj_mass, self._adj_mass = self._allocate((nodes,), self._scalar)
@@ -60,17 +61,17 @@ class ColliderBuffers:
         return [*place, 1.0 / time, self.count, step, *self._packed, *self._poses]
 
     def apply(self, step: int, place: list, time: float, velocity) -> None:
-        """Contact at substep `step`, on node velocities in place. place: grid, cutoff, origin, dims, dx; time [s]: for which the
+        """Contact at substep `step`, on node velocities in place. place: grid, cutoff, dx; time [s]: for which the
         substep's forces act."""
-        self._run(self.kernels.collide_nodes, len(velocity), [*self._arguments(place, step, time), velocity, *self._reaction])
+        self._over_nodes(self.kernels.collide_nodes, [*self._arguments(place, step, time), velocity, *self._reaction])
 
     def adjoint(self, step: int, place: list, time: float, adj_velocity) -> None:
         """Turns the adjoint of node velocities after contact into that before it; `before` holds those velocities."""
-        self._run(self.kernels.adj_collide_nodes, len(adj_velocity), [
+        self._over_nodes(self.kernels.adj_collide_nodes, [
             *self._arguments(place, step, time), self.before_wp, *self._adj_reaction, adj_velocity, self._adj_mass,
             *self._adj_poses,
         ])  # fmt: skip
 
     def add_mass(self, adj_grid) -> None:
         """The reaction's part of the adjoint of node masses, after the grid's own."""
-        self._run(self.kernels.add_mass, len(adj_grid), [self._adj_mass, adj_grid])
+        self._over_nodes(self.kernels.add_mass, [self._adj_mass, adj_grid])

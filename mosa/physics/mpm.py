@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mosa.errors import SimulationDiverged
 from mosa.physics.mpm_kernels import INVERTED, NO_EVENT, NONFINITE, OUTSIDE, WINDOW
-from mosa.physics.window import MAX_NODES, extent, grid_window, window_of
+from mosa.physics.window import MAX_NODES, SMALL, extent, grid_window, window_of
 from mosa.physics.workspace import Numerics, Steps, Workspace, copies
 
 HELD = ("parameters", "G", "h", "plastic_G", "plastic_h")
@@ -20,14 +20,6 @@ LONGEST = 256
 """Most substeps of a segment of which no gradient is wanted, on CUDA: each segment costs a look at the host."""
 WIDENED = 32
 """Most substeps of a segment whose window may be widened for particles of any speed; longer ones are cut instead."""
-SMALL = 2**16
-"""Nodes that a long segment's window may have more than a short one's: over the substeps they cost about what it saves."""
-SPARE = 1.5
-"""A window keeps the size of an earlier, larger one up to this factor: another number of nodes costs CUDA a new capture."""
-
-
-def _largest(dims: Iterable[tuple[int, int, int]]) -> tuple[int, int, int]:
-    return tuple(map(max, zip(*dims, strict=True)))
 
 
 def substep_bytes(numerics: Numerics, particles: int) -> int:
@@ -55,7 +47,6 @@ class SegmentSolver:
         self.numerics, self.volume, self.cutoff = numerics, volume, cutoff
         self.mass = density * volume
         self._workspaces, self.room = workspaces, room
-        self._dims = (0, 0, 0)
         self._known: tuple | None = None
 
     def workspace(self, substeps: int, adapted: bool, plastic_adapted: bool, with_adjoint: bool) -> Workspace:
@@ -81,10 +72,10 @@ class SegmentSolver:
         self, state: tuple[Tensor, ...], held: dict, poses, substeps: int, first: int, steps: Steps | None = None,
         kept: bool = False,
     ) -> tuple[tuple, tuple, tuple, list[Tensor]]:  # fmt: skip
-        """(state after `substeps`, reactions (force, torque) of the colliders or (), grid window used, copy of `Workspace.tape`).
+        """(state after `substeps`, reactions (force, torque) of the colliders or (), grid window used, `Workspace.tape`).
 
         first: number of the first substep, for messages; steps: their times, the numerics' dt by default; kept: whether to make
-        the copy, [] otherwise.
+        the last, [] otherwise.
 
         Errors: SimulationDiverged naming substep and particle.
         """
@@ -94,7 +85,7 @@ class SegmentSolver:
         for margin in (2, 3 + substeps // 2):
             found, flags, work = self._attempt(state, held, poses, substeps, margin, steps, kept)
             if not self.left_window(flags, first, steps.dt):
-                return *found, copies(work.tape()) if kept else []
+                return *found, work.tape() if kept else []
         raise self.left_behind(flags, first, steps.dt)
 
     def advance_any(
@@ -135,14 +126,13 @@ class SegmentSolver:
     ) -> tuple[tuple[tuple, tuple, tuple], list[int], Workspace]:
         """((state, reactions, window), flags, workspace), in a window for the speeds at the start and `margin` nodes more."""
         x, v = state[:2]
-        origin, dims = grid_window(x, v, self.numerics.dx, 2 * substeps * steps.dt, margin, bounds=self.bounds(state))
-        self._dims = dims = self._kept(dims)
-        work = self.prepare(state, held, poses, substeps, (origin, dims), with_adjoint=kept, steps=steps)
+        window = grid_window(x, v, self.numerics.dx, 2 * substeps * steps.dt, margin, bounds=self.bounds(state))
+        work = self.prepare(state, held, poses, substeps, window, with_adjoint=kept, steps=steps)
         work.advance()
         final = work.final()
         flags = self.look(work.flags, final)
         reaction = () if work.colliders is None else tuple(copies(work.colliders.reaction))
-        return (final, reaction, (origin, dims)), flags, work
+        return (final, reaction, window), flags, work
 
     def look(self, flags: Tensor, final: tuple[Tensor, ...]) -> list[int]:
         """The events of a segment; the same transfer tells the host where the next one starts."""
@@ -163,14 +153,6 @@ class SegmentSolver:
     def _know(self, state: tuple[Tensor, ...], bounds: list[float]) -> None:
         # aliases hold the memory, so that it does not become another tensor's, but not the graph, which holds the solver
         self._known = (*_identity(state), bounds, [t.detach() for t in state[:2]])
-
-    def _kept(self, dims: tuple[int, int, int]) -> tuple[int, int, int]:
-        """`dims`; on CUDA those of an earlier segment where they are not much larger: another size costs a new capture."""
-        if self.numerics.device.type != "cuda":
-            return dims
-        least = _largest([dims, self._dims])
-        roomy = _largest([least, *(work.dims for work in self._workspaces.values())])
-        return roomy if math.prod(roomy) <= max(SPARE * math.prod(dims), SMALL) else least
 
     def left_behind(self, flags: list[int], first: int, dt: float) -> SimulationDiverged:
         """The error to raise for a particle that leaves even the widest window."""
@@ -225,7 +207,7 @@ class _Segment(torch.autograd.Function):
         work = ctx.solver.prepare(state, held, poses, ctx.substeps, ctx.window, with_adjoint=True, steps=ctx.steps)
         tape, ctx.tape = ctx.tape, []  # freed as soon as it is used
         if tape:
-            torch._foreach_copy_(work.tape(), tape)
+            work.rewind(tape)
         else:
             work.advance()
         slot = ctx.substeps % 2

@@ -1,7 +1,8 @@
 """Transfers between particles and grid, with hand-written adjoints: MLS-MPM, APIC, quadratic B-splines.
 
-A node (i, j, k) sits at dx (i, j, k). The grid is a window of `dims` nodes from `origin`, flat, z fastest; it holds
-(momentum, mass) as one 4-vector, and the node velocity after gravity and contact as another, of which the fourth is unused.
+A node (i, j, k) sits at dx (i, j, k). The grid is a window, flat, z fastest, told by two rows: its lowest node and its number of
+nodes per axis. It holds (momentum, mass) as one 4-vector, and the node velocity after gravity and contact as another, of which
+the fourth is unused. Arrays of nodes may be longer than the window.
 The adjoint of P2G is a pure gather; the adjoint of G2P scatters three numbers per node.
 Stencils are nested static loops over 3: a single loop over 27 nodes compiles to a dynamic loop.
 """
@@ -29,7 +30,9 @@ _FLIPPED = wp.constant(INVERTED)
 
 @cache
 def transfer_kernels(scalar) -> SimpleNamespace:
-    """Kernels p2g, grid, g2p, adj_g2p, adj_grid, adj_p2g for wp.float32 or wp.float64 fields."""
+    """Kernels clear, p2g, grid_update, g2p, adj_g2p, adj_grid, adj_p2g for wp.float32 or wp.float64 fields.
+
+    Those over nodes take all of the window's, whatever the number of `threads` that they are launched with."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
     vec4 = wp.types.vector(length=4, dtype=scalar)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
@@ -78,13 +81,14 @@ def transfer_kernels(scalar) -> SimpleNamespace:
     def p2g(
         x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), C: wp.array(dtype=mat33), F: wp.array(dtype=mat33),
         tau: wp.array(dtype=mat33), mass: wp.array(dtype=scalar), volume: wp.array(dtype=scalar),
-        origin: wp.array(dtype=wp.vec3i), dims: wp.vec3i, dx: scalar, inv_dx: scalar, dt: scalar,
+        window: wp.array(dtype=wp.vec3i), dx: scalar, inv_dx: scalar, dt: scalar,
         check_J: int, substep: int, flags: wp.array(dtype=wp.int64), grid: wp.array(dtype=vec4),
     ):  # fmt: skip
         p = wp.tid()
         xp = x[p]
         base = cell(xp, inv_dx)
-        n = local_cell(base, origin[0], dims)
+        dims = window[1]
+        n = local_cell(base, window[0], dims)
         if n < 0:
             wp.atomic_min(flags, _LEFT, wp.int64(substep) * wp.int64(x.shape[0]) + wp.int64(p))
             return
@@ -142,51 +146,72 @@ def transfer_kernels(scalar) -> SimpleNamespace:
                 r = collide(r, vec3(planes[i, 0], planes[i, 1], planes[i, 2]), modes[i], planes[i, 4])
         return r
 
+    @wp.func
+    def adj_contact(
+        u: vec3, y: vec3, planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int, seed: vec3
+    ):
+        a = seed
+        for reverse in range(count):
+            i = count - 1 - reverse
+            if inside(y, planes, i):
+                before = contact(u, y, planes, modes, i)
+                normal = vec3(planes[i, 0], planes[i, 1], planes[i, 2])
+                a = adj_collide(before, normal, modes[i], planes[i, 4], a)
+        return a
+
+    @wp.func
+    def node_count(window: wp.array(dtype=wp.vec3i)):
+        return window[1][0] * window[1][1] * window[1][2]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def clear(window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4)):
+        z = scalar(0.0)
+        for node in range(wp.tid(), node_count(window), threads):
+            store4(grid, node, vec4(z, z, z, z))
+
     @wp.kernel(module=module, enable_backward=False)
     def grid_update(
-        grid: wp.array(dtype=vec4), impulse: vec3, cutoff: scalar, origin: wp.array(dtype=wp.vec3i), dims: wp.vec3i,
+        window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4), impulse: vec3, cutoff: scalar,
         dx: scalar, planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int,
         velocity: wp.array(dtype=vec4),
     ):  # fmt: skip
-        node = wp.tid()
-        g = load4(grid, node)
-        u = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
-        if g[3] > cutoff:
-            u = free_velocity(g, impulse)
-            if count > 0:
-                u = contact(u, node_position(node, origin[0], dims, dx), planes, modes, count)
-        store3(velocity, node, u)
+        origin = window[0]
+        dims = window[1]
+        for node in range(wp.tid(), node_count(window), threads):
+            g = load4(grid, node)
+            u = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
+            if g[3] > cutoff:
+                u = free_velocity(g, impulse)
+                if count > 0:
+                    u = contact(u, node_position(node, origin, dims, dx), planes, modes, count)
+            store3(velocity, node, u)
 
     @wp.kernel(module=module, enable_backward=False)
     def adj_grid(
-        grid: wp.array(dtype=vec4), impulse: vec3, cutoff: scalar, origin: wp.array(dtype=wp.vec3i), dims: wp.vec3i,
+        window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4), impulse: vec3, cutoff: scalar,
         dx: scalar, planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int,
         adj_velocity: wp.array(dtype=vec4), adj_grid: wp.array(dtype=vec4),
     ):  # fmt: skip
-        node = wp.tid()
-        g = load4(grid, node)
-        if g[3] > cutoff:
-            a = load3(adj_velocity, node)
-            u = free_velocity(g, impulse)
-            if count > 0:
-                y = node_position(node, origin[0], dims, dx)
-                for reverse in range(count):
-                    i = count - 1 - reverse
-                    if inside(y, planes, i):
-                        before = contact(u, y, planes, modes, i)
-                        normal = vec3(planes[i, 0], planes[i, 1], planes[i, 2])
-                        a = adj_collide(before, normal, modes[i], planes[i, 4], a)
-            a = a / g[3]
-            # v = p/m: dL/dm = -a.(p/m)/m
-            store4(adj_grid, node, vec4(a[0], a[1], a[2], -(a[0] * g[0] + a[1] * g[1] + a[2] * g[2]) / g[3]))
-        else:
-            z = scalar(0.0)
-            store4(adj_grid, node, vec4(z, z, z, z))
+        origin = window[0]
+        dims = window[1]
+        for node in range(wp.tid(), node_count(window), threads):
+            g = load4(grid, node)
+            if g[3] > cutoff:
+                u = free_velocity(g, impulse)
+                a = load3(adj_velocity, node)
+                if count > 0:
+                    a = adj_contact(u, node_position(node, origin, dims, dx), planes, modes, count, a)
+                a = a / g[3]
+                # v = p/m: dL/dm = -a.(p/m)/m
+                store4(adj_grid, node, vec4(a[0], a[1], a[2], -(a[0] * g[0] + a[1] * g[1] + a[2] * g[2]) / g[3]))
+            else:
+                z = scalar(0.0)
+                store4(adj_grid, node, vec4(z, z, z, z))
 
     @wp.kernel(module=module, enable_backward=False)
     def g2p(
         x: wp.array(dtype=vec3), A: wp.array(dtype=mat33), velocity: wp.array(dtype=vec4),
-        origin: wp.array(dtype=wp.vec3i), dims: wp.vec3i, dx: scalar, inv_dx: scalar, dt: scalar,
+        window: wp.array(dtype=wp.vec3i), dx: scalar, inv_dx: scalar, dt: scalar,
         low: vec3, high: vec3, substep: int, flags: wp.array(dtype=wp.int64),
         x_new: wp.array(dtype=vec3), v_new: wp.array(dtype=vec3), C_new: wp.array(dtype=mat33),
         A_new: wp.array(dtype=mat33),
@@ -195,7 +220,8 @@ def transfer_kernels(scalar) -> SimpleNamespace:
         p = wp.tid()
         xp = x[p]
         base = cell(xp, inv_dx)
-        n = local_cell(base, origin[0], dims)
+        dims = window[1]
+        n = local_cell(base, window[0], dims)
         if n < 0:
             x_new[p] = xp
             return
@@ -248,7 +274,7 @@ def transfer_kernels(scalar) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def adj_g2p(
         x: wp.array(dtype=vec3), A: wp.array(dtype=mat33), velocity: wp.array(dtype=vec4), C_new: wp.array(dtype=mat33),
-        origin: wp.array(dtype=wp.vec3i), dims: wp.vec3i, dx: scalar, inv_dx: scalar, dt: scalar,
+        window: wp.array(dtype=wp.vec3i), dx: scalar, inv_dx: scalar, dt: scalar,
         adj_x_new: wp.array(dtype=vec3), adj_v_new: wp.array(dtype=vec3), adj_C_new: wp.array(dtype=mat33),
         adj_A_new: wp.array(dtype=mat33),
         adj_x: wp.array(dtype=vec3), adj_A: wp.array(dtype=mat33), adj_velocity: wp.array(dtype=vec4),
@@ -257,7 +283,8 @@ def transfer_kernels(scalar) -> SimpleNamespace:
         p = wp.tid()
         xp = x[p]
         base = cell(xp, inv_dx)
-        n = local_cell(base, origin[0], dims)
+        dims = window[1]
+        n = local_cell(base, window[0], dims)
         if n < 0:
             return
         f = xp * inv_dx - base
@@ -306,7 +333,7 @@ def transfer_kernels(scalar) -> SimpleNamespace:
     def adj_p2g(
         x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), C: wp.array(dtype=mat33), tau: wp.array(dtype=mat33),
         mass: wp.array(dtype=scalar), volume: wp.array(dtype=scalar),
-        origin: wp.array(dtype=wp.vec3i), dims: wp.vec3i, dx: scalar, inv_dx: scalar, dt: scalar,
+        window: wp.array(dtype=wp.vec3i), dx: scalar, inv_dx: scalar, dt: scalar,
         adj_grid: wp.array(dtype=vec4),
         adj_x: wp.array(dtype=vec3), adj_v: wp.array(dtype=vec3), adj_C: wp.array(dtype=mat33),
         adj_tau: wp.array(dtype=mat33),
@@ -315,7 +342,8 @@ def transfer_kernels(scalar) -> SimpleNamespace:
         p = wp.tid()
         xp = x[p]
         base = cell(xp, inv_dx)
-        n = local_cell(base, origin[0], dims)
+        dims = window[1]
+        n = local_cell(base, window[0], dims)
         if n < 0:
             return
         f = xp * inv_dx - base
@@ -374,6 +402,6 @@ def transfer_kernels(scalar) -> SimpleNamespace:
         adj_x[p] = adj_x[p] + inv_dx * (vec3(gx, gy, gz) - wp.transpose(B) * s)
 
     return SimpleNamespace(
-        p2g=p2g, grid_update=grid_update, g2p=g2p, adj_g2p=adj_g2p, adj_grid=adj_grid, adj_p2g=adj_p2g,
-        node_position=node_position, vec3=vec3, vec4=vec4, mat33=mat33,
+        clear=clear, p2g=p2g, grid_update=grid_update, g2p=g2p, adj_g2p=adj_g2p, adj_grid=adj_grid, adj_p2g=adj_p2g,
+        node_position=node_position, node_count=node_count, vec3=vec3, vec4=vec4, mat33=mat33,
     )  # fmt: skip

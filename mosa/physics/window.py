@@ -10,6 +10,8 @@ from mosa.errors import SimulationDiverged
 
 MAX_NODES = 2**23
 """Nodes of the largest window: 200 cells across."""
+SMALL = 2**16
+"""Nodes that a window may have too many: over a segment they cost about what a segment less, or a capture less, saves."""
 
 
 def extent(x: Tensor, v: Tensor) -> Tensor:
@@ -22,8 +24,8 @@ def grid_window(
 ) -> tuple[tuple, tuple]:
     """(lowest node, nodes per axis) that hold the stencils of all particles for `travel_time` seconds.
 
-    x, v: (N, 3); bounds: their extent, where the host has it already. Node counts are multiples of 4, so that a moving body seldom
-    changes them. Errors: SimulationDiverged for non-finite input or particles spread over more than 2^23 nodes.
+    x, v: (N, 3); bounds: their extent, where the host has it already. Errors: SimulationDiverged for non-finite input or particles
+    spread over more than 2^23 nodes.
     """
     bounds = extent(x, v).tolist() if bounds is None else bounds  # the only transfer to the host
     if not all(math.isfinite(b) for b in bounds):
@@ -42,4 +44,4 @@ def window_of(bounds: Sequence[float], dx: float, travel_time: float, margin: in
     reach = math.ceil(bounds[6] * travel_time / dx) + margin
     low = [math.floor(b / dx - 0.5) - reach for b in bounds[:3]]
     high = [math.floor(b / dx - 0.5) + 2 + reach for b in bounds[3:6]]
-    return tuple(low), tuple(-(-(h - l + 1) // 4) * 4 for l, h in zip(low, high))
+    return tuple(low), tuple(h - l + 1 for l, h in zip(low, high))

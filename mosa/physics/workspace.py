@@ -1,8 +1,9 @@
 """Device buffers of a segment of substeps, and the launches that advance it and run its adjoint.
 
-Everything is allocated once per (particles, slots, grid window); nothing allocates inside the substep loop. The launches of a
-segment are captured as one graph the second time they are asked for with the same time step: on CUDA that saves the waits between
-them, on a CPU the 10 us that Python takes for each.
+Everything is allocated once per (particles, slots); nothing allocates inside the substep loop. The launches of a segment are
+captured as one graph the second time they are asked for with the same time step: on CUDA that saves the waits between them, on a
+CPU the 10 us that Python takes for each. The grid's window is read from memory by the kernels, and the nodes' arrays are longer
+than it: a body that moves or speeds up goes through the same graphs.
 """
 
 import math
@@ -22,6 +23,7 @@ from mosa.physics.laws import SLOTS, Law
 from mosa.physics.material_kernels import kernels_of
 from mosa.physics.mpm_kernels import NO_EVENT, transfer_kernels
 from mosa.physics.particle_memory import aligned, zeros_in_one
+from mosa.physics.window import SMALL
 
 SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
 
@@ -62,10 +64,11 @@ class Steps(NamedTuple):
 
 MAX_GRAPHS = 64
 """Captured graphs a workspace keeps: one per pass and time step."""
-WINDOWS = 2**27
-"""Bytes of other windows' buffers that a workspace on a CPU keeps, with their graphs: a falling body comes back to them."""
-GRID = ("grid", "grid_wp", "velocity", "velocity_wp", "adj_grid", "adj_grid_wp", "adj_velocity", "adj_velocity_wp", "_graphs")
-"""What belongs to a size of the window."""
+SPARE = 1.5
+"""Nodes there is room for, over those of the window that asked for it: more than that cost new buffers and captures."""
+IDLE = 8
+"""Times the window's nodes that stay (`window.SMALL` in any case) for when it grows again: idle ones cost memory and, on CUDA,
+threads that end at once."""
 BLOCK = 64
 """Threads of a CUDA block: small ones, so that ten thousand particles are spread over all multiprocessors."""
 
@@ -140,20 +143,20 @@ class Workspace:
             self.all_adj_wp = wp.from_torch(buffer, dtype=self.scalar)
             self.adj_operator_wp = wp.from_torch(buffer[parts[1].storage_offset() :], dtype=self.scalar)
         self.flags, self.flags_wp = self._array((4,), wp.int64, torch.int64)
-        self.origin, self.origin_wp = self._array((1, 3), wp.vec3i, torch.int32)
+        self.window, self.window_wp = self._array((2, 3), wp.vec3i, torch.int32)
         self.planes_wp = wp.from_torch(numerics.planes, dtype=self.scalar)
         self.modes_wp = wp.from_torch(numerics.modes, dtype=wp.int32)
         self.colliders = None
         if numerics.colliders is not None:
             self.colliders = ColliderBuffers(
-                numerics.colliders, self.scalar, substeps, self._array, self._run, with_adjoint
+                numerics.colliders, self.scalar, substeps, self._array, self._over_nodes, with_adjoint
             )
         self.cutoff = 0.0
-        self.lowest, self.dims = (0, 0, 0), (0, 0, 0)
+        self.nodes = self.capacity = 0
+        self._placed: tuple | None = None
         self.steps = Steps(numerics.dt, numerics.dt)
         self._graphs: dict[tuple, object] = {}
         self._captures = Captures("substeps cannot be captured as a graph and are launched one by one")
-        self._windows: dict[tuple[int, int, int], dict] = {}
 
     def _array(self, shape: tuple[int, ...], kind, dtype: torch.dtype | None = None):
         tensor = torch.zeros(shape, dtype=dtype or self.numerics.dtype, device=self.numerics.device)
@@ -164,44 +167,41 @@ class Workspace:
         return list(tensor), [wp.from_torch(t, dtype=kind) for t in tensor]
 
     def tape(self) -> list[Tensor]:
-        """All that the adjoint reads of a forward pass, one tensor of slots each, the grid's last."""
-        parts = [self.x, self.v, self.C, self.F, self.tau] + ([self.A] if self.plastic else []) + [self.velocity, self.grid]
+        """Copies of all that the adjoint reads of a forward pass, one tensor of slots each, the grid's last."""
+        return [*copies(self._particle_slots()), self.grid_slots().clone(memory_format=torch.contiguous_format)]
+
+    def rewind(self, tape: Sequence[Tensor]) -> None:
+        """As if the forward pass that left `tape`, in the window that is set, had just run."""
+        torch._foreach_copy_(self._particle_slots(), list(tape[:-1]))
+        self.grid_slots().copy_(tape[-1])
+
+    def _particle_slots(self) -> list[Tensor]:
+        parts = [self.x, self.v, self.C, self.F, self.tau] + ([self.A] if self.plastic else [])
         return [part[0]._base for part in parts]
 
-    def set_window(self, origin: tuple[int, int, int], dims: tuple[int, int, int]) -> None:
-        """Place the grid: lowest node and number of nodes per axis. When dims change its buffers and graphs do too."""
-        if origin != self.lowest:
-            self.lowest = origin
-            self.origin.copy_(torch.tensor([origin], dtype=torch.int32), non_blocking=True)  # CUDA stages it before it returns
-        if dims == self.dims:
-            return
-        known = self._exchanged(dims)
-        self.dims, nodes = dims, dims[0] * dims[1] * dims[2]
-        if known is not None:
-            self.__dict__.update(known)
-            return
-        grids = self.substeps if self.with_adjoint else 1
-        self.grid, self.grid_wp = self._per_slot(grids, (nodes, 4), self.kernels.vec4)
-        self.velocity, self.velocity_wp = self._per_slot(grids, (nodes, 4), self.kernels.vec4)
-        if self.colliders is not None:
-            self.colliders.set_nodes(nodes)
-        if self.with_adjoint:
-            self.adj_grid, self.adj_grid_wp = self._array((nodes, 4), self.kernels.vec4)
-            self.adj_velocity, self.adj_velocity_wp = self._array((nodes, 4), self.kernels.vec4)
-        self._graphs = {}
+    def grid_slots(self) -> Tensor:
+        """(2, slots, nodes of the window, 4): momentum and mass, velocity."""
+        return self.fields[:, :, : self.nodes]
 
-    def _exchanged(self, dims: tuple[int, int, int]) -> dict | None:
-        """What a window of `dims` nodes had when it was left; what the present one has is kept for its return. On a CPU only: a GPU
-        has room for one window's buffers, and colliders have buffers of their own."""
-        if self.numerics.device.type == "cuda" or self.colliders is not None:
-            return None
-        if self.dims != (0, 0, 0):
-            self._windows[self.dims] = {name: self.__dict__[name] for name in GRID if name in self.__dict__}
-        known = self._windows.pop(dims, None)
-        each = 8 * len(self.grid) * torch.finfo(self.numerics.dtype).bits // 8 if self._windows else 0
-        while sum(each * math.prod(kept) for kept in self._windows) > WINDOWS:
-            self._windows.pop(next(iter(self._windows)))
-        return known
+    def set_window(self, origin: tuple[int, int, int], dims: tuple[int, int, int]) -> None:
+        """Place the grid: lowest node and number of nodes per axis. Buffers and graphs are new where there is no room for them."""
+        if self._placed != (origin, dims):
+            self._placed, self.nodes = (origin, dims), math.prod(dims)
+            rows = torch.tensor([origin, dims], dtype=torch.int32)
+            self.window.copy_(rows, non_blocking=True)  # CUDA stages it before it returns
+        if not self.nodes <= self.capacity <= max(IDLE * self.nodes, SMALL):
+            self._allocate_nodes(math.ceil(SPARE * self.nodes))
+
+    def _allocate_nodes(self, count: int) -> None:
+        self._graphs, self.capacity = {}, count
+        grids, vec4 = self.substeps if self.with_adjoint else 1, self.kernels.vec4
+        self.fields = torch.zeros((2, grids, count, 4), dtype=self.numerics.dtype, device=self.numerics.device)
+        self.grid_wp, self.velocity_wp = ([wp.from_torch(t, dtype=vec4) for t in slots] for slots in self.fields)
+        if self.colliders is not None:
+            self.colliders.set_nodes(count)
+        if self.with_adjoint:
+            self.adj_grid, self.adj_grid_wp = self._array((count, 4), vec4)
+            self.adj_velocity, self.adj_velocity_wp = self._array((count, 4), vec4)
 
     def load(
         self, state: tuple[Tensor, ...], held: dict[str, Tensor | None], volume: Tensor, mass: Tensor, cutoff: float,
@@ -220,7 +220,6 @@ class Workspace:
         if cutoff != self.cutoff:
             self.cutoff = cutoff
             self._graphs.clear()
-            self._windows.clear()
 
     def hold(self, held: dict[str, Tensor | None]) -> None:
         """Copy parameters and the adapter's operator in, those that are given."""
@@ -265,7 +264,7 @@ class Workspace:
             self._graphs.clear()
         if graph == "loaded":
             # on Warp's own stream: torch's default one cannot be captured
-            capture = wp.ScopedCapture(device=self.origin_wp.device, force_module_load=False)
+            capture = wp.ScopedCapture(device=self.flags_wp.device, force_module_load=False)
             graph = None
             if self._captures.succeeds(capture, body):
                 graph = self._graphs[key] = capture.graph
@@ -277,10 +276,16 @@ class Workspace:
             wp.capture_launch(graph, stream=stream)
 
     def _run(self, kernel, dim: int, inputs: list, adj_inputs: list | None = None) -> None:
-        launch(kernel, dim, inputs, self.origin_wp.device, adj_inputs)
+        launch(kernel, dim, inputs, self.flags_wp.device, adj_inputs)
+
+    def _over_nodes(self, kernel, inputs: list) -> None:
+        """Launch for all nodes of the window. Graphs hold the number of threads: one for all nodes on a CPU, on a CUDA device one
+        for each that there is room for."""
+        threads = self.capacity if self.flags_wp.device.is_cuda else 1
+        self._run(kernel, threads, [self.window_wp, threads, *inputs])
 
     def _geometry(self, dt: float) -> list:
-        return [self.origin_wp, wp.vec3i(*self.dims), self.numerics.dx, 1.0 / self.numerics.dx, dt]
+        return [self.window_wp, self.numerics.dx, 1.0 / self.numerics.dx, dt]
 
     def _kick(self, step: int) -> float:
         """For how long [s] the forces of a substep act."""
@@ -290,12 +295,11 @@ class Workspace:
         numerics = self.numerics
         impulse = self.kernels.vec3(*(self._kick(step) * g for g in numerics.gravity))
         return [
-            self.grid_wp[slot], impulse, self.cutoff, self.origin_wp, wp.vec3i(*self.dims), numerics.dx, self.planes_wp,
-            self.modes_wp, numerics.plane_count,
+            self.grid_wp[slot], impulse, self.cutoff, numerics.dx, self.planes_wp, self.modes_wp, numerics.plane_count,
         ]  # fmt: skip
 
     def _collider_place(self, slot: int) -> list:
-        return [self.grid_wp[slot], self.cutoff, self.origin_wp, wp.vec3i(*self.dims), self.numerics.dx]
+        return [self.grid_wp[slot], self.cutoff, self.numerics.dx]
 
     def _stress_arguments(self, state: int, slot: int) -> list:
         held = self.held_wp
@@ -311,20 +315,20 @@ class Workspace:
     def advance_steps(self, first: int, count: int) -> None:
         """Launch substeps `first` to `first + count` of the segment, from the states in slot `first`."""
         kernels, numerics, n = self.kernels, self.numerics, self.particles
-        states, grids = len(self.x), len(self.grid)
+        states, grids = len(self.x), len(self.grid_wp)
         geometry, kicked = self._geometry(self.steps.dt), self._geometry(self.steps.kick)
         low, high = kernels.vec3(*numerics.low), kernels.vec3(*numerics.high)
         if self.colliders is not None and first == 0:
             self.colliders.reset()
         for step in range(first, first + count):
             a, b, g = step % states, (step + 1) % states, step % grids
-            self.grid_wp[g].zero_()
+            self._over_nodes(kernels.clear, [self.grid_wp[g]])
             self._run(self.stress, n, self._stress_arguments(a, g))
             self._run(kernels.p2g, n, [
                 self.x_wp[a], self.v_wp[a], self.C_wp[a], self.F_wp[a], self.tau_wp[g], self.mass_wp, self.volume_wp,
                 *(geometry if step else kicked), int(numerics.check_J), step, self.flags_wp, self.grid_wp[g],
             ])  # fmt: skip
-            self._run(kernels.grid_update, len(self.grid[g]), [*self._grid_arguments(g, step), self.velocity_wp[g]])
+            self._over_nodes(kernels.grid_update, [*self._grid_arguments(g, step), self.velocity_wp[g]])
             if self.colliders is not None:
                 self.colliders.apply(step, self._collider_place(g), self._kick(step), self.velocity_wp[g])
             self._run(kernels.g2p, n, [
@@ -351,7 +355,7 @@ class Workspace:
                     self.adj_F_wp[a], self.adj_C_wp[b], held["parameters"], held["plastic_G"], held["plastic_h"], 0.0, 0.0, 0,
                     self.adj_F_wp[b],
                 ])  # fmt: skip
-            self.adj_velocity_wp.zero_()
+            self._over_nodes(kernels.clear, [self.adj_velocity_wp])
             self._run(kernels.adj_g2p, n, [
                 self.x_wp[step], self.A_wp[step], self.velocity_wp[step], self.C_wp[step + 1], *geometry,
                 self.adj_x_wp[b], self.adj_v_wp[b], self.adj_C_wp[b], self.adj_A_wp[b],
@@ -359,10 +363,9 @@ class Workspace:
             ])  # fmt: skip
             if self.colliders is not None:
                 # the velocities that the colliders found are cheaper to compute again than to keep
-                self._run(kernels.grid_update, len(self.grid[step]), [*self._grid_arguments(step, step), self.colliders.before_wp])
+                self._over_nodes(kernels.grid_update, [*self._grid_arguments(step, step), self.colliders.before_wp])
                 self.colliders.adjoint(step, self._collider_place(step), self._kick(step), self.adj_velocity_wp)
-            self._run(kernels.adj_grid, len(self.grid[step]),
-                      [*self._grid_arguments(step, step), self.adj_velocity_wp, self.adj_grid_wp])  # fmt: skip
+            self._over_nodes(kernels.adj_grid, [*self._grid_arguments(step, step), self.adj_velocity_wp, self.adj_grid_wp])
             if self.colliders is not None:
                 self.colliders.add_mass(self.adj_grid_wp)
             self._run(kernels.adj_p2g, n, [

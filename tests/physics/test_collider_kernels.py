@@ -42,14 +42,14 @@ def nodes():
     return DX * torch.cartesian_prod(*[torch.arange(n) for n in DIMS]).double()
 
 
-def arguments(colliders, mass, poses):
+def arguments(threads, colliders, mass, poses):
     packed = pack_colliders(colliders, torch.float64, torch.device("cpu"))
     grid = torch.cat([torch.zeros(COUNT, 3).double(), mass[:, None]], 1)
     kinds = (VEC3, MAT33, VEC3, VEC3)
     # poses are those of substep 2 of 3
     held = [torch.stack([torch.full_like(p, 7.0), torch.full_like(p, 7.0), p]).contiguous() for p in poses]
     return [
-        wp.from_torch(grid, dtype=VEC4), 0.0, wp.zeros(1, dtype=wp.vec3i, device="cpu"), wp.vec3i(*DIMS), DX, 1 / DT,
+        wp.array([(0, 0, 0), DIMS], dtype=wp.vec3i, device="cpu"), threads, wp.from_torch(grid, dtype=VEC4), 0.0, DX, 1 / DT,
         len(colliders), 2,
         *(wp.from_torch(t, dtype=kind) for t, kind in zip(packed, (wp.float64, wp.int32, wp.float64))),
         *(wp.from_torch(p, dtype=kind) for p, kind in zip(held, kinds)),
@@ -63,25 +63,25 @@ def padded(u):
 
 def forward(colliders, u, mass, poses):
     """(velocity, force, torque) of the kernel."""
-    velocity = padded(u)
+    velocity, threads = padded(u), 11  # some nodes for each
     force, torque = (torch.zeros(3, len(colliders), 3).double() for _ in range(2))
-    inputs = [*arguments(colliders, mass, poses), wp.from_torch(velocity, dtype=VEC4),
+    inputs = [*arguments(threads, colliders, mass, poses), wp.from_torch(velocity, dtype=VEC4),
               *(wp.from_torch(t, dtype=VEC3) for t in (force, torque))]  # fmt: skip
-    wp.launch(KERNELS.collide_nodes, COUNT, inputs=inputs, device="cpu")
+    wp.launch(KERNELS.collide_nodes, threads, inputs=inputs, device="cpu")
     assert float(force[:2].abs().sum() + torque[:2].abs().sum()) == 0
     return velocity[:, :3], force[2], torque[2]
 
 
 def backward(colliders, u, mass, poses, seeds):
     """Gradients in (u, mass, position, rotation, linear, angular) of the kernel."""
-    a = padded(seeds[0])
+    a, threads = padded(seeds[0]), COUNT + 5  # some without a node
     adj_force, adj_torque = (torch.stack([torch.full_like(s, 3.0)] * 2 + [s]).contiguous() for s in seeds[1:])
     adj_mass = torch.zeros(COUNT).double()
     adj_poses = [torch.zeros(3, *p.shape).double() for p in poses]
     kinds = [VEC4, VEC3, VEC3, VEC4, wp.float64, VEC3, MAT33, VEC3, VEC3]
     arrays = [padded(u), adj_force, adj_torque, a, adj_mass, *adj_poses]
-    inputs = [*arguments(colliders, mass, poses), *(wp.from_torch(t, dtype=kind) for t, kind in zip(arrays, kinds))]
-    wp.launch(KERNELS.adj_collide_nodes, COUNT, inputs=inputs, device="cpu")
+    inputs = [*arguments(threads, colliders, mass, poses), *(wp.from_torch(t, dtype=kind) for t, kind in zip(arrays, kinds))]
+    wp.launch(KERNELS.adj_collide_nodes, threads, inputs=inputs, device="cpu")
     return [a[:, :3], adj_mass, *(p[2] for p in adj_poses)]
 
 

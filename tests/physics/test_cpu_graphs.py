@@ -1,5 +1,6 @@
 """On a CPU the launches of a segment are captured too: the same bits as one by one, whatever sizes the window goes through."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -7,6 +8,8 @@ import torch
 import warp as wp
 
 from mosa.physics import workspace
+from mosa.physics.collider_motion import Motion
+from mosa.physics.colliders import Collider, Sphere
 from mosa.physics.rollout import Simulator
 from mosa.types import ParticleState
 
@@ -21,30 +24,51 @@ def falls(sim, state, *, mu=4e4, frames=9):
 
 
 @pytest.mark.parametrize("kept", [True, False])
-@pytest.mark.parametrize("windows", [workspace.WINDOWS, 0])
-def test_captured_segments_are_those_launched_one_by_one(kept, windows, make_block, monkeypatch):
-    monkeypatch.setattr(workspace, "WINDOWS", windows)
+@pytest.mark.parametrize("tight, collides", [(False, False), (True, False), (False, True)])
+def test_captured_segments_are_those_launched_one_by_one(kept, tight, collides, make_block, monkeypatch):
+    """tight: every window has buffers and graphs of its own size, else one size comes to serve all."""
+    if tight:
+        monkeypatch.setattr(workspace, "SPARE", 1)
+        monkeypatch.setattr(workspace, "IDLE", 1)
+        monkeypatch.setattr(workspace, "SMALL", 1)
     monkeypatch.setattr("mosa.physics.memory.KEPT_ON_CPU", 2**29 if kept else 0)
-    replays, dims = [], set()
-    launch, place = wp.capture_launch, workspace.Workspace.set_window
+    replays, launches, dims, sizes = [], [], set(), set()
+    replay, place, send = wp.capture_launch, workspace.Workspace.set_window, workspace.Workspace._launch
 
     def placed(work, origin, size):
         place(work, origin, size)
-        dims.add(work.dims)
+        dims.add(size)
+        sizes.add(work.capacity)
 
-    monkeypatch.setattr(wp, "capture_launch", lambda *a, **k: (replays.append(1), launch(*a, **k)))
+    monkeypatch.setattr(wp, "capture_launch", lambda *a, **k: (replays.append(1), replay(*a, **k)))
     monkeypatch.setattr(workspace.Workspace, "set_window", placed)
+    monkeypatch.setattr(workspace.Workspace, "_launch", lambda *a: (launches.append(1), send(*a)))
     state = make_block(velocity=(1.0, -4.0, 0.5))
     state = replace(state, v=state.v + 5 * (state.x - state.x.mean(0)))
-    sim = Simulator("corotated", dx=0.04, substeps=12, frame_dt=12 * 1e-3, gravity=(0.0, -90.0, 0.0), dtype=torch.float64)
-    found = [falls(sim, state) for _ in range(3)]
-    assert len(dims) > 1 and len(replays) >= (8 if windows else 1)
+    ball = Collider(Sphere(0.1), motion=Motion(position=(*state.x.mean(0)[:1].tolist(), -0.5, 0.1)), thickness=0.02)
+
+    def simulator():
+        return Simulator("corotated", dx=0.04, substeps=12, frame_dt=12 * 1e-3, gravity=(0.0, -90.0, 0.0), dtype=torch.float64,
+                         colliders=[ball] if collides else [])  # fmt: skip
+
+    sim, found = simulator(), []
+    for _ in range(3):
+        replays.clear(), launches.clear()
+        found.append(falls(sim, state))
+    assert len(dims) > 2 and len(launches) == (16 if kept else 24)
+    if tight:
+        assert sizes == {math.prod(size) for size in dims}
+    else:
+        assert len(sizes) < len(dims) and len(replays) == len(launches)
     others = falls(sim, state, mu=5e4)  # other numbers through the same graphs
     monkeypatch.setattr(workspace.Workspace, "_launch", lambda work, name, body: body())
     replays.clear()
-    expected, different = (falls(Simulator("corotated", dx=0.04, substeps=12, frame_dt=12 * 1e-3, gravity=(0.0, -90.0, 0.0),
-                                           dtype=torch.float64), state, mu=mu) for mu in (4e4, 5e4))  # fmt: skip
+    expected, different = (falls(simulator(), state, mu=mu) for mu in (4e4, 5e4))
     assert not replays
     for each in found:
         assert all(torch.equal(a, b) for a, b in zip(each, expected, strict=True))
     assert all(torch.equal(a, b) for a, b in zip(others, different, strict=True)) and not torch.equal(others[0], found[0][0])
+    if collides:
+        monkeypatch.setattr(workspace.Workspace, "_launch", send)
+        assert not torch.equal(falls(Simulator("corotated", dx=0.04, substeps=12, frame_dt=12 * 1e-3, gravity=(0.0, -90.0, 0.0),
+                                               dtype=torch.float64), state)[0], expected[0])  # fmt: skip
