@@ -11,7 +11,6 @@ states and nothing is asked a third time.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
@@ -22,9 +21,9 @@ from torch.func import functional_call
 
 from mosa.physics.activations import at_hand, same_weights
 from mosa.physics.capturing import ATTEMPTS, Captures
-from mosa.physics.mpm import SegmentSolver, wants_gradient, warp_stream
+from mosa.physics.mpm import LeftWindow, SegmentSolver, wants_gradient, warp_stream
 from mosa.physics.mpm_kernels import NO_EVENT
-from mosa.physics.window import grid_window
+from mosa.physics.window import fallen, grid_window
 from mosa.physics.workspace import Numerics, Workspace, copies
 
 ANSWER = ("G", "h", "plastic_G", "plastic_h")
@@ -38,10 +37,6 @@ class _Evaluation(NamedTuple):
     leaves: list[Tensor]
     answer: dict[str, Tensor | None]
     statistics: tuple[Tensor, ...]
-
-
-class LeftWindow(Exception):
-    """A particle left the window of a chain with marks: shorter ones have room for any speed."""
 
 
 class Learned(NamedTuple):
@@ -61,11 +56,6 @@ def addresses_of(adapter: nn.Module) -> tuple[int, ...]:
 def learned_of(adapter: nn.Module) -> Learned:
     wanted = {name: p for name, p in adapter.named_parameters() if p.requires_grad}
     return Learned(tuple(wanted), tuple(wanted.values()), addresses_of(adapter))
-
-
-def fallen(bounds: Sequence[float], numerics: Numerics, substeps: int) -> list[float]:
-    """`window.extent` with the speed of a body that gravity pulls on for so many substeps."""
-    return [*bounds[:6], bounds[6] + math.hypot(*numerics.gravity) * substeps * numerics.dt]
 
 
 class Chain:
@@ -119,7 +109,7 @@ class Chain:
         backward pass, which kept needs and any rollout with one has anyway. Errors: as `SegmentSolver.advance`; LeftWindow."""
         dx, dt, total = self.numerics.dx, self.numerics.dt, self.substeps
         work = self._full() if full else self._light()
-        bounds = fallen(solver.bounds(state), self.numerics, total)
+        bounds = fallen(solver.bounds(state), self.numerics.gravity, total * dt)
         for margin in (MARGIN, 3 + total // 2):
             window = grid_window(state[0], state[1], dx, 2 * total * dt, margin, bounds=bounds)
             self._load(work, window, solver, learned, state, packed)

@@ -12,10 +12,10 @@ from torch import Tensor, nn
 
 from mosa.errors import SimulationDiverged
 from mosa.physics.activations import at_hand
-from mosa.physics.chain import MARGIN, Chain, Learned, LeftWindow, advance_chain, fallen, learned_of
+from mosa.physics.chain import MARGIN, Chain, Learned, advance_chain, learned_of
 from mosa.physics.memory import free_memory, room
-from mosa.physics.mpm import SegmentSolver, substep_bytes, wants_gradient
-from mosa.physics.window import MAX_NODES, SMALL, window_of
+from mosa.physics.mpm import LeftWindow, SegmentSolver, substep_bytes, wants_gradient
+from mosa.physics.window import MAX_NODES, SMALL, fallen, window_of
 from mosa.physics.workspace import Numerics
 
 SEGMENT = 32
@@ -107,9 +107,9 @@ class Chains:
             return 1
 
         def nodes(count: int) -> int:
-            total = count * substeps
-            reach = fallen(bounds, self.numerics, total)
-            return math.prod(window_of(reach, self.numerics.dx, 2 * total * self.numerics.dt, MARGIN)[1])
+            time = count * substeps * self.numerics.dt
+            reach = fallen(bounds, self.numerics.gravity, time)
+            return math.prod(window_of(reach, self.numerics.dx, 2 * time, MARGIN)[1])
 
         # a state is in the graph and in the answer
         while count > 1 and (nodes(count) > min(nodes(1) + SMALL, MAX_NODES) or not room(self.numerics.device, 2 * count * size)):

@@ -12,12 +12,14 @@ from torch import Tensor
 
 from mosa.errors import SimulationDiverged
 from mosa.physics.mpm_kernels import INVERTED, NO_EVENT, NONFINITE, OUTSIDE, WINDOW
-from mosa.physics.window import MAX_NODES, SMALL, extent, grid_window, window_of
+from mosa.physics.window import MAX_NODES, SMALL, extent, fallen, grid_window, window_of
 from mosa.physics.workspace import Numerics, Steps, Workspace, copies
 
 HELD = ("parameters", "G", "h", "plastic_G", "plastic_h")
 LONGEST = 256
 """Most substeps of a segment of which no gradient is wanted, on CUDA: each segment costs a look at the host."""
+LONGEST_KEPT = 96
+"""The same where a gradient is wanted and all states are kept; its buffers hold those of a segment once more."""
 WIDENED = 32
 """Most substeps of a segment whose window may be widened for particles of any speed; longer ones are cut instead."""
 
@@ -26,6 +28,10 @@ def substep_bytes(numerics: Numerics, particles: int) -> int:
     """What the backward pass reads of a substep: 33 numbers a particle (42 where the law yields) and 8 a node, of which there is
     about one a particle."""
     return particles * (50 if numerics.law.plastic else 41) * torch.finfo(numerics.dtype).bits // 8
+
+
+class LeftWindow(Exception):
+    """A particle left the window of many substeps: of fewer, it has room for any speed."""
 
 
 def _identity(state: tuple[Tensor, ...]) -> tuple[int, int]:
@@ -77,45 +83,26 @@ class SegmentSolver:
         first: number of the first substep, for messages; steps: their times, the numerics' dt by default; kept: whether to make
         the last, [] otherwise.
 
-        Errors: SimulationDiverged naming substep and particle.
+        Errors: SimulationDiverged naming substep and particle; LeftWindow of more than `WIDENED` substeps.
         """
         # the speed at the start tells the window; a body that is being accelerated may need the most that the time step bound
         # allows, half a cell per substep
         steps = steps or Steps(self.numerics.dt, self.numerics.dt)
-        for margin in (2, 3 + substeps // 2):
+        for margin in (2, 3 + substeps // 2)[: 1 if substeps > WIDENED else 2]:
             found, flags, work = self._attempt(state, held, poses, substeps, margin, steps, kept)
             if not self.left_window(flags, first, steps.dt):
                 return *found, work.tape() if kept else []
-        raise self.left_behind(flags, first, steps.dt)
+        raise LeftWindow if substeps > WIDENED else self.left_behind(flags, first, steps.dt)
 
-    def advance_any(
-        self, state: tuple[Tensor, ...], held: dict, poses, substeps: int, first: int, steps: Steps | None = None
-    ) -> tuple[tuple, tuple]:
-        """(state, reactions) after any number of substeps, in as few pieces as windows of moderate size allow. No gradient."""
-        steps, done, reactions, most = steps or Steps(self.numerics.dt, self.numerics.dt), 0, [], LONGEST
-        while done < substeps:
-            count = self._piece(state, substeps - done, most, steps.dt)
-            along = None if poses is None else tuple(part[done : done + count] for part in poses)
-            if count <= WIDENED:
-                found = self.advance(state, held, along, count, first + done, steps)
-            else:
-                found, flags, _ = self._attempt(state, held, along, count, 2, steps)
-                if self.left_window(flags, first + done, steps.dt):
-                    most = WIDENED
-                    continue
-            state, reaction = found[:2]
-            reactions.append(reaction)
-            done, steps = done + count, Steps(steps.dt, steps.dt)
-        return state, tuple(torch.cat(parts) for parts in zip(*reactions, strict=True))
-
-    def _piece(self, state: tuple[Tensor, ...], left: int, most: int, dt: float) -> int:
+    def piece(self, state: tuple[Tensor, ...], left: int, most: int, dt: float) -> int:
         """How many of the `left` substeps the next window is to serve: at most `most`, and so few that it is not much larger than
         the window of `WIDENED` substeps."""
         bounds, pieces = self.bounds(state), -(-left // most)
         if not all(math.isfinite(b) for b in bounds):
             return min(left, WIDENED)
         while (count := -(-left // pieces)) > WIDENED:
-            long, short = (math.prod(window_of(bounds, self.numerics.dx, 2 * n * dt, 2)[1]) for n in (count, WIDENED))
+            reach = fallen(bounds, self.numerics.gravity, count * dt)
+            long, short = (math.prod(window_of(reach, self.numerics.dx, 2 * n * dt, 2)[1]) for n in (count, WIDENED))
             if long <= min(short + SMALL, MAX_NODES):
                 break
             pieces *= 2
@@ -126,7 +113,10 @@ class SegmentSolver:
     ) -> tuple[tuple[tuple, tuple, tuple], list[int], Workspace]:
         """((state, reactions, window), flags, workspace), in a window for the speeds at the start and `margin` nodes more."""
         x, v = state[:2]
-        window = grid_window(x, v, self.numerics.dx, 2 * substeps * steps.dt, margin, bounds=self.bounds(state))
+        time, bounds = substeps * steps.dt, self.bounds(state)
+        # a few substeps that gravity takes out of the window are cheaper than nodes for it in every window
+        bounds = fallen(bounds, self.numerics.gravity, time) if substeps > WIDENED else bounds
+        window = grid_window(x, v, self.numerics.dx, 2 * time, margin, bounds=bounds)
         work = self.prepare(state, held, poses, substeps, window, with_adjoint=kept, steps=steps)
         work.advance()
         final = work.final()
@@ -237,13 +227,26 @@ def advance_segment(
     poses: of K colliders at the segment's S substeps, as `collider_motion.Poses`, () where there are none; reactions: force [N]
     and torque about each collider's origin [N m], (S, K, 3), or (). steps: times of the substeps, the numerics' dt by default.
     """
-    inputs = (*state, *(held[name] for name in HELD), *poses)
-    if not wants_gradient(inputs):
-        return solver.advance_any(tuple(t.detach().contiguous() for t in state), held, poses or None, substeps, first, steps)
-    result = _Segment.apply(solver, substeps, first, steps, *inputs)
-    count = 5 if solver.numerics.law.plastic else 4
-    final, reaction = result[:count], result[count:]
-    return (final if count == 5 else (*final, final[3])), reaction
+    steps = steps or Steps(solver.numerics.dt, solver.numerics.dt)
+    count, done, most, reactions = 5 if solver.numerics.law.plastic else 4, 0, substeps, []
+    while done < substeps:
+        piece = solver.piece(state, substeps - done, most, steps.dt)
+        along = tuple(part[done : done + piece] for part in poses)
+        inputs = (*state, *(held[name] for name in HELD), *along)
+        try:
+            if wants_gradient(inputs):
+                result = _Segment.apply(solver, piece, first + done, steps, *inputs)
+                final, reaction = result[:count], result[count:]
+                state = final if count == 5 else (*final, final[3])
+            else:
+                state = tuple(t.detach().contiguous() for t in state)
+                state, reaction = solver.advance(state, held, along or None, piece, first + done, steps)[:2]
+        except LeftWindow:
+            most = WIDENED
+            continue
+        reactions.append(reaction)
+        done, steps = done + piece, Steps(steps.dt, steps.dt)
+    return state, reactions[0] if len(reactions) == 1 else tuple(torch.cat(parts) for parts in zip(*reactions, strict=True))
 
 
 def warp_stream(device: torch.device):

@@ -24,7 +24,7 @@ from mosa.physics.collider_motion import Motion, Trajectory, sample_frame, sampl
 from mosa.physics.colliders import Collider, pack_colliders, reach
 from mosa.physics.laws import SLOTS, law_named
 from mosa.physics.memory import room
-from mosa.physics.mpm import LONGEST, SegmentSolver, advance_segment, substep_bytes, wants_gradient
+from mosa.physics.mpm import LONGEST, LONGEST_KEPT, SegmentSolver, advance_segment, substep_bytes, wants_gradient
 from mosa.physics.particle_operations import first_advance, material_state
 from mosa.physics.plasticity import yield_factor
 from mosa.physics.workspace import SCALARS, Numerics, Steps
@@ -248,7 +248,11 @@ class Simulator:
         wanted = wants_gradient((*current, *held.values(), *poses))
         if not chained and (wanted or (adapter is not None and torch.is_grad_enabled())):
             solver.room = room(self.device, (frames - 1) * self.substeps * substep_bytes(self.numerics, n))
-        most_alone = LONGEST if self._long and not variable and not wanted else SEGMENT
+        most_alone = SEGMENT
+        if self._long and not variable and not wanted:
+            most_alone = LONGEST
+        elif self._long and not variable and solver.room:
+            most_alone = max(SEGMENT, min(LONGEST_KEPT, (frames - 1) * self.substeps // 8))
         for frame in range(1, frames):
             if frame > 1:
                 taken.append(substeps_of(frame, current[1], current[2], current[3]))

@@ -19,6 +19,11 @@ def extent(x: Tensor, v: Tensor) -> Tensor:
     return torch.cat([*torch.aminmax(x, dim=0), v.abs().amax().reshape(1)])
 
 
+def fallen(bounds: Sequence[float], gravity: Sequence[float], time: float) -> list[float]:
+    """`extent` with the speed of a body that gravity (3,) [m/s^2] pulls on for `time` seconds."""
+    return [*bounds[:6], bounds[6] + math.hypot(*gravity) * time]
+
+
 def grid_window(
     x: Tensor, v: Tensor, dx: float, travel_time: float, margin: int, bounds: Sequence[float] | None = None
 ) -> tuple[tuple, tuple]:

@@ -1,4 +1,4 @@
-"""Without gradients a segment on CUDA is long, as far as one window serves it. Here on a CPU: the same bits as short ones."""
+"""Segments on CUDA are long, as far as one window serves them. Here on a CPU: the same bits as short ones, the same gradients."""
 
 from dataclasses import replace
 
@@ -62,3 +62,39 @@ def test_divergence_in_a_long_segment_names_the_substep_of_the_short_one(make_bl
             run(make_block(), long, box=torch.tensor([[-1.0, 0.012, -1.0], [1.0, 1.0, 1.0]]), ground=None)
         messages.append(str(error.value))
     assert messages[0] == messages[1]
+
+
+def gradients(state, long, monkeypatch, *, kept=True, frames=9, stiffness=1.0, **options):
+    """(gradients in positions, velocities, their affine part and modulus, lengths of the segments that had buffers)."""
+    monkeypatch.setattr("mosa.physics.memory.KEPT_ON_CPU", 2**30 if kept else 0)
+    modulus = torch.tensor(4e4 * stiffness, dtype=torch.float64)
+    leaves = [t.clone().requires_grad_() for t in (state.x, state.v, state.C_affine, modulus)]
+    start = replace(state, x=leaves[0], v=leaves[1], C_affine=leaves[2])
+    found, lengths = run(start, long, frames=frames, parameters={"mu": leaves[3], "lam": 5e4 * stiffness}, **options)
+    loss = (found.x[1:] ** 2).sum() + 1e-3 * (found.F[1:] ** 2).sum()
+    if found.reactions is not None:
+        loss = loss + 1e-6 * found.reactions.square().sum()
+    return torch.autograd.grad(loss, leaves), lengths
+
+
+@pytest.mark.parametrize("case", ["falling", "against a collider", "fast", "leaves the window"])
+def test_gradients_through_long_segments(case, make_block, monkeypatch):
+    state, options, lengths = make_block(), {}, {70}
+    if case == "against a collider":
+        options = {"colliders": (COLLIDER,)}
+    elif case == "fast":
+        state, options, lengths = make_block(velocity=(40.0, 3.0, 0.0)), {"ground": None}, {35}
+    elif case == "leaves the window":  # a compressed body shows no speed at the start
+        state = make_block(velocity=(0.0, 0.0, 0.0))
+        state = replace(state, F=0.5 * state.F, C_affine=0 * state.C_affine)
+        options = {"dt": 1e-4, "stiffness": 200.0, "gravity": (0, 0, 0), "ground": None}
+    (long, found), (short, short_lengths) = (gradients(state, long, monkeypatch, **options) for long in (True, False))
+    assert max(short_lengths) <= 32 and (lengths <= found if case == "leaves the window" else found == lengths)
+    for a, b in zip(long, short, strict=True):
+        assert float(b.abs().max()) > 0
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-11 * float(b.abs().max()))
+
+
+def test_segments_are_long_only_where_their_states_are_kept(make_block, monkeypatch):
+    for kept, frames, expected in ((False, 9, {24, 23}), (True, 3, {24, 23}), (True, 6, {35})):
+        assert gradients(make_block(), True, monkeypatch, kept=kept, frames=frames)[1] == expected
