@@ -54,7 +54,7 @@ def measure(dtype: torch.dtype, particles: int, grid: int | None, substeps: int,
     volume = torch.full((particles,), (dx / 2) ** 3, dtype=dtype)
     solver = SegmentSolver(sim.numerics, volume, 1000.0, 0.0, {})
     held = {"parameters": sim.pack({"mu": 4e4, "lam": 6e4}, particles), "G": None, "h": None, "plastic_G": None, "plastic_h": None}
-    window = grid_window(state[0], state[1], dx, 2 * substeps * sim.dt, 2) if grid is None else ((0, 0, 0), (grid,) * 3)
+    window = grid_window(state[0], state[1], dx, substeps * sim.dt, 2) if grid is None else ((0, 0, 0), (grid,) * 3)
     results = []
     for with_adjoint in (False, True):
         work = solver.workspace(substeps, False, False, with_adjoint)

@@ -111,7 +111,7 @@ class Chain:
         work = self._full() if full else self._light()
         bounds = fallen(solver.bounds(state), self.numerics.gravity, total * dt)
         for margin in (MARGIN, 3 + total // 2):
-            window = grid_window(state[0], state[1], dx, 2 * total * dt, margin, bounds=bounds)
+            window = grid_window(state[0], state[1], dx, total * dt, margin, bounds=bounds)
             self._load(work, window, solver, learned, state, packed)
             self._capture()
             self._play(("forward", full))

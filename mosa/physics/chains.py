@@ -109,7 +109,7 @@ class Chains:
         def nodes(count: int) -> int:
             time = count * substeps * self.numerics.dt
             reach = fallen(bounds, self.numerics.gravity, time)
-            return math.prod(window_of(reach, self.numerics.dx, 2 * time, MARGIN)[1])
+            return math.prod(window_of(reach, self.numerics.dx, time, MARGIN)[1])
 
         # a state is in the graph and in the answer
         while count > 1 and (nodes(count) > min(nodes(1) + SMALL, MAX_NODES) or not room(self.numerics.device, 2 * count * size)):

@@ -102,7 +102,7 @@ class SegmentSolver:
             return min(left, WIDENED)
         while (count := -(-left // pieces)) > WIDENED:
             reach = fallen(bounds, self.numerics.gravity, count * dt)
-            long, short = (math.prod(window_of(reach, self.numerics.dx, 2 * n * dt, 2)[1]) for n in (count, WIDENED))
+            long, short = (math.prod(window_of(reach, self.numerics.dx, n * dt, 2)[1]) for n in (count, WIDENED))
             if long <= min(short + SMALL, MAX_NODES):
                 break
             pieces *= 2
@@ -116,7 +116,7 @@ class SegmentSolver:
         time, bounds = substeps * steps.dt, self.bounds(state)
         # a few substeps that gravity takes out of the window are cheaper than nodes for it in every window
         bounds = fallen(bounds, self.numerics.gravity, time) if substeps > WIDENED else bounds
-        window = grid_window(x, v, self.numerics.dx, 2 * time, margin, bounds=bounds)
+        window = grid_window(x, v, self.numerics.dx, time, margin, bounds=bounds)
         work = self.prepare(state, held, poses, substeps, window, with_adjoint=kept, steps=steps)
         work.advance()
         final = work.final()

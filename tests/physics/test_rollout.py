@@ -12,6 +12,7 @@ from mosa.errors import ConfigError, SimulationDiverged
 from mosa.physics.elasticity import lame
 from mosa.physics.mpm import SegmentSolver, grid_window, substep_bytes
 from mosa.physics.rollout import AdapterOperator, MaterialState, Simulator
+from mosa.physics.window import GAINED, extent, fallen, window_of
 from mosa.physics.workspace import Workspace
 from mosa.types import Ground, ParticleState
 
@@ -287,6 +288,28 @@ def test_acceleration_within_a_segment_widens_the_window(make_block, monkeypatch
         results.append((rollout.x.detach(), torch.autograd.grad((rollout.x[-1] ** 2).sum(), leaf)[0]))
     assert margins[:3] == [2, 19, 2]  # the long segment needed the second window
     assert torch.equal(results[0][0], results[1][0]) and torch.equal(results[0][1], results[1][1])
+
+
+def test_a_window_goes_where_the_particles_go(make_block):
+    """It holds the stencils of what flies on for the time given, and is not wide where nothing flies to."""
+    state, time, gravity = make_block(velocity=(0.0, 0.0, 0.0)), 0.02, (0.0, -9.8, 0.0)
+    spread = state.x - state.x.mean(0)
+    for velocity in ((0.0, 0.0, 0.0), (0.0, -6.0, 0.0), (5.0, -3.0, 1.0)):
+        v = torch.tensor(velocity, dtype=torch.float64) + 30 * spread * torch.tensor([1.0, 0.2, 0.0], dtype=torch.float64)
+        bounds = fallen(extent(state.x, v).tolist(), gravity, time)
+        low, dims = window_of(bounds, DX, time, 2)
+        assert (low, dims) == grid_window(state.x, v, DX, time, 2, bounds=bounds)
+        low, high = torch.tensor(low), torch.tensor(low) + torch.tensor(dims) - 1
+        fastest = v + time * torch.tensor(gravity, dtype=torch.float64)
+        for x in (state.x, state.x + time * v, state.x + time * fastest, state.x + GAINED * time * fastest):
+            base = (x / DX - 0.5).floor()
+            assert (base - 2 >= low).all() and (base + 2 + 2 <= high).all()
+    still, falls = (
+        window_of(extent(state.x, torch.tensor([0.0, -v, 0.0]).double().expand_as(state.x)).tolist(), DX, time, 2) for v in (0, 6)
+    )
+    below = [a - b for a, b in zip(still[0], falls[0])]
+    above = [b - a - c for a, b, c in zip(still[1], falls[1], below)]
+    assert (below, above) == ([2, 5, 2], [2, 2, 2])  # 3 cells at 6 m/s, half as many again; half of them elsewhere
 
 
 class TestErrors:
