@@ -1,30 +1,71 @@
 """What a run saw and what it learned, side by side in a browser:  python -m mosa.viewer run=outputs/train/<date>/<time>
 
-The observed motion (the reconstruction's splats, of the sequences learned from) and beside it the learned twin. Needs viser: the
+The observed motion (the reconstruction's splats, of the sequences learned from) and beside it the learned body's. Needs viser: the
 extra `viewer`.
 """
 
 from __future__ import annotations
 
+import math
+import socket
 import sys
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
 
 from mosa.errors import ConfigError, DataError, MosaError
+from mosa.modules.body import World
 from mosa.modules.observer import deformed_covariances
 from mosa.twin import Twin
 
 COLORS = ("appearance", "heterogeneity", "deviation")
+LAYOUTS = ("side by side", "overlaid", "observed", "learned")
+GEOMETRY = ("splats", "particles")
 DISTANCE = 1.4
 """Between the two bodies, in widths of what they take up together."""
-SLOWEST = 5.0
-"""Frames per second at which a sequence is played, at most: real time is over before one has looked."""
+FIELD_OF_VIEW = math.radians(40)
+"""Vertical, of the first view: less distorted at the rim than viser's 75 degrees."""
+GRAY = 0.6
+"""Of what has no value, and of the observed body where it lies over the learned one: white would not be seen on viser's white."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Colours of a quantity: `colors` (of matplotlib) over low to high, in the unit that `label` names. beyond: max where values
+    can lie above high, which the legend then shows."""
+
+    label: str
+    colors: str
+    low: float
+    high: float
+    beyond: str = "neither"
+
+    def paint(self, values: np.ndarray) -> np.ndarray:
+        """(N, 3) colours in [0, 1] of (N,) values."""
+        return matplotlib.colormaps[self.colors]((values - self.low) / (self.high - self.low))[:, :3]
+
+    def legend(self) -> np.ndarray:
+        """(H, W, 3) picture of the colour bar, 8 bit."""
+        figure = Figure(figsize=(3.2, 0.7), dpi=200, layout="constrained")
+        canvas = FigureCanvasAgg(figure)
+        shown = ScalarMappable(Normalize(self.low, self.high), self.colors)
+        bar = figure.colorbar(shown, cax=figure.add_subplot(), orientation="horizontal", extend=self.beyond)
+        bar.set_label(self.label, fontsize=9)
+        bar.ax.tick_params(labelsize=8)
+        canvas.draw()
+        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 @dataclass(frozen=True)
@@ -37,66 +78,124 @@ class Motion:
 
 @dataclass(frozen=True)
 class Clip:
-    """A sequence of a run. times: (T,) [s]; twin: over all frames; observed: over the frames that were learned from, or None;
-    appearance: (N, 3) in [0, 1]; opacities: (N,); factor: (N,) learned stiffness over the mean law's; up: (3,)."""
+    """A sequence of a run. times: (T,) [s]; learned: over all frames; observed: over the frames that were learned from, or None;
+    appearance: (N, 3) in [0, 1]; opacities: (N,); factor: (N,) 1 + a tanh eta, by which a particle's stiffness
+    differs from the law's."""
 
     name: str
     times: np.ndarray
-    twin: Motion
+    learned: Motion
     observed: Motion | None
     appearance: np.ndarray
     opacities: np.ndarray
     factor: np.ndarray
-    up: np.ndarray
+    world: World
+
+    @property
+    def up(self) -> np.ndarray:
+        """(3,) unit vector."""
+        return self.world.up.numpy()
 
     @property
     def size(self) -> float:
         """Largest extent of the body at the start [m]."""
-        return float(np.ptp(self.twin.centers[0], axis=0).max())
+        return float(np.ptp(self.learned.centers[0], axis=0).max())
+
+    @property
+    def across(self) -> np.ndarray:
+        """(3,) horizontal unit vector, from the observed body to the learned one."""
+        across = np.eye(3)[np.abs(self.up).argmin()]
+        across = across - (across @ self.up) * self.up
+        return across / np.linalg.norm(across)
+
+    @property
+    def moved(self) -> np.ndarray:
+        """(M, 3) all positions of both [m]."""
+        both = [self.learned.centers] if self.observed is None else [self.learned.centers, self.observed.centers]
+        return np.concatenate([motion.reshape(-1, 3) for motion in both])
 
     @property
     def side(self) -> np.ndarray:
-        """(3,) shift of the twin beside the observed body [m], horizontal."""
-        across = np.eye(3)[np.abs(self.up).argmin()]
-        across = across - (across @ self.up) * self.up
-        across = across / np.linalg.norm(across)
-        moved = self.twin.centers if self.observed is None else np.concatenate([*self.twin.centers, *self.observed.centers])
-        return DISTANCE * float(np.ptp(moved @ across)) * across
+        """(3,) shift of the learned body beside the observed one [m]."""
+        return DISTANCE * float(np.ptp(self.moved @ self.across)) * self.across
 
     def deviation(self, frame: int) -> np.ndarray | None:
-        """(N,) distance [m] of the twin's particles from the observed ones; None where nothing was observed."""
+        """(N,) distance [m] of the learned body's particles from the observed ones; None where nothing was observed."""
         if self.observed is None or frame >= len(self.observed.centers):
             return None
-        return np.linalg.norm(self.twin.centers[frame] - self.observed.centers[frame], axis=-1)
+        return np.linalg.norm(self.learned.centers[frame] - self.observed.centers[frame], axis=-1)
+
+    @cached_property
+    def scales(self) -> dict[str, Scale]:
+        """Of each quantity, the same for all frames: a colour means one value while the sequence plays."""
+        span = max(float(np.abs(self.factor - 1).max()), 0.01)  # what differs by less than 1 % shall not look like a contrast
+        found = {"heterogeneity": Scale(r"stiffness factor $1 + a\,\tanh\,\eta$ [-]", "coolwarm", 1 - span, 1 + span)}
+        if self.observed is not None:
+            high = max(float(np.quantile(self.deviation(t), 0.99)) for t in range(len(self.observed.centers)))
+            found["deviation"] = Scale("distance learned - observed [mm]", "viridis", 0, max(1e3 * high, 1e-3), "max")
+        return found
 
     def paint(self, frame: int, by: str) -> np.ndarray:
-        """(N, 3) colours in [0, 1]. heterogeneity: blue softer, red stiffer, as far as the most different particle; deviation: dark
-        0, yellow a tenth of the body's size, white where nothing was observed. Errors: ConfigError for another name."""
+        """(N, 3) colours in [0, 1] of the learned body. heterogeneity: blue softer, red stiffer; deviation: up to the 99th
+        percentile of the sequence's worst frame, gray where nothing was observed. Errors: ConfigError for another name."""
         if by not in COLORS:
             raise ConfigError(f"color: expected {' or '.join(COLORS)}, found {by!r}")
         if by == "appearance":
             return self.appearance
         if by == "heterogeneity":
-            span = max(float(np.abs(self.factor - 1).max()), 1e-6)
-            return matplotlib.colormaps["coolwarm"](0.5 + 0.5 * (self.factor - 1) / span)[:, :3]
+            return self.scales[by].paint(self.factor)
         far = self.deviation(frame)
-        if far is None:
-            return np.ones_like(self.appearance)
-        return matplotlib.colormaps["inferno"](0.9 * (far / (0.1 * self.size)).clip(0, 1))[:, :3]
+        return np.full_like(self.appearance, GRAY) if far is None else self.scales[by].paint(1e3 * far)
 
     def caption(self, frame: int) -> str:
-        """One line on a frame."""
-        said = f"{self.name}, frame {frame}, {self.times[frame] - self.times[0]:.3f} s"
+        """What a frame is, and what the scene leaves out."""
+        said = f"**{self.name}**, frame {frame}, {self.times[frame] - self.times[0]:.3f} s  \n"
         far = self.deviation(frame)
-        return said if far is None else f"{said}: rms distance {1e3 * float(np.sqrt(np.square(far).mean())):.1f} mm"
+        if self.observed is None:
+            said += "No observed motion: the learned body alone."
+        elif far is None:
+            said += "Not observed in this frame."
+        else:
+            said += f"rms distance learned - observed {1e3 * float(np.sqrt(np.square(far).mean())):.1f} mm"
+        if self.world.ground is not None:
+            said += f"  \nGround grid: {1e3 * cell(self.size):g} mm"
+        hidden = {"walls": len(self.world.planes), "colliders": len(self.world.colliders)}
+        if any(hidden.values()):
+            said += "  \nNot drawn: " + ", ".join(f"{kind} ({count})" for kind, count in hidden.items() if count)
+        return said
+
+
+def cell(size: float) -> float:
+    """Width [m] of a ground cell for a body of that size: the power of ten below it."""
+    return 10.0 ** math.floor(math.log10(size))
+
+
+def first_view(clips: Sequence[Clip]) -> tuple[np.ndarray, np.ndarray]:
+    """((3,) camera, (3,) point looked at) [m]: all motions side by side, seen from the front and a little above."""
+    across, up = clips[0].across, clips[0].up
+    axes = np.stack([across, up, np.cross(across, up)])  # right, up, to the camera
+    seen = [clip.moved for clip in clips] + [clip.moved + clip.side for clip in clips if clip.observed is not None]
+    seen = np.concatenate([np.stack([part.min(0), part.max(0)]) for part in (points @ axes.T for points in seen)])
+    low, high = seen.min(0), seen.max(0)
+    if clips[0].world.ground is not None:
+        low[1] = min(low[1], clips[0].world.ground.height)
+    corners = 0.5 * (high - low) * np.array(list(product((-1, 1), repeat=3)))
+    toward = np.array([0, 0.25, 1]) / math.hypot(0.25, 1)
+    rim = np.abs(np.stack([corners[:, 0], corners @ np.cross(toward, [1, 0, 0])])).max(0)  # to the right, and up in the picture
+    distance = (corners @ toward + 1.15 * rim / math.tan(FIELD_OF_VIEW / 2)).max()  # all in a square window, and a margin
+    target = 0.5 * (low + high) @ axes
+    return target + distance * toward @ axes, target
 
 
 @torch.no_grad()
 def read_run(folder: str | Path) -> list[Clip]:
     """The sequences of a run, the training one first. Errors: DataError naming the file that is missing or of another run."""
     folder = Path(folder)
+    if not folder.is_dir():
+        raise DataError(f"run: expected the folder of a finished run (run=outputs/train/<date>/<time>), found no folder {folder}")
+    rollouts, seen = arrays(folder / "rollout.npz"), {}  # first: it is what a run that has not ended lacks
     twin = Twin.load(folder / "checkpoints" / "last.ckpt")
-    body, rollouts, seen = twin.body, arrays(folder / "rollout.npz"), {}
+    body = twin.body
     if (folder / "observed.npz").is_file():  # runs of before it was written, and those of eval.py, have none
         seen = arrays(folder / "observed.npz")
     factor = body.factor(body.heterogeneity)
@@ -111,7 +210,7 @@ def read_run(folder: str | Path) -> list[Clip]:
             observed = Motion(seen[f"{name}/x"], seen[f"{name}/covariances"])
         clips.append(Clip(
             name, rollouts[f"{name}/times"], Motion(rollouts[f"{name}/x"], shapes.numpy()), observed,
-            body.colors.clamp(0, 1).numpy(), body.opacities.numpy(), factor.numpy(), twin.world.up.numpy(),
+            body.colors.clamp(0, 1).numpy(), body.opacities.numpy(), factor.numpy(), twin.world,
         ))  # fmt: skip
     if not clips:
         raise DataError(f"{folder / 'rollout.npz'}: expected the rollouts of a run, found none")
@@ -121,7 +220,8 @@ def read_run(folder: str | Path) -> list[Clip]:
 def arrays(path: Path) -> dict[str, np.ndarray]:
     """Contents of an npz file. Errors: DataError naming it."""
     if not path.is_file():
-        raise DataError(f"{path}: file not found; expected the folder of a finished run (run=outputs/train/<date>/<time>)")
+        raise DataError(f"{path}: file not found; expected the folder of a finished run (run=outputs/train/<date>/<time>); "
+                        "train.py writes this file at its end; it resumes with ckpt_path=<run folder>/checkpoints/last.ckpt")
     try:
         with np.load(path) as stored:
             return {key: stored[key] for key in stored.files}
@@ -130,30 +230,66 @@ def arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 class Viewer:
-    """A viser server that plays clips. host: 127.0.0.1 shows to this machine alone. Errors: ConfigError without viser."""
+    """A viser server that plays clips. host: 127.0.0.1 shows to this machine alone; port: the next free one where it is taken.
+    Errors: ConfigError without viser, or for a host that is no address of this machine."""
 
     def __init__(self, clips: Sequence[Clip], *, host: str = "127.0.0.1", port: int = 8080) -> None:
         try:
             import viser
         except ImportError as error:
             raise ConfigError("viewer: expected the package viser, found none: pip install -e '.[viewer]'") from error
+        try:  # viser's own server would try port after port and then wait for ever
+            with socket.create_server((host, 0)):
+                pass
+        except OSError as error:
+            raise ConfigError(f"host: expected 127.0.0.1, 0.0.0.0 or this machine's address, found {host!r} ({error})") from error
         self.clips, self.ended, self.drawing = {clip.name: clip for clip in clips}, threading.Event(), threading.RLock()
         self.server = viser.ViserServer(host=host, port=port, label="MoSA", verbose=False)
-        self.server.scene.set_up_direction(tuple(float(u) for u in clips[0].up))
-        gui, first = self.server.gui, clips[0]
+        first = clips[0]
+        self.place(clips)
+        gui = self.server.gui
         self.sequence = gui.add_dropdown("sequence", list(self.clips), initial_value=first.name)
+        self.layout = gui.add_dropdown("layout", LAYOUTS, initial_value=LAYOUTS[0], disabled=first.observed is None)
         self.frame = gui.add_slider("frame", 0, len(first.times) - 1, 1, 0)
         self.play = gui.add_checkbox("play", False)
-        self.color = gui.add_dropdown("color", COLORS, initial_value=COLORS[0])
-        self.points = gui.add_checkbox("particles in place of splats", False)
-        self.beside = gui.add_checkbox("side by side", True)
+        self.rate = gui.add_slider("frames per second", 1, 30, 1, 5)
+        self.geometry = gui.add_dropdown("geometry", GEOMETRY, initial_value=GEOMETRY[0])
+        self.color = gui.add_dropdown("color", COLORS, initial_value=COLORS[0], hint="of the learned body")
+        self.legend = gui.add_image(np.full((1, 1, 3), 255, np.uint8), format="png", visible=False)
         self.caption = gui.add_markdown("")
         self.sequence.on_update(lambda _: self.choose())
-        for handle in (self.frame, self.color, self.points, self.beside):
+        self.color.on_update(lambda _: self.explain())
+        for handle in (self.frame, self.color, self.geometry, self.layout):
             handle.on_update(lambda _: self.draw())
         self.draw()
         self.player = threading.Thread(target=self.run, daemon=True)
         self.player.start()
+
+    def place(self, clips: Sequence[Clip]) -> None:
+        """What does not move: ground, first view, and the two bodies' nodes, which `draw` fills."""
+        scene, camera, clip = self.server.scene, self.server.initial_camera, clips[0]
+        scene.set_up_direction(tuple(float(u) for u in clip.up))
+        eye, target = first_view(clips)
+        camera.look_at, camera.position, camera.fov = target, eye, FIELD_OF_VIEW
+        camera.near = 1e-3 * float(np.linalg.norm(eye - target))
+        if clip.world.ground is not None:
+            axes = np.stack([clip.across, np.cross(clip.up, clip.across), clip.up], axis=1)  # the grid's x, y and normal
+            at, width = target + (clip.world.ground.height - target @ clip.up) * clip.up, cell(clip.size)
+            at = axes @ np.array([*(width * np.round(axes.T[:2] @ at / width)), at @ clip.up])  # lines at multiples of the width
+            extent = 2 * width * math.ceil(float(np.linalg.norm(eye - target)) / width)
+            scene.add_grid("/ground", extent, extent, plane="xy", cell_size=width, section_size=10 * width, position=at,
+                           wxyz=np.roll(Rotation.from_matrix(axes).as_quat(), 1))
+        # viser keeps covariances as float16, whose steps are 6e-8 below 6e-5: in m^2 a splat of 0.5 mm would lose its shape
+        self.unit = float(np.sqrt(np.linalg.eigvalsh(clip.learned.covariances[0]).max()))
+        self.nodes = {}
+        for name in ("observed", "learned"):
+            centers, colors = clip.learned.centers[0].astype(np.float32), clip.appearance.astype(np.float32)
+            splats = scene.add_gaussian_splats(f"/{name}/splats", centers, clip.learned.covariances[0], colors,
+                                               clip.opacities[:, None], scale=self.unit, visible=False)
+            spacing = 0.5 * clip.size / len(centers) ** (1 / 3)
+            points = scene.add_point_cloud(f"/{name}/particles", centers, colors, point_size=spacing, point_shape="circle",
+                                           precision="float32", visible=False)
+            self.nodes[name] = splats, points, scene.add_label(f"/{name}/label", name, anchor="bottom-center", visible=False)
 
     @property
     def clip(self) -> Clip:
@@ -163,41 +299,55 @@ class Viewer:
         """Another sequence, from its start."""
         with self.drawing:
             self.frame.max, self.frame.value = len(self.clip.times) - 1, 0
+            self.layout.disabled = self.clip.observed is None
+            self.explain()
             self.draw()
+
+    def explain(self) -> None:
+        """The colours' legend."""
+        scale = self.clip.scales.get(self.color.value)
+        self.legend.visible = scale is not None
+        if scale is not None:
+            self.legend.image = scale.legend()
 
     def draw(self) -> None:
         """The current frame."""
         with self.drawing, self.server.atomic():
-            clip = self.clip
+            clip, layout = self.clip, "learned" if self.clip.observed is None else self.layout.value
             frame = min(int(self.frame.value), len(clip.times) - 1)
-            beside = clip.side if self.beside.value and clip.observed is not None else np.zeros(3)
-            self.body("twin", clip, clip.twin, frame, clip.paint(frame, self.color.value), beside)
-            self.body("observed", clip, clip.observed, frame, clip.appearance, np.zeros(3))
+            gray = np.full_like(clip.appearance, GRAY) if layout == "overlaid" else clip.appearance
+            self.body("observed", clip.observed if layout != "learned" else None, frame, gray, np.zeros(3))
+            self.body("learned", clip.learned if layout != "observed" else None, frame, clip.paint(frame, self.color.value),
+                      clip.side if layout == "side by side" else np.zeros(3))
             self.caption.content = clip.caption(frame)
 
-    def body(self, name: str, clip: Clip, motion: Motion | None, frame: int, colors: np.ndarray, shift: np.ndarray) -> None:
+    def body(self, name: str, motion: Motion | None, frame: int, colors: np.ndarray, shift: np.ndarray) -> None:
         """One of the two, or nothing where it has no such frame."""
-        scene = self.server.scene
-        for kind in ("splats", "points"):
-            scene.remove_by_name(f"/{name}/{kind}")
-        if motion is None or frame >= len(motion.centers):
+        clip, (splats, points, label) = self.clip, self.nodes[name]
+        shown = motion is not None and frame < len(motion.centers)
+        splats.visible = shown and self.geometry.value == "splats"
+        points.visible = shown and self.geometry.value == "particles"
+        label.visible = shown
+        if not shown:
             return
-        centers = (motion.centers[frame] + shift).astype(np.float32)
-        if self.points.value:
-            spacing = 0.5 * float(clip.size / len(centers) ** (1 / 3))
-            scene.add_point_cloud(f"/{name}/points", centers, (255 * colors).astype(np.uint8), point_size=spacing)
+        centers = motion.centers[frame] + shift
+        if splats.visible:
+            splats.set_gaussians((centers / self.unit).astype(np.float32), motion.covariances[frame] / self.unit**2, colors,
+                                 clip.opacities[:, None])
         else:
-            scene.add_gaussian_splats(f"/{name}/splats", centers, motion.covariances[frame].astype(np.float32),
-                                      colors.astype(np.float32), clip.opacities[:, None].astype(np.float32))
+            points.points, points.colors = centers.astype(np.float32), (255 * colors).astype(np.uint8)
+        overlaid = self.layout.value == "overlaid" and clip.observed is not None
+        label.text = f"{name} (gray)" if overlaid and name == "observed" else name
+        height = 0.05 * clip.size if not overlaid or name == "learned" else 0.15 * clip.size  # the labels one above the other
+        top = (centers @ clip.up).max() + height
+        middle = 0.5 * (centers.min(0) + centers.max(0))
+        label.position = middle + (top - middle @ clip.up) * clip.up
 
     def run(self) -> None:
         """Advances the slider while `play` is on, until `stop`."""
-        while True:
-            times = self.clip.times
-            if self.ended.wait(max(1 / SLOWEST, float(times[1] - times[0]))):
-                return
+        while not self.ended.wait(1 / self.rate.value):
             if self.play.value:
-                self.frame.value = (int(self.frame.value) + 1) % len(times)  # draws
+                self.frame.value = (int(self.frame.value) + 1) % len(self.clip.times)  # draws
 
     def stop(self) -> None:
         """Ends the player and the server."""
@@ -228,7 +378,10 @@ def main(arguments: Sequence[str]) -> None:
     except MosaError as error:
         print(f"\n{type(error).__name__}: {error}", file=sys.stderr)
         sys.exit(2)
-    print(f"http://{chosen['host']}:{viewer.server.get_port()} shows {', '.join(viewer.clips)}; Ctrl-C ends it")
+    port = viewer.server.get_port()
+    if port != int(chosen["port"]):
+        print(f"port {chosen['port']} is taken; serving on {port}")
+    print(f"http://{chosen['host']}:{port} shows {', '.join(viewer.clips)}; Ctrl-C ends it")
     try:
         viewer.ended.wait()
     except KeyboardInterrupt:

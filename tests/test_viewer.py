@@ -1,8 +1,11 @@
 """What the viewer shows of a run: read from its folder, painted, placed; and, where viser is installed, served."""
 
+import socket
 import sys
 import time
+from dataclasses import replace
 
+import matplotlib
 import numpy as np
 import pytest
 import torch
@@ -13,10 +16,12 @@ from mosa.errors import ConfigError, DataError
 from mosa.modules.body import Body, SimulationSettings, Start
 from mosa.modules.heterogeneity import HeterogeneityField
 from mosa.modules.material import Material
+from mosa.physics.colliders import domain_walls
 from mosa.twin import Twin, save_observed, save_rollout
 from mosa.types import MotionCues, Rollout
 
 N, T, SEEN = 27, 5, 3
+GROUND = -0.2
 
 
 def rollout(shift: float) -> Rollout:
@@ -34,7 +39,7 @@ def run(tmp_path, monkeypatch):
     """A run folder: one sequence that was observed for three frames, and a held-out one."""
     tensors = {"rest": rollout(0).x[0], "volume": torch.full((N,), 1e-4), "colors": torch.full((N, 3), 0.25),
                "opacities": torch.full((N,), 0.9), "covariances": 1e-4 * torch.eye(3).expand(N, 3, 3).clone()}  # fmt: skip
-    world = {"ground": None, "gravity": [0, 0, -9.8], "up": [0, 0, 1], "box": [[-1, -1, -1], [1, 1, 1]]}
+    world = {"ground": {"height": GROUND}, "gravity": [0, -9.8, 0], "up": [0, 1, 0], "box": [[-1, -1, -1], [1, 1, 1]]}
     field = HeterogeneityField(tensors["rest"].amin(0), tensors["rest"].amax(0), hidden=8)
     material = Material("neo_hookean", {"E": 1e5, "nu": 0.3})
     body = Body(**tensors, density=1000.0, material=material, heterogeneity=field, adapter=None,
@@ -56,18 +61,36 @@ def test_a_run_is_read_with_what_it_observed(run):
     assert (train.name, test.name) == ("train", "test/test_60") and len(train.times) == T
     assert train.observed.centers.shape == (SEEN, N, 3) and test.observed is None
     # A = F A_0 F^T: squashed to half, a covariance is a quarter along y
-    assert np.allclose(train.twin.covariances[4, 0], np.diag([1e-4, 0.25e-4, 1e-4]))
+    assert np.allclose(train.learned.covariances[4, 0], np.diag([1e-4, 0.25e-4, 1e-4]))
     assert train.deviation(0) == pytest.approx(np.full(N, 0.01), rel=1e-4) and train.deviation(SEEN) is None
-    assert "rms distance 10.0 mm" in train.caption(1) and train.caption(4) == "train, frame 4, 0.080 s"
+    assert "**train**, frame 1, 0.020 s" in train.caption(1) and "rms distance learned - observed 10.0 mm" in train.caption(1)
+    assert "Not observed in this frame" in train.caption(4) and "No observed motion" in test.caption(1)
+    assert "Ground grid: 100 mm" in train.caption(1) and "Not drawn" not in train.caption(1)
+    walled = replace(train, world=replace(train.world, planes=domain_walls(train.world.box)))
+    assert "Not drawn: walls (6)" in walled.caption(1)
     (run / "observed.npz").unlink()
     assert viewer.read_run(run)[0].observed is None
 
 
 def test_the_bodies_stand_beside_each_other_on_the_ground(run):
     train, _ = viewer.read_run(run)
-    assert train.side @ train.up == 0
-    along = train.side / np.linalg.norm(train.side)
-    assert (train.twin.centers @ along).min() + np.linalg.norm(train.side) > (train.observed.centers @ along).max()
+    assert train.across @ train.up == 0 and np.linalg.norm(train.across) == pytest.approx(1)
+    assert (train.learned.centers @ train.across).min() + train.side @ train.across > (train.observed.centers @ train.across).max()
+
+
+@pytest.mark.parametrize("up", [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+def test_the_first_view_holds_both_bodies_and_the_ground(run, up):
+    clips = [replace(clip, world=replace(clip.world, up=torch.tensor(up))) for clip in viewer.read_run(run)]
+    eye, target = viewer.first_view(clips)
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, clips[0].up)
+    assert right @ clips[0].across > 0.99 * np.linalg.norm(right)  # the learned body, shifted along `across`, is to the right
+    upward = np.cross(right / np.linalg.norm(right), forward)
+    points = np.concatenate([clips[0].moved, clips[0].moved + clips[0].side, clips[1].moved])
+    points = np.concatenate([points, points + np.outer(GROUND - points @ clips[0].up, clips[0].up)]) - eye
+    tangent = np.abs(points @ np.stack([right / np.linalg.norm(right), upward], axis=1)) / (points @ forward)[:, None]
+    inside = tangent / np.tan(viewer.FIELD_OF_VIEW / 2)  # 1 at the rim of a square window
+    assert 0.5 < inside.max() < 1 and forward @ clips[0].up < 0
 
 
 def test_colours_say_what_they_are_by(run):
@@ -77,11 +100,29 @@ def test_colours_say_what_they_are_by(run):
     softest, stiffest = by_stiffness[train.factor.argmin()], by_stiffness[train.factor.argmax()]
     assert train.factor.max() > 1 > train.factor.min()
     assert softest[2] > softest[0] and stiffest[0] > stiffest[2]  # blue, red
+    scale = train.scales["heterogeneity"]
+    assert (scale.low + scale.high) / 2 == 1 and scale.high == pytest.approx(1 + np.abs(train.factor - 1).max())
+    even = replace(train, factor=np.full(N, 1.001))
+    assert (even.scales["heterogeneity"].low, even.scales["heterogeneity"].high) == pytest.approx((0.99, 1.01))
+    assert train.scales["deviation"].high == pytest.approx(10, rel=1e-3) and "[mm]" in train.scales["deviation"].label
     by_deviation = train.paint(0, "deviation")
-    assert by_deviation.shape == (N, 3) and np.ptp(by_deviation, axis=0).max() < 1e-3 and 0.02 < by_deviation.mean() < 0.9
-    assert (train.paint(SEEN, "deviation") == 1).all() and (test.paint(0, "deviation") == 1).all()
+    assert np.allclose(by_deviation, matplotlib.colormaps["viridis"](1.0)[:3], atol=0.01)  # all at the sequence's largest
+    assert (train.paint(SEEN, "deviation") == viewer.GRAY).all() and (test.paint(0, "deviation") == viewer.GRAY).all()
+    assert "deviation" not in test.scales
+    thrown = train.learned.centers + 0.02 * (np.arange(T) == 1)[:, None, None]
+    worst = replace(train, learned=replace(train.learned, centers=thrown))
+    assert worst.scales["deviation"].high == pytest.approx(1e3 * worst.deviation(1).max(), rel=1e-3)  # of the worst frame
     with pytest.raises(ConfigError, match="color: expected appearance or heterogeneity or deviation, found 'speed'"):
         train.paint(0, "speed")
+
+
+def test_the_legend_goes_through_the_scale_s_colours():
+    picture = viewer.Scale("distance [mm]", "viridis", 0, 5).legend()
+    assert picture.dtype == np.uint8 and picture.shape[1] > 4 * picture.shape[0]
+    row = picture[picture.shape[0] // 5].astype(float) / 255
+    inside = row[(row.min(1) < 0.9) & (np.ptp(row, axis=1) > 0.1)]  # the bar: neither white nor its black frame
+    ends = matplotlib.colormaps["viridis"]([0.0, 1.0])[:, :3]
+    assert len(inside) > 0.8 * len(row) and np.allclose(inside[[3, -4]], ends, atol=0.05)
 
 
 def test_what_is_missing_or_mistyped_is_named(run, monkeypatch, capsys):
@@ -104,29 +145,52 @@ def test_what_is_missing_or_mistyped_is_named(run, monkeypatch, capsys):
     with pytest.raises(DataError, match=r"rollout\.npz: expected a readable npz file"):
         viewer.read_run(run)
     (run / "rollout.npz").unlink()
-    with pytest.raises(DataError, match=r"rollout\.npz: file not found; expected the folder of a finished run"):
+    with pytest.raises(DataError, match=r"rollout\.npz: file not found; expected the folder of a finished run.*ckpt_path="):
         viewer.read_run(run)
+    with pytest.raises(DataError, match=r"run: expected the folder of a finished run .*, found no folder .*nowhere"):
+        viewer.read_run(run / "nowhere")
 
 
 def test_the_server_plays_and_ends(run):
     pytest.importorskip("viser")
     from urllib.request import urlopen
 
-    shown = viewer.Viewer(viewer.read_run(run), port=18080)
+    clips = viewer.read_run(run)
+    with pytest.raises(ConfigError, match=r"host: expected 127\.0\.0\.1, .*found '203\.0\.113\.7'"):
+        viewer.Viewer(clips, host="203.0.113.7")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        shown = viewer.Viewer(clips, port=taken.getsockname()[1])
+        assert shown.server.get_port() != taken.getsockname()[1]
     try:
         with urlopen(f"http://127.0.0.1:{shown.server.get_port()}", timeout=10) as page:
             assert page.status == 200
+        assert shown.server.scene.get_handle_by_name("/ground").position @ clips[0].up == pytest.approx(GROUND)
+        (seen, _, _), (splats, points, label) = shown.nodes["observed"], shown.nodes["learned"]
         shown.frame.value = 2
-        assert "frame 2" in shown.caption.content
-        shown.color.value, shown.points.value = "deviation", True
+        assert "frame 2" in shown.caption.content and seen.visible and splats.visible and not points.visible
+        assert np.allclose(seen.centers * shown.unit, clips[0].observed.centers[2], atol=1e-6)
+        assert np.allclose(splats.centers * shown.unit, clips[0].learned.centers[2] + clips[0].side, atol=1e-6)
+        # float16 as viser keeps them: to 2^-11, which in m^2 they would not be
+        assert np.allclose(splats.covariances * shown.unit**2, clips[0].learned.covariances[2], rtol=2**-11, atol=1e-12)
+        shown.layout.value = "overlaid"
+        assert np.allclose(splats.centers * shown.unit, clips[0].learned.centers[2], atol=1e-6)
+        assert (seen.rgbs == round(255 * viewer.GRAY)).all() and shown.nodes["observed"][2].text == "observed (gray)"
+        shown.layout.value = "observed"
+        assert seen.visible and not splats.visible and not label.visible
+        shown.layout.value = "side by side"
+        assert not shown.legend.visible
+        shown.color.value, shown.geometry.value = "deviation", "particles"
+        assert shown.legend.visible and points.visible and not splats.visible
+        assert np.allclose(points.points, clips[0].learned.centers[2] + clips[0].side, atol=1e-6)
         shown.frame.value = 4  # past what was observed
-        assert "rms" not in shown.caption.content
+        assert "rms" not in shown.caption.content and not shown.nodes["observed"][1].visible
         shown.sequence.value = "test/test_60"
-        assert "test/test_60, frame 0" in shown.caption.content
-        shown.play.value = True
+        assert "**test/test_60**, frame 0" in shown.caption.content and shown.layout.disabled and not shown.legend.visible
+        assert np.allclose(points.points, clips[1].learned.centers[0], atol=1e-6)
+        shown.play.value, shown.rate.value = True, 30
         until = time.time() + 10
         while "frame 0" in shown.caption.content and time.time() < until:
-            time.sleep(0.05)
+            time.sleep(0.01)
         assert "frame 0" not in shown.caption.content
     finally:
         shown.stop()
