@@ -21,7 +21,7 @@ from torch.func import functional_call
 
 from mosa.physics.activations import at_hand, same_weights
 from mosa.physics.capturing import ATTEMPTS, Captures
-from mosa.physics.mpm import LeftWindow, SegmentSolver, wants_gradient, warp_stream
+from mosa.physics.mpm import WIDENED, LeftWindow, SegmentSolver, wants_gradient, warp_stream
 from mosa.physics.mpm_kernels import NO_EVENT
 from mosa.physics.window import fallen, grid_window
 from mosa.physics.workspace import Numerics, Workspace, copies
@@ -106,7 +106,8 @@ class Chain:
         """(states at the marks and after the chain, statistics (K, ...) each, grid window used, what `adjoint` takes as `tape`).
 
         learned: of the adapter as it is now; kept: leave all substeps on the tape, else nothing; full: in the buffers of the
-        backward pass, which kept needs and any rollout with one has anyway. Errors: as `SegmentSolver.advance`; LeftWindow."""
+        backward pass, which kept needs and any rollout with one has anyway. Errors: as `SegmentSolver.advance`; LeftWindow of
+        chains that can be cut, with marks or of more than `WIDENED` substeps in several segments."""
         dx, dt, total = self.numerics.dx, self.numerics.dt, self.substeps
         work = self._full() if full else self._light()
         bounds = fallen(solver.bounds(state), self.numerics.gravity, total * dt)
@@ -120,8 +121,8 @@ class Chain:
             if not solver.left_window(flags, first, dt):
                 states = [*(work.whole(copies(state)) for state in self.marked), final]
                 return states, tuple(copies(self.statistics[full])), window, work.tape() if kept else []
-            if self.marks:
-                raise LeftWindow
+            if self.marks or (total > WIDENED and len(self.lengths) > 1):
+                raise LeftWindow  # shorter chains need less than the widest window, which is larger than any may be
         raise solver.left_behind(flags, first, dt)
 
     def adjoint(
@@ -265,8 +266,9 @@ class Chain:
                 each.cutoff = solver.cutoff
         work.load(state, {"parameters": packed}, solver.volume, solver.mass, solver.cutoff)
         self.learned = learned
-        rooms = tuple(each.capacity if each is not None else 0 for each in (self.light, self.full))
-        key = (rooms, solver.cutoff, learned.addresses, tuple(w.data_ptr() for w in learned.weights))
+        # not their sizes: buffers may come back to an earlier one
+        buffers = tuple(each.allocations if each is not None else 0 for each in (self.light, self.full))
+        key = (buffers, solver.cutoff, learned.addresses, tuple(w.data_ptr() for w in learned.weights))
         if key != self._key:
             self._key, self.marked = key, []
             self._graphs.clear()

@@ -69,8 +69,8 @@ class Chains:
     ) -> Iterator[tuple[Tensor, ...]]:  # fmt: skip
         """The states after each of `frames` frames, each of segments of `lengths` substeps. collect: as `Simulator.rollout`.
 
-        Where a chain goes over several frames, they arrive together; if it fails, what can be had one by one still does. Errors:
-        SimulationDiverged."""
+        Where a chain goes over several frames, they arrive together; if it fails, what can be had one by one still does, and a
+        frame's chain that fails is cut. Errors: SimulationDiverged."""
         learned, substeps, done = learned_of(adapter), sum(lengths), 0
         plan = self.plan(adapter, learned, state, packed, frames * substeps, max(lengths))
         most = plan.limit // substeps if plan.several else 1
@@ -93,9 +93,17 @@ class Chains:
                 yield from states
                 state = states[-1]
             else:
-                for group in grouped(lengths, plan.limit):
-                    state = advanced(group, first)[-1]
-                    first += sum(group)
+                groups = grouped(lengths, plan.limit)
+                while groups:
+                    try:
+                        state = advanced(groups[0], first)[-1]
+                    except (LeftWindow, SimulationDiverged):
+                        shorter = grouped(groups[0], SEGMENT)
+                        if len(shorter) == 1:
+                            raise
+                        groups[:1] = shorter
+                        continue
+                    first += sum(groups.pop(0))
                 yield state
             done += count
 

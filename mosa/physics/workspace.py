@@ -152,7 +152,7 @@ class Workspace:
                 numerics.colliders, self.scalar, substeps, self._array, self._over_nodes, with_adjoint
             )
         self.cutoff = 0.0
-        self.nodes = self.capacity = 0
+        self.nodes = self.capacity = self.allocations = 0
         self._placed: tuple | None = None
         self.steps = Steps(numerics.dt, numerics.dt)
         self._graphs: dict[tuple, object] = {}
@@ -185,15 +185,17 @@ class Workspace:
 
     def set_window(self, origin: tuple[int, int, int], dims: tuple[int, int, int]) -> None:
         """Place the grid: lowest node and number of nodes per axis. Buffers and graphs are new where there is no room for them."""
+        nodes = math.prod(dims)
+        if not nodes <= self.capacity <= max(IDLE * nodes, SMALL):
+            self._allocate_nodes(math.ceil(SPARE * nodes))
         if self._placed != (origin, dims):
-            self._placed, self.nodes = (origin, dims), math.prod(dims)
             rows = torch.tensor([origin, dims], dtype=torch.int32)
             self.window.copy_(rows, non_blocking=True)  # CUDA stages it before it returns
-        if not self.nodes <= self.capacity <= max(IDLE * self.nodes, SMALL):
-            self._allocate_nodes(math.ceil(SPARE * self.nodes))
+            self._placed, self.nodes = (origin, dims), nodes
 
     def _allocate_nodes(self, count: int) -> None:
-        self._graphs, self.capacity = {}, count
+        self._graphs, self.allocations = {}, self.allocations + 1
+        self.capacity = 0  # until all is there: memory may run out
         grids, vec4 = self.substeps if self.with_adjoint else 1, self.kernels.vec4
         self.fields = torch.zeros((2, grids, count, 4), dtype=self.numerics.dtype, device=self.numerics.device)
         self.grid_wp, self.velocity_wp = ([wp.from_torch(t, dtype=vec4) for t in slots] for slots in self.fields)
@@ -202,6 +204,7 @@ class Workspace:
         if self.with_adjoint:
             self.adj_grid, self.adj_grid_wp = self._array((count, 4), vec4)
             self.adj_velocity, self.adj_velocity_wp = self._array((count, 4), vec4)
+        self.capacity = count
 
     def load(
         self, state: tuple[Tensor, ...], held: dict[str, Tensor | None], volume: Tensor, mass: Tensor, cutoff: float,

@@ -338,6 +338,55 @@ def test_a_window_that_grows_between_the_passes_does_not_change_the_gradient(mak
     assert_same(gradients[1], gradients[0], 1e-11)
 
 
+def test_buffers_that_could_not_be_made_are_made_later(make_block, monkeypatch):
+    """A GPU's memory may run out when the window grows: nothing is launched on what is too small or gone then."""
+    adapter, state = adapter_of("cpu", torch.float64, False), make_block(n=4)
+    sim = Simulator("corotated", dx=0.04, substeps=4, frame_dt=1.6e-3, dtype=torch.float64, chained=True)
+
+    def run(stretch):
+        volume = torch.full((len(state.x),), 8e-6, dtype=torch.float64)
+        start = replace(state, x=stretch * state.x)
+        return sim.rollout(start, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 2, adapter=adapter, stride=2).x
+
+    expected, zeros = run(1), torch.zeros
+    (chain,) = sim._chains.chains.values()
+    capacity, chain._graphs["captured"] = chain.full.capacity, None
+
+    def full(shape, *rest, **options):
+        if isinstance(shape, tuple) and len(shape) == 4:
+            raise torch.OutOfMemoryError
+        return zeros(shape, *rest, **options)
+
+    monkeypatch.setattr(torch, "zeros", full)
+    with pytest.raises(torch.OutOfMemoryError):
+        run(30)
+    monkeypatch.setattr(torch, "zeros", zeros)
+    chain.full.set_window((0, 0, 0), (60, 60, 60))
+    assert chain.full.fields.shape[2] >= 60**3
+    chain.full.set_window((0, 0, 0), (6, 6, 6))  # not needed any more
+    assert torch.equal(run(1), expected) and chain.full.capacity == capacity and not chain._graphs
+
+
+def test_a_chain_whose_widest_window_would_be_too_large_is_cut(make_block):
+    """A body that bounces back faster than its window foresees, as one segment after the other."""
+    adapter, state = adapter_of("cpu", torch.float64, False), make_block(n=4, velocity=(0.0, -45.0, 0.0), jitter=0.0)
+    state = replace(state, x=0.5 * state.x)
+    volume, found = torch.full((len(state.x),), 1e-6, dtype=torch.float64), []
+    for chained in (False, True):
+        sim = Simulator("corotated", dx=0.02, substeps=192, frame_dt=192e-4, dtype=torch.float64, chained=chained,
+                        ground=Ground(0.0, "separate"))  # fmt: skip
+        sim._chains.plan = lambda *_: Plan(192, kept=False, several=True)
+        collected = []
+        with torch.no_grad():
+            rollout = sim.rollout(state, {"mu": 6e6, "lam": 6e6}, volume, 1000.0, 2, adapter=adapter, stride=16,
+                                  collect=collected.append)  # fmt: skip
+        assert len(collected) == 12
+        found.append([rollout.x, rollout.v])
+    assert {sum(chain.lengths) for chain in sim._chains.chains.values()} == {192, 32}
+    assert float(rollout.v[-1, :, 1].min()) > 20
+    assert_same(*found[::-1], 1e-11)
+
+
 def test_divergence_names_the_substep_and_the_particle(make_block):
     adapter, state = adapter_of("cpu", torch.float64, False), make_block(n=5, velocity=(0.0, 1.5, 0.0))
     top = float(state.x[:, 1].max()) + 0.008  # reached in the second frame
