@@ -183,7 +183,10 @@ class _Segment(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         kept = solver.has_room(substeps)
         result, reaction, window, ctx.tape = solver.advance(state, held, poses, substeps, first, steps, kept)
-        solver.room -= sum(t.nbytes for t in ctx.tape)
+        size = sum(t.nbytes for t in ctx.tape)
+        if size > solver.room:  # a window of more nodes than `substep_bytes` knows of
+            ctx.tape, size = [], 0
+        solver.room -= size
         ctx.solver, ctx.substeps, ctx.window, ctx.steps = solver, substeps, window, steps
         ctx.states = 5 if solver.numerics.law.plastic else 4
         ctx.save_for_backward(*state, *inputs[5:])

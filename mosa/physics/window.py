@@ -10,6 +10,8 @@ from mosa.errors import SimulationDiverged
 
 MAX_NODES = 2**23
 """Nodes of the largest window: 200 cells across."""
+FARTHEST = 2**30
+"""Nodes of the farthest window from the origin."""
 SMALL = 2**16
 """Nodes that a window may have too many: over a segment they cost about what a segment less, or a capture less, saves."""
 GAINED = 1.5
@@ -43,6 +45,11 @@ def grid_window(
         bad = int((~(torch.isfinite(x).all(1) & torch.isfinite(v).all(1))).nonzero()[0])
         raise SimulationDiverged(f"particle {bad} has a non-finite position or velocity before the substep")
     low, dims = window_of(bounds, dx, time, margin)
+    if max(map(abs, low)) + max(dims) > FARTHEST:
+        raise SimulationDiverged(
+            f"a particle is {max(map(abs, bounds[:6])):.3g} m from the origin, more than {FARTHEST} nodes of {dx} m: use more "
+            "substeps, or a box"
+        )
     if math.prod(dims) > MAX_NODES:
         raise SimulationDiverged(
             f"particles spread over {list(dims)} grid nodes of {dx} m (speeds to {_largest_speed(bounds):.3g} m/s): use more "

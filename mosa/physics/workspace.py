@@ -97,6 +97,7 @@ class Workspace:
     pointed: no buffers for the operators, which only `point` gives.
     """
 
+    @torch.inference_mode(False)
     def __init__(
         self, numerics: Numerics, particles: int, substeps: int, *, adapted: bool, plastic_adapted: bool, with_adjoint: bool,
         pointed: bool = False,
@@ -193,9 +194,12 @@ class Workspace:
             self.window.copy_(rows, non_blocking=True)  # CUDA stages it before it returns
             self._placed, self.nodes = (origin, dims), nodes
 
+    @torch.inference_mode(False)  # another rollout may want gradients
     def _allocate_nodes(self, count: int) -> None:
         self._graphs, self.allocations = {}, self.allocations + 1
         self.capacity = 0  # until all is there: memory may run out
+        self.fields = self.grid_wp = self.velocity_wp = None  # freed before there are others
+        self.adj_grid = self.adj_grid_wp = self.adj_velocity = self.adj_velocity_wp = None
         grids, vec4 = self.substeps if self.with_adjoint else 1, self.kernels.vec4
         self.fields = torch.zeros((2, grids, count, 4), dtype=self.numerics.dtype, device=self.numerics.device)
         self.grid_wp, self.velocity_wp = ([wp.from_torch(t, dtype=vec4) for t in slots] for slots in self.fields)

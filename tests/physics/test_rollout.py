@@ -115,7 +115,7 @@ def test_segments_recomputed_give_the_gradient_of_one_segment(law, make_block, m
     each = substep_bytes(simulator(law).numerics, len(state.x))
     run_again, advance = [], Workspace.advance
     monkeypatch.setattr(Workspace, "advance", lambda work: (run_again.append(work.with_adjoint), advance(work)))
-    for length, kept, expected in ((32, 0, 2), (32, 10_000, 0), (7, 7, 7), (7, 0, 8), (1, 10_000, 0)):
+    for length, kept, expected in ((32, 0, 2), (32, 10_000, 0), (7, 36, 7), (7, 7, 8), (7, 0, 8), (1, 10_000, 0)):
         monkeypatch.setattr("mosa.physics.rollout.SEGMENT", length)
         monkeypatch.setattr("mosa.physics.memory.KEPT_ON_CPU", kept * each)
         state = make_block()
@@ -312,11 +312,47 @@ def test_a_window_goes_where_the_particles_go(make_block):
     assert (below, above) == ([2, 5, 2], [2, 2, 2])  # 3 cells at 6 m/s, half as many again; half of them elsewhere
 
 
+def test_a_rollout_in_inference_mode_leaves_the_simulator_usable(make_block):
+    state, sim = make_block(), simulator()
+    with torch.inference_mode():
+        expected = sim.rollout(state, TestErrors.PARAMETERS, volume_of(state), DENSITY, 3).x
+    leaf = state.v.clone().requires_grad_()
+    found = sim.rollout(replace(state, v=leaf), TestErrors.PARAMETERS, volume_of(state), DENSITY, 3).x
+    assert torch.equal(found.detach(), expected) and float(torch.autograd.grad(found[-1].sum(), leaf)[0].abs().min()) > 0
+
+
+def test_a_tape_of_many_more_nodes_than_particles_is_not_kept_beyond_its_room(make_block, monkeypatch):
+    """Two particles far apart: a window of ten thousand nodes, of which the estimate by particles knows nothing."""
+    state = make_block()
+    state = ParticleState(*(t[[0, -1]].contiguous() for t in (state.x, 0 * state.v, state.C_affine, state.F, state.F_tot)))
+    state.x[1] += 0.5
+    kept, forward = [], SegmentSolver.advance
+
+    def spied(self, *args, **more):
+        kept.append(self.room)
+        return forward(self, *args, **more)
+
+    monkeypatch.setattr(SegmentSolver, "advance", spied)
+    gradients = []
+    for room in (2**30, 2**20):
+        monkeypatch.setattr("mosa.physics.memory.KEPT_ON_CPU", room)
+        leaf = state.v.clone().requires_grad_()
+        rollout = simulator().rollout(replace(state, v=leaf), TestErrors.PARAMETERS, volume_of(state), DENSITY, 4)
+        gradients.append(torch.autograd.grad(rollout.x[-1].square().sum(), leaf)[0])
+    assert kept[:3] != [2**30] * 3 and kept[3:] == [2**20] * 3
+    assert torch.equal(*gradients)
+
+
 class TestErrors:
     PARAMETERS = {"mu": 4e4, "lam": 5e4}
 
     def run(self, state, parameters=None, **options):
         return simulator(**options).rollout(state, parameters or self.PARAMETERS, volume_of(state), DENSITY, 3)
+
+    def test_far_away(self, make_block):
+        state = make_block()
+        with pytest.raises(SimulationDiverged, match="from the origin"):
+            self.run(replace(state, x=state.x + 1e8))
 
     def test_nan(self, make_block):
         state = make_block()
