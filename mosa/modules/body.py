@@ -59,6 +59,11 @@ class World:
     colliders: tuple[Collider, ...] = ()
 
 
+EVEN = 4
+"""Substeps of a frame are a multiple of this at least: each count has buffers and captured graphs of its own, and one that followed
+every change of the modulus would need new ones in nearly every step of a fit."""
+
+
 @dataclass(frozen=True)
 class SimulationSettings:
     """dx [m]; `stride`: substeps between evaluations of the networks; `max_substeps` per frame; `precision`: 32 | 64;
@@ -202,14 +207,15 @@ class Body(nn.Module):
         return self.adapter.stiffening(self.material.poisson()) if adapted else 1.0
 
     def substeps(self, parameters_modulus: float, frame_dt: float, speed: float, adapted: bool, viscosity: float = 0.0) -> int:
-        """Substeps per frame that the time step bound asks for, rounded up to whole strides of the adapter."""
+        """Substeps per frame that the time step bound asks for, rounded up to whole strides of the adapter and to `EVEN`."""
         settings = self.settings
         count = required_substeps(
             modulus_max=parameters_modulus, density=self.density, frame_dt=frame_dt, dx=settings.dx, v_max=speed,
             factor=self.stiffening(adapted), courant=settings.courant, limit=settings.max_substeps,
             viscosity=viscosity,
         )
-        return -(-count // settings.stride) * settings.stride
+        multiple = settings.stride * -(-EVEN // settings.stride)
+        return -(-count // multiple) * multiple
 
     def step_control(self, adapted: bool) -> StepControl:
         """Bounds of adaptive substeps. Errors: ConfigError naming the field."""

@@ -90,13 +90,13 @@ class Chain:
         self._warm: set[tuple] = set()
         self._graphs: dict[tuple, torch.cuda.CUDAGraph] = {}
         self._key: tuple = ()
-        self._passes: dict[tuple, Callable[[], None]] = {}
+        self._passes: dict[tuple, Callable[[Chain], None]] = {}  # of the class: no cycle keeps the buffers when the chain goes
         self.again = "graphs" if graphs else "states"
         for full in (False, True):
-            self._passes["forward", full] = partial(self._forward, full)
+            self._passes["forward", full] = partial(Chain._forward, full=full)
         for source in ("tape", self.again):
             for penalised in (False, True):
-                self._passes["adjoint", source, penalised] = partial(self._adjoint, source, penalised)
+                self._passes["adjoint", source, penalised] = partial(Chain._adjoint, source=source, penalised=penalised)
 
     @torch.no_grad()
     def advance(
@@ -278,7 +278,7 @@ class Chain:
         if graph is not None:
             graph.replay()
         else:
-            self._passes[name]()  # the first time this also compiles and loads the kernels, which a capture must not do
+            self._passes[name](self)  # the first time this also compiles and loads the kernels, which a capture must not do
             self._warm.add(name)
 
     def _capture(self) -> None:
@@ -290,7 +290,8 @@ class Chain:
             return
         for name in missing:
             graph = torch.cuda.CUDAGraph()
-            if not self._captures.succeeds(torch.cuda.graph(graph, capture_error_mode="thread_local"), self._passes[name]):
+            capture = torch.cuda.graph(graph, capture_error_mode="thread_local")
+            if not self._captures.succeeds(capture, partial(self._passes[name], self)):
                 torch.cuda.synchronize()
                 return
             self._graphs[name] = graph

@@ -1,5 +1,7 @@
 """Device buffers of the colliders of a segment: poses, reactions and their adjoints by substep, and the launches on them."""
 
+import weakref
+
 import warp as wp
 from torch import Tensor
 
@@ -8,17 +10,16 @@ from mosa.physics.colliders import PackedColliders
 
 
 class ColliderBuffers:
-    """K colliders over `substeps` substeps. allocate: `Workspace`'s (shape, kind) -> (tensor, Warp array); over_nodes: its
-    launcher of (kernel, inputs).
+    """K colliders over `substeps` substeps of the workspace `work`, which holds them and is not held by them.
 
     poses, adj_poses: position (S, K, 3), rotation (S, K, 3, 3), linear, angular (S, K, 3); reaction: force [N] and torque [N m]
     about the collider's origin (S, K, 3), as the body exerts them on the collider in world axes.
     """
 
-    def __init__(self, packed: PackedColliders, scalar, substeps: int, allocate, over_nodes, with_adjoint: bool) -> None:
+    def __init__(self, packed: PackedColliders, scalar, substeps: int, work, with_adjoint: bool) -> None:
         self.count = len(packed)
         self.kernels = collider_kernels(scalar)
-        self._scalar, self._allocate, self._over_nodes, self.with_adjoint = scalar, allocate, over_nodes, with_adjoint
+        self._scalar, self._work, self.with_adjoint = scalar, weakref.proxy(work), with_adjoint
         self._packed = [
             wp.from_torch(packed.shapes, dtype=scalar), wp.from_torch(packed.codes, dtype=wp.int32),
             wp.from_torch(packed.fields, dtype=scalar),
@@ -28,7 +29,7 @@ class ColliderBuffers:
         pose = ((vectors, vec3), (matrices, mat33), (vectors, vec3), (vectors, vec3))
 
         def buffers(kinds):
-            made = [allocate(shape, kind) for shape, kind in kinds]
+            made = [work.array(shape, kind) for shape, kind in kinds]
             return [tensor for tensor, _ in made], [array for _, array in made]
 
         self.poses, self._poses = buffers(pose)
@@ -40,8 +41,8 @@ class ColliderBuffers:
     def set_nodes(self, nodes: int) -> None:
         """Buffers for so many grid nodes, for the adjoint."""
         if self.with_adjoint:
-            self.before, self.before_wp = self._allocate((nodes, 4), self.kernels.vec4)
-            self.adj_mass, self._adj_mass = self._allocate((nodes,), self._scalar)
+            self.before, self.before_wp = self._work.array((nodes, 4), self.kernels.vec4)
+            self.adj_mass, self._adj_mass = self._work.array((nodes,), self._scalar)
 
     def load(self, poses: tuple[Tensor, ...]) -> None:
         """Copy the poses of a segment's substeps in."""
@@ -63,15 +64,15 @@ class ColliderBuffers:
     def apply(self, step: int, place: list, time: float, velocity) -> None:
         """Contact at substep `step`, on node velocities in place. place: grid, cutoff, dx; time [s]: for which the
         substep's forces act."""
-        self._over_nodes(self.kernels.collide_nodes, [*self._arguments(place, step, time), velocity, *self._reaction])
+        self._work.over_nodes(self.kernels.collide_nodes, [*self._arguments(place, step, time), velocity, *self._reaction])
 
     def adjoint(self, step: int, place: list, time: float, adj_velocity) -> None:
         """Turns the adjoint of node velocities after contact into that before it; `before` holds those velocities."""
-        self._over_nodes(self.kernels.adj_collide_nodes, [
+        self._work.over_nodes(self.kernels.adj_collide_nodes, [
             *self._arguments(place, step, time), self.before_wp, *self._adj_reaction, adj_velocity, self._adj_mass,
             *self._adj_poses,
         ])  # fmt: skip
 
     def add_mass(self, adj_grid) -> None:
         """The reaction's part of the adjoint of node masses, after the grid's own."""
-        self._over_nodes(self.kernels.add_mass, [self._adj_mass, adj_grid])
+        self._work.over_nodes(self.kernels.add_mass, [self._adj_mass, adj_grid])

@@ -10,6 +10,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -22,7 +23,7 @@ from mosa.physics.chain import ANSWER
 from mosa.physics.chains import SEGMENT, Chains
 from mosa.physics.collider_motion import Motion, Trajectory, sample_frame, sample_poses
 from mosa.physics.colliders import Collider, pack_colliders, reach
-from mosa.physics.laws import SLOTS, law_named
+from mosa.physics.laws import SLOTS, Law, law_named
 from mosa.physics.memory import room
 from mosa.physics.mpm import LONGEST, LONGEST_KEPT, SegmentSolver, advance_segment, substep_bytes, wants_gradient
 from mosa.physics.particle_operations import first_advance, material_state
@@ -130,6 +131,8 @@ class Simulator:
         self._workspaces: dict = {}
         self._long = self.device.type == "cuda"  # a CPU gains nothing
         self.chained = self.device.type == "cuda" if chained is None else chained
+        # not a method: only what holds itself in no way is freed, with its buffers, as soon as nobody needs it
+        self._ask = partial(_asked, self.law, dtype)
         self._chains = Chains(self.numerics, self._ask)
 
     def pack(self, parameters: dict[str, Tensor], particles: int, rotation: Tensor | None = None) -> Tensor:
@@ -327,26 +330,6 @@ class Simulator:
         rotation = torch.eye(3, dtype=self.dtype, device=self.device).expand(len(F), 3, 3)
         return MaterialState(*material_state(self.law, F, C_affine, self.pack(parameters, len(F), rotation)))
 
-    def _ask(
-        self, adapter: Callable, F: Tensor, C: Tensor, packed: Tensor, collect: Callable | None = None,
-        into: tuple[Tensor, Tensor, Tensor] | None = None,
-    ) -> dict[str, Tensor | None]:  # fmt: skip
-        """The adapter's answer by name, checked. into: as `material_state`."""
-        n = len(F)
-        answer = AdapterOperator(*adapter(MaterialState(*material_state(self.law, F, C, packed, into))))
-        plastic = (answer.plastic_G, answer.plastic_h) if self.law.plastic else (None, None)
-        result = dict(zip(ANSWER, (answer.G, answer.h, *plastic)))
-        for name, value in result.items():
-            if name.startswith("plastic") and all(part is None for part in plastic):
-                continue
-            shape = (n, 6, 6) if name.endswith("G") else (n, 6)
-            if value is None or tuple(value.shape) != shape or value.dtype != self.dtype:
-                found = "none" if value is None else f"{tuple(value.shape)} of {value.dtype}"
-                raise ConfigError(f"adapter output {name}: expected shape {shape} of {self.dtype}, found {found}")
-        if collect is not None:
-            collect(adapter.statistics())
-        return result
-
     def _check(self, state: ParticleState, volume: Tensor) -> None:
         n = len(state.x)
         shapes = {"x": (n, 3), "v": (n, 3), "C_affine": (n, 3, 3), "F": (n, 3, 3), "F_tot": (n, 3, 3)}
@@ -379,6 +362,27 @@ class Simulator:
         if not densities:
             raise ConfigError("density: expected positive numbers [kg/m^3] for all particles")
         return density, mass
+
+
+def _asked(
+    law: Law, dtype: torch.dtype, adapter: Callable, F: Tensor, C: Tensor, packed: Tensor, collect: Callable | None = None,
+    into: tuple[Tensor, Tensor, Tensor] | None = None,
+) -> dict[str, Tensor | None]:  # fmt: skip
+    """The adapter's answer by name, checked. into: as `material_state`."""
+    n = len(F)
+    answer = AdapterOperator(*adapter(MaterialState(*material_state(law, F, C, packed, into))))
+    plastic = (answer.plastic_G, answer.plastic_h) if law.plastic else (None, None)
+    result = dict(zip(ANSWER, (answer.G, answer.h, *plastic)))
+    for name, value in result.items():
+        if name.startswith("plastic") and all(part is None for part in plastic):
+            continue
+        shape = (n, 6, 6) if name.endswith("G") else (n, 6)
+        if value is None or tuple(value.shape) != shape or value.dtype != dtype:
+            found = "none" if value is None else f"{tuple(value.shape)} of {value.dtype}"
+            raise ConfigError(f"adapter output {name}: expected shape {shape} of {dtype}, found {found}")
+    if collect is not None:
+        collect(adapter.statistics())
+    return result
 
 
 def _segments(substeps: int, stride: int | None, most: int = 0) -> list[int]:

@@ -64,8 +64,9 @@ class Steps(NamedTuple):
 
 MAX_GRAPHS = 64
 """Captured graphs a workspace keeps: one per pass and time step."""
-SPARE = 1.5
-"""Nodes there is room for, over those of the window that asked for it: more than that cost new buffers and captures."""
+SPARE = 8
+"""One node in so many is room for larger windows, half as many as there are up to `window.SMALL`: more nodes than there is room for
+cost new buffers and captures."""
 IDLE = 8
 """Times the window's nodes that stay (`window.SMALL` in any case) for when it grows again: idle ones cost memory and, on CUDA,
 threads that end at once."""
@@ -116,8 +117,8 @@ class Workspace:
         # the deformation gradient that is never mapped: F itself where the law does not yield
         self.A, self.A_wp = self._per_slot(states, (n, 3, 3), self.kernels.mat33) if self.plastic else (self.F, self.F_wp)
         self.tau, self.tau_wp = self._per_slot(substeps if with_adjoint else 1, (n, 3, 3), self.kernels.mat33)
-        self.mass, self.mass_wp = self._array((n,), self.scalar)
-        self.volume, self.volume_wp = self._array((n,), self.scalar)
+        self.mass, self.mass_wp = self.array((n,), self.scalar)
+        self.volume, self.volume_wp = self.array((n,), self.scalar)
         vec6, mat66 = wp.types.vector(6, self.scalar), wp.types.matrix((6, 6), self.scalar)
         shapes = {
             "parameters": ((n, SLOTS), wp.types.vector(SLOTS, self.scalar)),
@@ -127,7 +128,7 @@ class Workspace:
         self.held, self.held_wp = {}, {}
         for name, (shape, kind) in shapes.items():
             size = shape if name == "parameters" or not pointed else (1, *shape[1:])
-            self.held[name], self.held_wp[name] = self._array(size, kind)
+            self.held[name], self.held_wp[name] = self.array(size, kind)
         if with_adjoint:
             self.adj_x, self.adj_x_wp = self._per_slot(2, (n, 3), self.kernels.vec3)
             self.adj_v, self.adj_v_wp = self._per_slot(2, (n, 3), self.kernels.vec3)
@@ -136,22 +137,20 @@ class Workspace:
             self.adj_A, self.adj_A_wp = self.adj_F, self.adj_F_wp
             if self.plastic:
                 self.adj_A, self.adj_A_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
-            self.adj_tau, self.adj_tau_wp = self._array((n, 3, 3), self.kernels.mat33)
+            self.adj_tau, self.adj_tau_wp = self.array((n, 3, 3), self.kernels.mat33)
             buffer, parts = zeros_in_one([shape for shape, _ in shapes.values()], numerics.dtype, numerics.device)
             self.adj_held = dict(zip(shapes, parts))
             self.adj_held_wp = {name: wp.from_torch(part, dtype=shapes[name][1]) for name, part in self.adj_held.items()}
             # to clear in one launch: all of it, and all but the parameters' part, which comes first
             self.all_adj_wp = wp.from_torch(buffer, dtype=self.scalar)
             self.adj_operator_wp = wp.from_torch(buffer[parts[1].storage_offset() :], dtype=self.scalar)
-        self.flags, self.flags_wp = self._array((4,), wp.int64, torch.int64)
-        self.window, self.window_wp = self._array((2, 3), wp.vec3i, torch.int32)
+        self.flags, self.flags_wp = self.array((4,), wp.int64, torch.int64)
+        self.window, self.window_wp = self.array((2, 3), wp.vec3i, torch.int32)
         self.planes_wp = wp.from_torch(numerics.planes, dtype=self.scalar)
         self.modes_wp = wp.from_torch(numerics.modes, dtype=wp.int32)
         self.colliders = None
         if numerics.colliders is not None:
-            self.colliders = ColliderBuffers(
-                numerics.colliders, self.scalar, substeps, self._array, self._over_nodes, with_adjoint
-            )
+            self.colliders = ColliderBuffers(numerics.colliders, self.scalar, substeps, self, with_adjoint)
         self.cutoff = 0.0
         self.nodes = self.capacity = self.allocations = 0
         self._placed: tuple | None = None
@@ -159,7 +158,8 @@ class Workspace:
         self._graphs: dict[tuple, object] = {}
         self._captures = Captures("substeps cannot be captured as a graph and are launched one by one")
 
-    def _array(self, shape: tuple[int, ...], kind, dtype: torch.dtype | None = None):
+    def array(self, shape: tuple[int, ...], kind, dtype: torch.dtype | None = None) -> tuple[Tensor, wp.array]:
+        """Zeros of `shape`, and the same memory as Warp's array of `kind`."""
         tensor = torch.zeros(shape, dtype=dtype or self.numerics.dtype, device=self.numerics.device)
         return tensor, wp.from_torch(tensor, dtype=kind)
 
@@ -188,7 +188,7 @@ class Workspace:
         """Place the grid: lowest node and number of nodes per axis. Buffers and graphs are new where there is no room for them."""
         nodes = math.prod(dims)
         if not nodes <= self.capacity <= max(IDLE * nodes, SMALL):
-            self._allocate_nodes(math.ceil(SPARE * nodes))
+            self._allocate_nodes(nodes + max(nodes // SPARE, min(nodes // 2, SMALL)))
         if self._placed != (origin, dims):
             rows = torch.tensor([origin, dims], dtype=torch.int32)
             self.window.copy_(rows, non_blocking=True)  # CUDA stages it before it returns
@@ -206,8 +206,8 @@ class Workspace:
         if self.colliders is not None:
             self.colliders.set_nodes(count)
         if self.with_adjoint:
-            self.adj_grid, self.adj_grid_wp = self._array((count, 4), vec4)
-            self.adj_velocity, self.adj_velocity_wp = self._array((count, 4), vec4)
+            self.adj_grid, self.adj_grid_wp = self.array((count, 4), vec4)
+            self.adj_velocity, self.adj_velocity_wp = self.array((count, 4), vec4)
         self.capacity = count
 
     def load(
@@ -285,7 +285,7 @@ class Workspace:
     def _run(self, kernel, dim: int, inputs: list, adj_inputs: list | None = None) -> None:
         launch(kernel, dim, inputs, self.flags_wp.device, adj_inputs)
 
-    def _over_nodes(self, kernel, inputs: list) -> None:
+    def over_nodes(self, kernel, inputs: list) -> None:
         """Launch for all nodes of the window. Graphs hold the number of threads: one for all nodes on a CPU, on a CUDA device one
         for each that there is room for."""
         threads = self.capacity if self.flags_wp.device.is_cuda else 1
@@ -329,13 +329,13 @@ class Workspace:
             self.colliders.reset()
         for step in range(first, first + count):
             a, b, g = step % states, (step + 1) % states, step % grids
-            self._over_nodes(kernels.clear, [self.grid_wp[g]])
+            self.over_nodes(kernels.clear, [self.grid_wp[g]])
             self._run(self.stress, n, self._stress_arguments(a, g))
             self._run(kernels.p2g, n, [
                 self.x_wp[a], self.v_wp[a], self.C_wp[a], self.F_wp[a], self.tau_wp[g], self.mass_wp, self.volume_wp,
                 *(geometry if step else kicked), int(numerics.check_J), step, self.flags_wp, self.grid_wp[g],
             ])  # fmt: skip
-            self._over_nodes(kernels.grid_update, [*self._grid_arguments(g, step), self.velocity_wp[g]])
+            self.over_nodes(kernels.grid_update, [*self._grid_arguments(g, step), self.velocity_wp[g]])
             if self.colliders is not None:
                 self.colliders.apply(step, self._collider_place(g), self._kick(step), self.velocity_wp[g])
             self._run(kernels.g2p, n, [
@@ -362,7 +362,7 @@ class Workspace:
                     self.adj_F_wp[a], self.adj_C_wp[b], held["parameters"], held["plastic_G"], held["plastic_h"], 0.0, 0.0, 0,
                     self.adj_F_wp[b],
                 ])  # fmt: skip
-            self._over_nodes(kernels.clear, [self.adj_velocity_wp])
+            self.over_nodes(kernels.clear, [self.adj_velocity_wp])
             self._run(kernels.adj_g2p, n, [
                 self.x_wp[step], self.A_wp[step], self.velocity_wp[step], self.C_wp[step + 1], *geometry,
                 self.adj_x_wp[b], self.adj_v_wp[b], self.adj_C_wp[b], self.adj_A_wp[b],
@@ -370,9 +370,9 @@ class Workspace:
             ])  # fmt: skip
             if self.colliders is not None:
                 # the velocities that the colliders found are cheaper to compute again than to keep
-                self._over_nodes(kernels.grid_update, [*self._grid_arguments(step, step), self.colliders.before_wp])
+                self.over_nodes(kernels.grid_update, [*self._grid_arguments(step, step), self.colliders.before_wp])
                 self.colliders.adjoint(step, self._collider_place(step), self._kick(step), self.adj_velocity_wp)
-            self._over_nodes(kernels.adj_grid, [*self._grid_arguments(step, step), self.adj_velocity_wp, self.adj_grid_wp])
+            self.over_nodes(kernels.adj_grid, [*self._grid_arguments(step, step), self.adj_velocity_wp, self.adj_grid_wp])
             if self.colliders is not None:
                 self.colliders.add_mass(self.adj_grid_wp)
             self._run(kernels.adj_p2g, n, [

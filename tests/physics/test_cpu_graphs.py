@@ -28,9 +28,9 @@ def falls(sim, state, *, mu=4e4, frames=9):
 def test_captured_segments_are_those_launched_one_by_one(kept, tight, collides, make_block, monkeypatch):
     """tight: every window has buffers and graphs of its own size, else one size comes to serve all."""
     if tight:
-        monkeypatch.setattr(workspace, "SPARE", 1)
+        monkeypatch.setattr(workspace, "SPARE", 2**30)
         monkeypatch.setattr(workspace, "IDLE", 1)
-        monkeypatch.setattr(workspace, "SMALL", 1)
+        monkeypatch.setattr(workspace, "SMALL", 0)
     monkeypatch.setattr("mosa.physics.memory.KEPT_ON_CPU", 2**29 if kept else 0)
     replays, launches, dims, sizes = [], [], set(), set()
     replay, place, send = wp.capture_launch, workspace.Workspace.set_window, workspace.Workspace._launch

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError, SimulationDiverged
+from mosa.physics.colliders import Collider, Sphere
 from mosa.physics.elasticity import lame
 from mosa.physics.mpm import SegmentSolver, grid_window, substep_bytes
 from mosa.physics.rollout import AdapterOperator, MaterialState, Simulator
@@ -17,6 +18,17 @@ from mosa.physics.workspace import Workspace
 from mosa.types import Ground, ParticleState
 
 DX, DENSITY, SPACING = 0.04, 1000.0, 0.02
+
+
+class Answering(torch.nn.Module):
+    """An adapter that always gives the same answer."""
+
+    def __init__(self, answer):
+        super().__init__()
+        self.answer = answer
+
+    def forward(self, state):
+        return self.answer
 
 
 def simulator(law="neo_hookean", frames_dt=0.01, substeps=25, dtype=torch.float64, **options):
@@ -310,6 +322,36 @@ def test_a_window_goes_where_the_particles_go(make_block):
     below = [a - b for a, b in zip(still[0], falls[0])]
     above = [b - a - c for a, b, c in zip(still[1], falls[1], below)]
     assert (below, above) == ([2, 5, 2], [2, 2, 2])  # 3 cells at 6 m/s, half as many again; half of them elsewhere
+
+
+@pytest.mark.parametrize("kind", ["none", "function", "chained", "colliders"])
+def test_a_dropped_simulator_frees_its_buffers_at_once(kind, make_block):
+    """A fit makes a simulator for each count of substeps: on a GPU each has gigabytes, for which no garbage collector looks."""
+    state, adapter = make_block(), None
+    zero = AdapterOperator(torch.zeros(len(state.x), 6, 6).double(), torch.zeros(len(state.x), 6).double())
+    if kind == "function":
+        adapter = lambda _: zero  # noqa: E731
+    elif kind == "chained":
+        adapter = Answering(zero)
+    solids = [Collider(Sphere(0.05))] if kind == "colliders" else []
+    sim = simulator(colliders=solids, chained=kind == "chained")
+    gc.collect()
+    gc.disable()
+    try:
+        for differentiated in (True, False):
+            leaf = state.v.clone().requires_grad_(differentiated)
+            end = sim.rollout(replace(state, v=leaf), TestErrors.PARAMETERS, volume_of(state), DENSITY, 3, adapter=adapter,
+                              stride=5).x[-1]  # fmt: skip
+            if differentiated:
+                torch.autograd.grad(end.sum(), leaf)
+        chains = list(sim._chains.chains.values())
+        held = [weakref.ref(work) for work in (*sim._workspaces.values(), *(c.full for c in chains), *(c.light for c in chains))]
+        held += [weakref.ref(sim), *map(weakref.ref, chains)]
+        assert len(held) >= 3 and (kind == "chained") == bool(chains)
+        del sim, chains, end, leaf
+        assert [ref() for ref in held] == [None] * len(held)
+    finally:
+        gc.enable()
 
 
 def test_a_rollout_in_inference_mode_leaves_the_simulator_usable(make_block):
