@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from mosa import viewer
+from mosa.clips import GRAY, Scale, read_run
 from mosa.config import build_world
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body import Body, SimulationSettings, Start
@@ -48,7 +49,7 @@ def run(tmp_path, monkeypatch):
         for p in body.heterogeneity.parameters():
             p.copy_(torch.randn(p.shape, generator=torch.Generator().manual_seed(0)) if p.dim() == 2 else torch.zeros_like(p))
     twin = Twin(body, build_world(world), 0.02, {}, Start(torch.eye(3), torch.zeros(3), torch.zeros(3), torch.zeros(3)))
-    monkeypatch.setattr(viewer.Twin, "load", lambda path: twin)
+    monkeypatch.setattr(Twin, "load", lambda path: twin)
     save_rollout(tmp_path / "rollout.npz", {"train": rollout(0), "test/test_60": rollout(0.2)})
     seen = rollout(0.01)
     cues = MotionCues(seen.x[:SEEN], *(torch.zeros(SEEN, N, 3, 3) for _ in range(2)), torch.ones(SEEN, N), 2e-4 * seen.F[:SEEN])
@@ -57,7 +58,7 @@ def run(tmp_path, monkeypatch):
 
 
 def test_a_run_is_read_with_what_it_observed(run):
-    train, test = viewer.read_run(run)
+    train, test = read_run(run)
     assert (train.name, test.name) == ("train", "test/test_60") and len(train.times) == T
     assert train.observed.centers.shape == (SEEN, N, 3) and test.observed is None
     # A = F A_0 F^T: squashed to half, a covariance is a quarter along y
@@ -69,18 +70,18 @@ def test_a_run_is_read_with_what_it_observed(run):
     walled = replace(train, world=replace(train.world, planes=domain_walls(train.world.box)))
     assert "Not drawn: walls (6)" in walled.caption(1)
     (run / "observed.npz").unlink()
-    assert viewer.read_run(run)[0].observed is None
+    assert read_run(run)[0].observed is None
 
 
 def test_the_bodies_stand_beside_each_other_on_the_ground(run):
-    train, _ = viewer.read_run(run)
+    train, _ = read_run(run)
     assert train.across @ train.up == 0 and np.linalg.norm(train.across) == pytest.approx(1)
     assert (train.learned.centers @ train.across).min() + train.side @ train.across > (train.observed.centers @ train.across).max()
 
 
 @pytest.mark.parametrize("up", [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 def test_the_first_view_holds_both_bodies_and_the_ground(run, up):
-    clips = [replace(clip, world=replace(clip.world, up=torch.tensor(up))) for clip in viewer.read_run(run)]
+    clips = [replace(clip, world=replace(clip.world, up=torch.tensor(up))) for clip in read_run(run)]
     eye, target = viewer.first_view(clips)
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, clips[0].up)
@@ -94,7 +95,7 @@ def test_the_first_view_holds_both_bodies_and_the_ground(run, up):
 
 
 def test_colours_say_what_they_are_by(run):
-    train, test = viewer.read_run(run)
+    train, test = read_run(run)
     assert (train.paint(0, "appearance") == 0.25).all()
     by_stiffness = train.paint(0, "heterogeneity")
     softest, stiffest = by_stiffness[train.factor.argmin()], by_stiffness[train.factor.argmax()]
@@ -107,7 +108,7 @@ def test_colours_say_what_they_are_by(run):
     assert train.scales["deviation"].high == pytest.approx(10, rel=1e-3) and "[mm]" in train.scales["deviation"].label
     by_deviation = train.paint(0, "deviation")
     assert np.allclose(by_deviation, matplotlib.colormaps["viridis"](1.0)[:3], atol=0.01)  # all at the sequence's largest
-    assert (train.paint(SEEN, "deviation") == viewer.GRAY).all() and (test.paint(0, "deviation") == viewer.GRAY).all()
+    assert (train.paint(SEEN, "deviation") == GRAY).all() and (test.paint(0, "deviation") == GRAY).all()
     assert "deviation" not in test.scales
     thrown = train.learned.centers + 0.02 * (np.arange(T) == 1)[:, None, None]
     worst = replace(train, learned=replace(train.learned, centers=thrown))
@@ -117,7 +118,7 @@ def test_colours_say_what_they_are_by(run):
 
 
 def test_the_legend_goes_through_the_scale_s_colours():
-    picture = viewer.Scale("distance [mm]", "viridis", 0, 5).legend()
+    picture = Scale("distance [mm]", "viridis", 0, 5).legend()
     assert picture.dtype == np.uint8 and picture.shape[1] > 4 * picture.shape[0]
     row = picture[picture.shape[0] // 5].astype(float) / 255
     inside = row[(row.min(1) < 0.9) & (np.ptp(row, axis=1) > 0.1)]  # the bar: neither white nor its black frame
@@ -130,7 +131,7 @@ def test_what_is_missing_or_mistyped_is_named(run, monkeypatch, capsys):
                                (["run=x", "port=no"], "port: expected a number .*, found 'no'")):  # fmt: skip
         with pytest.raises(ConfigError, match=message):
             viewer.options(arguments)
-    clips = viewer.read_run(run)
+    clips = read_run(run)
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "viser", None)
         with pytest.raises(ConfigError, match=r"expected the package viser, found none: pip install -e '\.\[viewer\]'"):
@@ -140,22 +141,22 @@ def test_what_is_missing_or_mistyped_is_named(run, monkeypatch, capsys):
         assert ended.value.code == 2 and "ConfigError: viewer" in capsys.readouterr().err
     save_rollout(run / "rollout.npz", {"train": Rollout(**{**vars(rollout(0)), "x": rollout(0).x[:, :9]})})
     with pytest.raises(DataError, match=r"rollout\.npz: train: expected the checkpoint's 27 particles, found 9"):
-        viewer.read_run(run)
+        read_run(run)
     (run / "rollout.npz").write_bytes(b"no zip")
     with pytest.raises(DataError, match=r"rollout\.npz: expected a readable npz file"):
-        viewer.read_run(run)
+        read_run(run)
     (run / "rollout.npz").unlink()
     with pytest.raises(DataError, match=r"rollout\.npz: file not found; expected the folder of a finished run.*ckpt_path="):
-        viewer.read_run(run)
+        read_run(run)
     with pytest.raises(DataError, match=r"run: expected the folder of a finished run .*, found no folder .*nowhere"):
-        viewer.read_run(run / "nowhere")
+        read_run(run / "nowhere")
 
 
 def test_the_server_plays_and_ends(run):
     pytest.importorskip("viser")
     from urllib.request import urlopen
 
-    clips = viewer.read_run(run)
+    clips = read_run(run)
     with pytest.raises(ConfigError, match=r"host: expected 127\.0\.0\.1, .*found '203\.0\.113\.7'"):
         viewer.Viewer(clips, host="203.0.113.7")
     with socket.create_server(("127.0.0.1", 0)) as taken:
@@ -174,7 +175,7 @@ def test_the_server_plays_and_ends(run):
         assert np.allclose(splats.covariances * shown.unit**2, clips[0].learned.covariances[2], rtol=2**-11, atol=1e-12)
         shown.layout.value = "overlaid"
         assert np.allclose(splats.centers * shown.unit, clips[0].learned.centers[2], atol=1e-6)
-        assert (seen.rgbs == round(255 * viewer.GRAY)).all() and shown.nodes["observed"][2].text == "observed (gray)"
+        assert (seen.rgbs == round(255 * GRAY)).all() and shown.nodes["observed"][2].text == "observed (gray)"
         shown.layout.value = "observed"
         assert seen.visible and not splats.visible and not label.visible
         shown.layout.value = "side by side"
