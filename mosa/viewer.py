@@ -1,7 +1,7 @@
-"""What a run saw and what it learned, side by side in a browser:  python -m mosa.viewer run=outputs/train/<date>/<time>
+"""What a run saw, calibrated and learned, side by side in a browser:  python -m mosa.viewer run=outputs/train/<date>/<time>
 
-The observed motion (the reconstruction's splats, of the sequences learned from) and beside it the learned body's. Needs viser: the
-extra `viewer`.
+The observed motion (the reconstruction's splats, of the sequences learned from) or, of other sequences, the true one where it is
+known; beside it the calibrated prior's and the learned body's. Needs viser: the extra `viewer`.
 """
 
 from __future__ import annotations
@@ -16,10 +16,9 @@ from itertools import product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mosa.clips import COLORS, GRAY, Clip, Motion, cell, read_run
+from mosa.clips import BODIES, COLORS, GRAY, Clip, cell, read_run
 from mosa.errors import ConfigError, MosaError
 
-LAYOUTS = ("side by side", "overlaid", "observed", "learned")
 GEOMETRY = ("splats", "particles")
 FIELD_OF_VIEW = math.radians(40)
 """Vertical, of the first view: less distorted at the rim than viser's 75 degrees."""
@@ -29,7 +28,7 @@ def first_view(clips: Sequence[Clip]) -> tuple[np.ndarray, np.ndarray]:
     """((3,) camera, (3,) point looked at) [m]: all motions side by side, seen from the front and a little above."""
     across, up = clips[0].across, clips[0].up
     axes = np.stack([across, up, np.cross(across, up)])  # right, up, to the camera
-    seen = [clip.moved for clip in clips] + [clip.moved + clip.side for clip in clips if clip.observed is not None]
+    seen = [clip.moved + shift for clip in clips for shift in (0, (len(clip.bodies) - 1) * clip.side)]
     seen = np.concatenate([np.stack([part.min(0), part.max(0)]) for part in (points @ axes.T for points in seen)])
     low, high = seen.min(0), seen.max(0)
     if clips[0].world.ground is not None:
@@ -40,6 +39,11 @@ def first_view(clips: Sequence[Clip]) -> tuple[np.ndarray, np.ndarray]:
     distance = (corners @ toward + 1.15 * rim / math.tan(FIELD_OF_VIEW / 2)).max()  # all in a square window, and a margin
     target = 0.5 * (low + high) @ axes
     return target + distance * toward @ axes, target
+
+
+def layouts(clip: Clip) -> tuple[str, ...]:
+    """All bodies side by side, two of them over each other, or one alone."""
+    return ("side by side", *clip.overlays, *clip.bodies) if len(clip.bodies) > 1 else tuple(clip.bodies)
 
 
 class Viewer:
@@ -62,12 +66,12 @@ class Viewer:
         self.place(clips)
         gui = self.server.gui
         self.sequence = gui.add_dropdown("sequence", list(self.clips), initial_value=first.name)
-        self.layout = gui.add_dropdown("layout", LAYOUTS, initial_value=LAYOUTS[0], disabled=first.observed is None)
+        self.layout = gui.add_dropdown("layout", layouts(first), disabled=len(first.bodies) == 1)
         self.frame = gui.add_slider("frame", 0, len(first.times) - 1, 1, 0)
         self.play = gui.add_checkbox("play", False)
         self.rate = gui.add_slider("frames per second", 1, 30, 1, 5)
         self.geometry = gui.add_dropdown("geometry", GEOMETRY, initial_value=GEOMETRY[0])
-        self.color = gui.add_dropdown("color", COLORS, initial_value=COLORS[0], hint="of the learned body")
+        self.color = gui.add_dropdown("color", COLORS, initial_value=COLORS[0], hint="of the prior and the learned body")
         self.legend = gui.add_image(np.full((1, 1, 3), 255, np.uint8), format="png", visible=False)
         self.caption = gui.add_markdown("")
         self.sequence.on_update(lambda _: self.choose())
@@ -79,7 +83,7 @@ class Viewer:
         self.player.start()
 
     def place(self, clips: Sequence[Clip]) -> None:
-        """What does not move: ground, first view, and the two bodies' nodes, which `draw` fills."""
+        """What does not move: ground, first view, and the bodies' nodes, which `draw` fills."""
         scene, camera, clip = self.server.scene, self.server.initial_camera, clips[0]
         scene.set_up_direction(tuple(float(u) for u in clip.up))
         eye, target = first_view(clips)
@@ -95,7 +99,7 @@ class Viewer:
         # viser keeps covariances as float16, whose steps are 6e-8 below 6e-5: in m^2 a splat of 0.5 mm would lose its shape
         self.unit = float(np.sqrt(np.linalg.eigvalsh(clip.learned.covariances[0]).max()))
         self.nodes = {}
-        for name in ("observed", "learned"):
+        for name in (name for name in BODIES if any(name in clip.bodies for clip in clips)):
             centers, colors = clip.learned.centers[0].astype(np.float32), clip.appearance.astype(np.float32)
             splats = scene.add_gaussian_splats(f"/{name}/splats", centers, clip.learned.covariances[0], colors,
                                                clip.opacities[:, None], scale=self.unit, visible=False)
@@ -111,8 +115,11 @@ class Viewer:
     def choose(self) -> None:
         """Another sequence, from its start."""
         with self.drawing:
+            known, chosen = layouts(self.clip), self.layout.options.index(self.layout.value)
+            alike = len(known) == len(self.layout.options)  # the same layouts, of other bodies
+            self.layout.options, self.layout.disabled = known, len(known) == 1
+            self.layout.value = known[chosen if alike else 0]
             self.frame.max, self.frame.value = len(self.clip.times) - 1, 0
-            self.layout.disabled = self.clip.observed is None
             self.explain()
             self.draw()
 
@@ -126,33 +133,32 @@ class Viewer:
     def draw(self) -> None:
         """The current frame."""
         with self.drawing, self.server.atomic():
-            clip, layout = self.clip, "learned" if self.clip.observed is None else self.layout.value
+            clip, layout = self.clip, self.layout.value
             frame = min(int(self.frame.value), len(clip.times) - 1)
-            gray = np.full_like(clip.appearance, GRAY) if layout == "overlaid" else clip.appearance
-            self.body("observed", clip.observed if layout != "learned" else None, frame, gray, np.zeros(3))
-            self.body("learned", clip.learned if layout != "observed" else None, frame, clip.paint(frame, self.color.value),
-                      clip.side if layout == "side by side" else np.zeros(3))
+            above, below = clip.overlays.get(layout, (layout, None))
+            for name, nodes in self.nodes.items():
+                shown = name in clip.bodies and (layout == "side by side" or name in (above, below))
+                shown = shown and frame < len(clip.bodies[name].centers)
+                for node, wanted in zip(nodes, (self.geometry.value == "splats", self.geometry.value == "particles", True)):
+                    node.visible = shown and wanted
+                if shown:
+                    place = list(clip.bodies).index(name) if layout == "side by side" else 0
+                    self.body(name, frame, place * clip.side, under=name == below)
             self.caption.content = clip.caption(frame)
 
-    def body(self, name: str, motion: Motion | None, frame: int, colors: np.ndarray, shift: np.ndarray) -> None:
-        """One of the two, or nothing where it has no such frame."""
+    def body(self, name: str, frame: int, shift: np.ndarray, under: bool) -> None:
+        """One of the bodies. under: gray, its label above that of the body over it."""
         clip, (splats, points, label) = self.clip, self.nodes[name]
-        shown = motion is not None and frame < len(motion.centers)
-        splats.visible = shown and self.geometry.value == "splats"
-        points.visible = shown and self.geometry.value == "particles"
-        label.visible = shown
-        if not shown:
-            return
-        centers = motion.centers[frame] + shift
+        centers = clip.bodies[name].centers[frame] + shift
+        colors = clip.appearance if name == clip.reference else clip.paint(frame, self.color.value, name)
+        colors = np.full_like(colors, GRAY) if under else colors
         if splats.visible:
-            splats.set_gaussians((centers / self.unit).astype(np.float32), motion.covariances[frame] / self.unit**2, colors,
-                                 clip.opacities[:, None])
+            splats.set_gaussians((centers / self.unit).astype(np.float32), clip.bodies[name].covariances[frame] / self.unit**2,
+                                 colors, clip.opacities[:, None])
         else:
             points.points, points.colors = centers.astype(np.float32), (255 * colors).astype(np.uint8)
-        overlaid = self.layout.value == "overlaid" and clip.observed is not None
-        label.text = f"{name} (gray)" if overlaid and name == "observed" else name
-        height = 0.05 * clip.size if not overlaid or name == "learned" else 0.15 * clip.size  # the labels one above the other
-        top = (centers @ clip.up).max() + height
+        label.text = f"{name} (gray)" if under else name
+        top = (centers @ clip.up).max() + (0.15 if under else 0.05) * clip.size
         middle = 0.5 * (centers.min(0) + centers.max(0))
         label.position = middle + (top - middle @ clip.up) * clip.up
 
