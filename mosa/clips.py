@@ -25,9 +25,11 @@ BODIES = ("observed", "truth", "prior", "learned")
 """What a clip can have, from left to right: the motion learned from, or where none was the true one, and the two models'."""
 COLORS = ("appearance", "heterogeneity", "deviation")
 DISTANCE = 1.4
-"""From one body to the next, in widths of what they take up together."""
+"""From one body to the next, in widths of what they take up together in the frame where that is most."""
 GRAY = 0.6
 """Of what has no value, and of a body under another one: white would not be seen on viser's white."""
+FAINT = 0.25
+"""Opacity of a body under another one, relative to its own: where both lie together the upper one's colours are to be seen."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +131,9 @@ class Clip:
     @cached_property
     def side(self) -> np.ndarray:
         """(3,) shift of a body beside the one before it [m]."""
-        return DISTANCE * float(np.ptp(self.moved @ self.across)) * self.across
+        along = [motion.centers @ self.across for motion in self.bodies.values()]
+        widths = [np.ptp(np.concatenate([x[t] for x in along if t < len(x)])) for t in range(len(self.times))]
+        return DISTANCE * float(max(widths)) * self.across
 
     def deviation(self, frame: int, model: str = "learned") -> np.ndarray | None:
         """(N,) distance [m] of a model's particles from those of the reference; None where it has no such frame."""

@@ -16,7 +16,7 @@ from itertools import product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mosa.clips import BODIES, COLORS, GRAY, Clip, cell, read_run
+from mosa.clips import BODIES, COLORS, FAINT, GRAY, Clip, cell, read_run
 from mosa.errors import ConfigError, MosaError
 
 GEOMETRY = ("splats", "particles")
@@ -24,18 +24,17 @@ FIELD_OF_VIEW = math.radians(40)
 """Vertical, of the first view: less distorted at the rim than viser's 75 degrees."""
 
 
-def first_view(clips: Sequence[Clip]) -> tuple[np.ndarray, np.ndarray]:
-    """((3,) camera, (3,) point looked at) [m]: all motions side by side, seen from the front and a little above."""
-    across, up = clips[0].across, clips[0].up
+def first_view(clip: Clip) -> tuple[np.ndarray, np.ndarray]:
+    """((3,) camera, (3,) point looked at) [m]: a clip's motions side by side, seen from the front and a little above."""
+    across, up = clip.across, clip.up
     axes = np.stack([across, up, np.cross(across, up)])  # right, up, to the camera
-    seen = [clip.moved + shift for clip in clips for shift in (0, (len(clip.bodies) - 1) * clip.side)]
-    seen = np.concatenate([np.stack([part.min(0), part.max(0)]) for part in (points @ axes.T for points in seen)])
+    seen = np.concatenate([clip.moved, clip.moved + (len(clip.bodies) - 1) * clip.side]) @ axes.T
     low, high = seen.min(0), seen.max(0)
-    if clips[0].world.ground is not None:
-        low[1] = min(low[1], clips[0].world.ground.height)
+    if clip.world.ground is not None:
+        low[1] = min(low[1], clip.world.ground.height)
     corners = 0.5 * (high - low) * np.array(list(product((-1, 1), repeat=3)))
     toward = np.array([0, 0.25, 1]) / math.hypot(0.25, 1)
-    rim = np.abs(np.stack([corners[:, 0], corners @ np.cross(toward, [1, 0, 0])])).max(0)  # to the right, and up in the picture
+    rim = np.abs(np.stack([corners[:, 0], corners @ np.cross(toward, [1, 0, 0])])).max(0)  # to the right, and up
     distance = (corners @ toward + 1.15 * rim / math.tan(FIELD_OF_VIEW / 2)).max()  # all in a square window, and a margin
     target = 0.5 * (low + high) @ axes
     return target + distance * toward @ axes, target
@@ -63,9 +62,9 @@ class Viewer:
         self.clips, self.ended, self.drawing = {clip.name: clip for clip in clips}, threading.Event(), threading.RLock()
         self.server = viser.ViserServer(host=host, port=port, label="MoSA", verbose=False)
         first = clips[0]
-        self.place(clips)
         gui = self.server.gui
         self.sequence = gui.add_dropdown("sequence", list(self.clips), initial_value=first.name)
+        self.place(clips)
         self.layout = gui.add_dropdown("layout", layouts(first), disabled=len(first.bodies) == 1)
         self.frame = gui.add_slider("frame", 0, len(first.times) - 1, 1, 0)
         self.play = gui.add_checkbox("play", False)
@@ -84,16 +83,16 @@ class Viewer:
 
     def place(self, clips: Sequence[Clip]) -> None:
         """What does not move: ground, first view, and the bodies' nodes, which `draw` fills."""
-        scene, camera, clip = self.server.scene, self.server.initial_camera, clips[0]
+        scene, clip = self.server.scene, clips[0]
         scene.set_up_direction(tuple(float(u) for u in clip.up))
-        eye, target = first_view(clips)
-        camera.look_at, camera.position, camera.fov = target, eye, FIELD_OF_VIEW
-        camera.near = 1e-3 * float(np.linalg.norm(eye - target))
+        target = first_view(clip)[1]
+        self.look(self.server.initial_camera)
         if clip.world.ground is not None:
             axes = np.stack([clip.across, np.cross(clip.up, clip.across), clip.up], axis=1)  # the grid's x, y and normal
             at, width = target + (clip.world.ground.height - target @ clip.up) * clip.up, cell(clip.size)
             at = axes @ np.array([*(width * np.round(axes.T[:2] @ at / width)), at @ clip.up])  # lines at multiples of the width
-            extent = 2 * width * math.ceil(float(np.linalg.norm(eye - target)) / width)
+            farthest = max(float(np.linalg.norm(first_view(each)[0] - target)) for each in clips)
+            extent = 2 * width * math.ceil(farthest / width)
             scene.add_grid("/ground", extent, extent, plane="xy", cell_size=width, section_size=10 * width, position=at,
                            wxyz=np.roll(Rotation.from_matrix(axes).as_quat(), 1))
         # viser keeps covariances as float16, whose steps are 6e-8 below 6e-5: in m^2 a splat of 0.5 mm would lose its shape
@@ -108,12 +107,20 @@ class Viewer:
                                            precision="float32", visible=False)
             self.nodes[name] = splats, points, scene.add_label(f"/{name}/label", name, anchor="bottom-center", visible=False)
 
+    def look(self, *cameras) -> None:
+        """The current sequence's first view, for what viser calls cameras."""
+        eye, target = first_view(self.clip)
+        for camera in cameras:
+            camera.position = eye  # first: it takes a connected client's look_at along
+            camera.look_at, camera.fov = target, FIELD_OF_VIEW
+            camera.near = 1e-3 * float(np.linalg.norm(eye - target))
+
     @property
     def clip(self) -> Clip:
         return self.clips[self.sequence.value]
 
     def choose(self) -> None:
-        """Another sequence, from its start."""
+        """Another sequence, from its start, and where it is seen."""
         with self.drawing:
             known, chosen = layouts(self.clip), self.layout.options.index(self.layout.value)
             alike = len(known) == len(self.layout.options)  # the same layouts, of other bodies
@@ -122,6 +129,7 @@ class Viewer:
             self.frame.max, self.frame.value = len(self.clip.times) - 1, 0
             self.explain()
             self.draw()
+            self.look(self.server.initial_camera, *(client.camera for client in self.server.get_clients().values()))
 
     def explain(self) -> None:
         """The colours' legend."""
@@ -147,14 +155,14 @@ class Viewer:
             self.caption.content = clip.caption(frame)
 
     def body(self, name: str, frame: int, shift: np.ndarray, under: bool) -> None:
-        """One of the bodies. under: gray, its label above that of the body over it."""
+        """One of the bodies. under: gray, its splats faint, its label above that of the body over it."""
         clip, (splats, points, label) = self.clip, self.nodes[name]
         centers = clip.bodies[name].centers[frame] + shift
         colors = clip.appearance if name == clip.reference else clip.paint(frame, self.color.value, name)
-        colors = np.full_like(colors, GRAY) if under else colors
+        colors, opacities = (np.full_like(colors, GRAY), FAINT * clip.opacities) if under else (colors, clip.opacities)
         if splats.visible:
             splats.set_gaussians((centers / self.unit).astype(np.float32), clip.bodies[name].covariances[frame] / self.unit**2,
-                                 colors, clip.opacities[:, None])
+                                 colors, opacities[:, None])
         else:
             points.points, points.colors = centers.astype(np.float32), (255 * colors).astype(np.uint8)
         label.text = f"{name} (gray)" if under else name
