@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import lightning as L
+import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.loggers import TensorBoardLogger
@@ -25,7 +26,7 @@ from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLas
 from mosa.config import build_body, build_stages, build_world, plain, rehearse, run_config, world_config
 from mosa.data.datamodule import MultiViewDataModule, training_observations
 from mosa.errors import ConfigError, MosaError
-from mosa.evaluation import Sequence, evaluate, floor_figures, identification, law_figures, render
+from mosa.evaluation import Sequence, evaluate, floor_figures, identification, law_figures, render, true_motion
 from mosa.modules.body import Body, Start
 from mosa.modules.lit_mosa import LitMosa, Take
 from mosa.physics.memory import KEPT_ON_CPU
@@ -274,8 +275,13 @@ def start_figures(start: Start) -> dict[str, float]:
 
 
 def write_outputs(folder: Path, cfg: DictConfig, body: Body, evaluated: list[Sequence], figures: dict, kept: dict) -> None:
-    """rollout.npz, video.mp4 of the last held-out sequence, strip.png of all; tables in results.md; metrics.json."""
-    save_rollout(folder / "rollout.npz", {prefix: variants["adapted"] for prefix, variants in kept.items()})
+    """rollout.npz and prior.npz, truth.npz where it is known; video.mp4 of the last held-out sequence, strip.png of all; tables in
+    results.md; metrics.json."""
+    for variant, name in (("adapted", "rollout.npz"), ("prior", "prior.npz")):
+        save_rollout(folder / name, {prefix: variants[variant] for prefix, variants in kept.items()})
+    known = {f"{s.prefix}/x": true_motion(body, s.scene) for s in evaluated if s.scene.truth is not None}
+    if known:
+        np.savez_compressed(folder / "truth.npz", **{key: x.float().numpy() for key, x in known.items()})
     if cfg.evaluation.video:
         shown = [s for s in evaluated if s.prefix.startswith("test")] or evaluated[-1:]
         pictures = {s.prefix: comparison(body, s, kept[s.prefix]) for s in shown}

@@ -1,7 +1,7 @@
-"""What a run saw and what it learned, side by side in a browser:  python -m mosa.viewer run=outputs/train/<date>/<time>
+"""What a run saw, calibrated and learned, side by side in a browser:  python -m mosa.viewer run=outputs/train/<date>/<time>
 
-The observed motion (the reconstruction's splats, of the sequences learned from) and beside it the learned body's. Needs viser: the
-extra `viewer`.
+The observed motion (the reconstruction's splats, of the sequences learned from) or, of other sequences, the true one where it is
+known; beside it the calibrated prior's and the learned body's. Needs viser: the extra `viewer`.
 """
 
 from __future__ import annotations
@@ -11,222 +11,38 @@ import socket
 import sys
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from itertools import product
-from pathlib import Path
 
-import matplotlib
 import numpy as np
-import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from mosa.errors import ConfigError, DataError, MosaError
-from mosa.modules.body import World
-from mosa.modules.observer import deformed_covariances
-from mosa.twin import Twin
+from mosa.clips import BODIES, COLORS, FAINT, GRAY, Clip, cell, read_run
+from mosa.errors import ConfigError, MosaError
 
-COLORS = ("appearance", "heterogeneity", "deviation")
-LAYOUTS = ("side by side", "overlaid", "observed", "learned")
 GEOMETRY = ("splats", "particles")
-DISTANCE = 1.4
-"""Between the two bodies, in widths of what they take up together."""
 FIELD_OF_VIEW = math.radians(40)
 """Vertical, of the first view: less distorted at the rim than viser's 75 degrees."""
-GRAY = 0.6
-"""Of what has no value, and of the observed body where it lies over the learned one: white would not be seen on viser's white."""
 
 
-@dataclass(frozen=True)
-class Scale:
-    """Colours of a quantity: `colors` (of matplotlib) over low to high, in the unit that `label` names. beyond: max where values
-    can lie above high, which the legend then shows."""
-
-    label: str
-    colors: str
-    low: float
-    high: float
-    beyond: str = "neither"
-
-    def paint(self, values: np.ndarray) -> np.ndarray:
-        """(N, 3) colours in [0, 1] of (N,) values."""
-        return matplotlib.colormaps[self.colors]((values - self.low) / (self.high - self.low))[:, :3]
-
-    def legend(self) -> np.ndarray:
-        """(H, W, 3) picture of the colour bar, 8 bit."""
-        figure = Figure(figsize=(3.2, 0.7), dpi=200, layout="constrained")
-        canvas = FigureCanvasAgg(figure)
-        shown = ScalarMappable(Normalize(self.low, self.high), self.colors)
-        bar = figure.colorbar(shown, cax=figure.add_subplot(), orientation="horizontal", extend=self.beyond)
-        bar.set_label(self.label, fontsize=9)
-        bar.ax.tick_params(labelsize=8)
-        canvas.draw()
-        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
-
-
-@dataclass(frozen=True)
-class Motion:
-    """N splats over T frames: centers (T, N, 3) [m], covariances (T, N, 3, 3) [m^2]."""
-
-    centers: np.ndarray
-    covariances: np.ndarray
-
-
-@dataclass(frozen=True)
-class Clip:
-    """A sequence of a run. times: (T,) [s]; learned: over all frames; observed: over the frames that were learned from, or None;
-    appearance: (N, 3) in [0, 1]; opacities: (N,); factor: (N,) 1 + a tanh eta, by which a particle's stiffness
-    differs from the law's."""
-
-    name: str
-    times: np.ndarray
-    learned: Motion
-    observed: Motion | None
-    appearance: np.ndarray
-    opacities: np.ndarray
-    factor: np.ndarray
-    world: World
-
-    @property
-    def up(self) -> np.ndarray:
-        """(3,) unit vector."""
-        return self.world.up.numpy()
-
-    @property
-    def size(self) -> float:
-        """Largest extent of the body at the start [m]."""
-        return float(np.ptp(self.learned.centers[0], axis=0).max())
-
-    @property
-    def across(self) -> np.ndarray:
-        """(3,) horizontal unit vector, from the observed body to the learned one."""
-        across = np.eye(3)[np.abs(self.up).argmin()]
-        across = across - (across @ self.up) * self.up
-        return across / np.linalg.norm(across)
-
-    @property
-    def moved(self) -> np.ndarray:
-        """(M, 3) all positions of both [m]."""
-        both = [self.learned.centers] if self.observed is None else [self.learned.centers, self.observed.centers]
-        return np.concatenate([motion.reshape(-1, 3) for motion in both])
-
-    @property
-    def side(self) -> np.ndarray:
-        """(3,) shift of the learned body beside the observed one [m]."""
-        return DISTANCE * float(np.ptp(self.moved @ self.across)) * self.across
-
-    def deviation(self, frame: int) -> np.ndarray | None:
-        """(N,) distance [m] of the learned body's particles from the observed ones; None where nothing was observed."""
-        if self.observed is None or frame >= len(self.observed.centers):
-            return None
-        return np.linalg.norm(self.learned.centers[frame] - self.observed.centers[frame], axis=-1)
-
-    @cached_property
-    def scales(self) -> dict[str, Scale]:
-        """Of each quantity, the same for all frames: a colour means one value while the sequence plays."""
-        span = max(float(np.abs(self.factor - 1).max()), 0.01)  # what differs by less than 1 % shall not look like a contrast
-        found = {"heterogeneity": Scale(r"stiffness factor $1 + a\,\tanh\,\eta$ [-]", "coolwarm", 1 - span, 1 + span)}
-        if self.observed is not None:
-            high = max(float(np.quantile(self.deviation(t), 0.99)) for t in range(len(self.observed.centers)))
-            found["deviation"] = Scale("distance learned - observed [mm]", "viridis", 0, max(1e3 * high, 1e-3), "max")
-        return found
-
-    def paint(self, frame: int, by: str) -> np.ndarray:
-        """(N, 3) colours in [0, 1] of the learned body. heterogeneity: blue softer, red stiffer; deviation: up to the 99th
-        percentile of the sequence's worst frame, gray where nothing was observed. Errors: ConfigError for another name."""
-        if by not in COLORS:
-            raise ConfigError(f"color: expected {' or '.join(COLORS)}, found {by!r}")
-        if by == "appearance":
-            return self.appearance
-        if by == "heterogeneity":
-            return self.scales[by].paint(self.factor)
-        far = self.deviation(frame)
-        return np.full_like(self.appearance, GRAY) if far is None else self.scales[by].paint(1e3 * far)
-
-    def caption(self, frame: int) -> str:
-        """What a frame is, and what the scene leaves out."""
-        said = f"**{self.name}**, frame {frame}, {self.times[frame] - self.times[0]:.3f} s  \n"
-        far = self.deviation(frame)
-        if self.observed is None:
-            said += "No observed motion: the learned body alone."
-        elif far is None:
-            said += "Not observed in this frame."
-        else:
-            said += f"rms distance learned - observed {1e3 * float(np.sqrt(np.square(far).mean())):.1f} mm"
-        if self.world.ground is not None:
-            said += f"  \nGround grid: {1e3 * cell(self.size):g} mm"
-        hidden = {"walls": len(self.world.planes), "colliders": len(self.world.colliders)}
-        if any(hidden.values()):
-            said += "  \nNot drawn: " + ", ".join(f"{kind} ({count})" for kind, count in hidden.items() if count)
-        return said
-
-
-def cell(size: float) -> float:
-    """Width [m] of a ground cell for a body of that size: the power of ten below it."""
-    return 10.0 ** math.floor(math.log10(size))
-
-
-def first_view(clips: Sequence[Clip]) -> tuple[np.ndarray, np.ndarray]:
-    """((3,) camera, (3,) point looked at) [m]: all motions side by side, seen from the front and a little above."""
-    across, up = clips[0].across, clips[0].up
+def first_view(clip: Clip) -> tuple[np.ndarray, np.ndarray]:
+    """((3,) camera, (3,) point looked at) [m]: a clip's motions side by side, seen from the front and a little above."""
+    across, up = clip.across, clip.up
     axes = np.stack([across, up, np.cross(across, up)])  # right, up, to the camera
-    seen = [clip.moved for clip in clips] + [clip.moved + clip.side for clip in clips if clip.observed is not None]
-    seen = np.concatenate([np.stack([part.min(0), part.max(0)]) for part in (points @ axes.T for points in seen)])
+    seen = np.concatenate([clip.moved, clip.moved + (len(clip.bodies) - 1) * clip.side]) @ axes.T
     low, high = seen.min(0), seen.max(0)
-    if clips[0].world.ground is not None:
-        low[1] = min(low[1], clips[0].world.ground.height)
+    if clip.world.ground is not None:
+        low[1] = min(low[1], clip.world.ground.height)
     corners = 0.5 * (high - low) * np.array(list(product((-1, 1), repeat=3)))
     toward = np.array([0, 0.25, 1]) / math.hypot(0.25, 1)
-    rim = np.abs(np.stack([corners[:, 0], corners @ np.cross(toward, [1, 0, 0])])).max(0)  # to the right, and up in the picture
+    rim = np.abs(np.stack([corners[:, 0], corners @ np.cross(toward, [1, 0, 0])])).max(0)  # to the right, and up
     distance = (corners @ toward + 1.15 * rim / math.tan(FIELD_OF_VIEW / 2)).max()  # all in a square window, and a margin
     target = 0.5 * (low + high) @ axes
     return target + distance * toward @ axes, target
 
 
-@torch.no_grad()
-def read_run(folder: str | Path) -> list[Clip]:
-    """The sequences of a run, the training one first. Errors: DataError naming the file that is missing or of another run."""
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise DataError(f"run: expected the folder of a finished run (run=outputs/train/<date>/<time>), found no folder {folder}")
-    rollouts, seen = arrays(folder / "rollout.npz"), {}  # first: it is what a run that has not ended lacks
-    twin = Twin.load(folder / "checkpoints" / "last.ckpt")
-    body = twin.body
-    if (folder / "observed.npz").is_file():  # runs of before it was written, and those of eval.py, have none
-        seen = arrays(folder / "observed.npz")
-    factor = body.factor(body.heterogeneity)
-    clips = []
-    for name in (key.removesuffix("/x") for key in rollouts if key.endswith("/x")):
-        if rollouts[f"{name}/x"].shape[1] != len(body.rest):
-            raise DataError(f"{folder / 'rollout.npz'}: {name}: expected the checkpoint's {len(body.rest)} particles, found "
-                            f"{rollouts[f'{name}/x'].shape[1]}; both must be of one run")
-        shapes = deformed_covariances(torch.from_numpy(rollouts[f"{name}/F_tot"]), body.covariances)
-        observed = None
-        if f"{name}/x" in seen:
-            observed = Motion(seen[f"{name}/x"], seen[f"{name}/covariances"])
-        clips.append(Clip(
-            name, rollouts[f"{name}/times"], Motion(rollouts[f"{name}/x"], shapes.numpy()), observed,
-            body.colors.clamp(0, 1).numpy(), body.opacities.numpy(), factor.numpy(), twin.world,
-        ))  # fmt: skip
-    if not clips:
-        raise DataError(f"{folder / 'rollout.npz'}: expected the rollouts of a run, found none")
-    return clips
-
-
-def arrays(path: Path) -> dict[str, np.ndarray]:
-    """Contents of an npz file. Errors: DataError naming it."""
-    if not path.is_file():
-        raise DataError(f"{path}: file not found; expected the folder of a finished run (run=outputs/train/<date>/<time>); "
-                        "train.py writes this file at its end; it resumes with ckpt_path=<run folder>/checkpoints/last.ckpt")
-    try:
-        with np.load(path) as stored:
-            return {key: stored[key] for key in stored.files}
-    except (OSError, ValueError, EOFError, KeyError) as error:
-        raise DataError(f"{path}: expected a readable npz file, found a damaged one ({error})") from error
+def layouts(clip: Clip) -> tuple[str, ...]:
+    """All bodies side by side, two of them over each other, or one alone."""
+    return ("side by side", *clip.overlays, *clip.bodies) if len(clip.bodies) > 1 else tuple(clip.bodies)
 
 
 class Viewer:
@@ -246,15 +62,15 @@ class Viewer:
         self.clips, self.ended, self.drawing = {clip.name: clip for clip in clips}, threading.Event(), threading.RLock()
         self.server = viser.ViserServer(host=host, port=port, label="MoSA", verbose=False)
         first = clips[0]
-        self.place(clips)
         gui = self.server.gui
         self.sequence = gui.add_dropdown("sequence", list(self.clips), initial_value=first.name)
-        self.layout = gui.add_dropdown("layout", LAYOUTS, initial_value=LAYOUTS[0], disabled=first.observed is None)
+        self.place(clips)
+        self.layout = gui.add_dropdown("layout", layouts(first), disabled=len(first.bodies) == 1)
         self.frame = gui.add_slider("frame", 0, len(first.times) - 1, 1, 0)
         self.play = gui.add_checkbox("play", False)
         self.rate = gui.add_slider("frames per second", 1, 30, 1, 5)
         self.geometry = gui.add_dropdown("geometry", GEOMETRY, initial_value=GEOMETRY[0])
-        self.color = gui.add_dropdown("color", COLORS, initial_value=COLORS[0], hint="of the learned body")
+        self.color = gui.add_dropdown("color", COLORS, initial_value=COLORS[0], hint="of the prior and the learned body")
         self.legend = gui.add_image(np.full((1, 1, 3), 255, np.uint8), format="png", visible=False)
         self.caption = gui.add_markdown("")
         self.sequence.on_update(lambda _: self.choose())
@@ -266,23 +82,23 @@ class Viewer:
         self.player.start()
 
     def place(self, clips: Sequence[Clip]) -> None:
-        """What does not move: ground, first view, and the two bodies' nodes, which `draw` fills."""
-        scene, camera, clip = self.server.scene, self.server.initial_camera, clips[0]
+        """What does not move: ground, first view, and the bodies' nodes, which `draw` fills."""
+        scene, clip = self.server.scene, clips[0]
         scene.set_up_direction(tuple(float(u) for u in clip.up))
-        eye, target = first_view(clips)
-        camera.look_at, camera.position, camera.fov = target, eye, FIELD_OF_VIEW
-        camera.near = 1e-3 * float(np.linalg.norm(eye - target))
+        target = first_view(clip)[1]
+        self.look(self.server.initial_camera)
         if clip.world.ground is not None:
             axes = np.stack([clip.across, np.cross(clip.up, clip.across), clip.up], axis=1)  # the grid's x, y and normal
             at, width = target + (clip.world.ground.height - target @ clip.up) * clip.up, cell(clip.size)
             at = axes @ np.array([*(width * np.round(axes.T[:2] @ at / width)), at @ clip.up])  # lines at multiples of the width
-            extent = 2 * width * math.ceil(float(np.linalg.norm(eye - target)) / width)
+            farthest = max(float(np.linalg.norm(first_view(each)[0] - target)) for each in clips)
+            extent = 2 * width * math.ceil(farthest / width)
             scene.add_grid("/ground", extent, extent, plane="xy", cell_size=width, section_size=10 * width, position=at,
                            wxyz=np.roll(Rotation.from_matrix(axes).as_quat(), 1))
         # viser keeps covariances as float16, whose steps are 6e-8 below 6e-5: in m^2 a splat of 0.5 mm would lose its shape
         self.unit = float(np.sqrt(np.linalg.eigvalsh(clip.learned.covariances[0]).max()))
         self.nodes = {}
-        for name in ("observed", "learned"):
+        for name in (name for name in BODIES if any(name in clip.bodies for clip in clips)):
             centers, colors = clip.learned.centers[0].astype(np.float32), clip.appearance.astype(np.float32)
             splats = scene.add_gaussian_splats(f"/{name}/splats", centers, clip.learned.covariances[0], colors,
                                                clip.opacities[:, None], scale=self.unit, visible=False)
@@ -291,17 +107,29 @@ class Viewer:
                                            precision="float32", visible=False)
             self.nodes[name] = splats, points, scene.add_label(f"/{name}/label", name, anchor="bottom-center", visible=False)
 
+    def look(self, *cameras) -> None:
+        """The current sequence's first view, for what viser calls cameras."""
+        eye, target = first_view(self.clip)
+        for camera in cameras:
+            camera.position = eye  # first: it takes a connected client's look_at along
+            camera.look_at, camera.fov = target, FIELD_OF_VIEW
+            camera.near = 1e-3 * float(np.linalg.norm(eye - target))
+
     @property
     def clip(self) -> Clip:
         return self.clips[self.sequence.value]
 
     def choose(self) -> None:
-        """Another sequence, from its start."""
+        """Another sequence, from its start, and where it is seen."""
         with self.drawing:
+            known, chosen = layouts(self.clip), self.layout.options.index(self.layout.value)
+            alike = len(known) == len(self.layout.options)  # the same layouts, of other bodies
+            self.layout.options, self.layout.disabled = known, len(known) == 1
+            self.layout.value = known[chosen if alike else 0]
             self.frame.max, self.frame.value = len(self.clip.times) - 1, 0
-            self.layout.disabled = self.clip.observed is None
             self.explain()
             self.draw()
+            self.look(self.server.initial_camera, *(client.camera for client in self.server.get_clients().values()))
 
     def explain(self) -> None:
         """The colours' legend."""
@@ -313,33 +141,32 @@ class Viewer:
     def draw(self) -> None:
         """The current frame."""
         with self.drawing, self.server.atomic():
-            clip, layout = self.clip, "learned" if self.clip.observed is None else self.layout.value
+            clip, layout = self.clip, self.layout.value
             frame = min(int(self.frame.value), len(clip.times) - 1)
-            gray = np.full_like(clip.appearance, GRAY) if layout == "overlaid" else clip.appearance
-            self.body("observed", clip.observed if layout != "learned" else None, frame, gray, np.zeros(3))
-            self.body("learned", clip.learned if layout != "observed" else None, frame, clip.paint(frame, self.color.value),
-                      clip.side if layout == "side by side" else np.zeros(3))
+            above, below = clip.overlays.get(layout, (layout, None))
+            for name, nodes in self.nodes.items():
+                shown = name in clip.bodies and (layout == "side by side" or name in (above, below))
+                shown = shown and frame < len(clip.bodies[name].centers)
+                for node, wanted in zip(nodes, (self.geometry.value == "splats", self.geometry.value == "particles", True)):
+                    node.visible = shown and wanted
+                if shown:
+                    place = list(clip.bodies).index(name) if layout == "side by side" else 0
+                    self.body(name, frame, place * clip.side, under=name == below)
             self.caption.content = clip.caption(frame)
 
-    def body(self, name: str, motion: Motion | None, frame: int, colors: np.ndarray, shift: np.ndarray) -> None:
-        """One of the two, or nothing where it has no such frame."""
+    def body(self, name: str, frame: int, shift: np.ndarray, under: bool) -> None:
+        """One of the bodies. under: gray, its splats faint, its label above that of the body over it."""
         clip, (splats, points, label) = self.clip, self.nodes[name]
-        shown = motion is not None and frame < len(motion.centers)
-        splats.visible = shown and self.geometry.value == "splats"
-        points.visible = shown and self.geometry.value == "particles"
-        label.visible = shown
-        if not shown:
-            return
-        centers = motion.centers[frame] + shift
+        centers = clip.bodies[name].centers[frame] + shift
+        colors = clip.appearance if name == clip.reference else clip.paint(frame, self.color.value, name)
+        colors, opacities = (np.full_like(colors, GRAY), FAINT * clip.opacities) if under else (colors, clip.opacities)
         if splats.visible:
-            splats.set_gaussians((centers / self.unit).astype(np.float32), motion.covariances[frame] / self.unit**2, colors,
-                                 clip.opacities[:, None])
+            splats.set_gaussians((centers / self.unit).astype(np.float32), clip.bodies[name].covariances[frame] / self.unit**2,
+                                 colors, opacities[:, None])
         else:
             points.points, points.colors = centers.astype(np.float32), (255 * colors).astype(np.uint8)
-        overlaid = self.layout.value == "overlaid" and clip.observed is not None
-        label.text = f"{name} (gray)" if overlaid and name == "observed" else name
-        height = 0.05 * clip.size if not overlaid or name == "learned" else 0.15 * clip.size  # the labels one above the other
-        top = (centers @ clip.up).max() + height
+        label.text = f"{name} (gray)" if under else name
+        top = (centers @ clip.up).max() + (0.15 if under else 0.05) * clip.size
         middle = 0.5 * (centers.min(0) + centers.max(0))
         label.position = middle + (top - middle @ clip.up) * clip.up
 

@@ -4,6 +4,7 @@ import socket
 import sys
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import matplotlib
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 import torch
 
 from mosa import viewer
+from mosa.clips import GRAY, Scale, covariances, read_run
 from mosa.config import build_world
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body import Body, SimulationSettings, Start
@@ -48,53 +50,101 @@ def run(tmp_path, monkeypatch):
         for p in body.heterogeneity.parameters():
             p.copy_(torch.randn(p.shape, generator=torch.Generator().manual_seed(0)) if p.dim() == 2 else torch.zeros_like(p))
     twin = Twin(body, build_world(world), 0.02, {}, Start(torch.eye(3), torch.zeros(3), torch.zeros(3), torch.zeros(3)))
-    monkeypatch.setattr(viewer.Twin, "load", lambda path: twin)
+    monkeypatch.setattr(Twin, "load", lambda path: twin)
     save_rollout(tmp_path / "rollout.npz", {"train": rollout(0), "test/test_60": rollout(0.2)})
+    save_rollout(tmp_path / "prior.npz", {"train": rollout(-0.03), "test/test_60": rollout(0.2)})
     seen = rollout(0.01)
     cues = MotionCues(seen.x[:SEEN], *(torch.zeros(SEEN, N, 3, 3) for _ in range(2)), torch.ones(SEEN, N), 2e-4 * seen.F[:SEEN])
     save_observed(tmp_path / "observed.npz", {"train": cues})
+    np.savez(tmp_path / "truth.npz", **{"train/x": seen.x.numpy(), "test/test_60/x": turned(seen.x.numpy())})
     return tmp_path
 
 
+def turned(x: np.ndarray) -> np.ndarray:
+    """About the vertical by 90 degrees, and stretched to double along it."""
+    return x @ np.array([[0, 0, -1.0], [0, 2, 0], [1, 0, 0]], np.float32)
+
+
 def test_a_run_is_read_with_what_it_observed(run):
-    train, test = viewer.read_run(run)
+    train, test = read_run(run)
     assert (train.name, test.name) == ("train", "test/test_60") and len(train.times) == T
-    assert train.observed.centers.shape == (SEEN, N, 3) and test.observed is None
+    assert (list(train.bodies), list(test.bodies)) == (["observed", "prior", "learned"], ["truth", "prior", "learned"])
+    assert (train.reference, test.reference) == ("observed", "truth") and train.models == ["prior", "learned"]
+    assert train.bodies["observed"].centers.shape == (SEEN, N, 3) and test.bodies["truth"].centers.shape == (T, N, 3)
+    assert np.allclose(train.bodies["prior"].centers, rollout(-0.03).x)
     # A = F A_0 F^T: squashed to half, a covariance is a quarter along y
     assert np.allclose(train.learned.covariances[4, 0], np.diag([1e-4, 0.25e-4, 1e-4]))
+    assert np.allclose(test.bodies["truth"].covariances[0, 0], np.diag([1e-4, 4e-4, 1e-4]), atol=1e-7)  # by the fit to positions
     assert train.deviation(0) == pytest.approx(np.full(N, 0.01), rel=1e-4) and train.deviation(SEEN) is None
-    assert "**train**, frame 1, 0.020 s" in train.caption(1) and "rms distance learned - observed 10.0 mm" in train.caption(1)
-    assert "Not observed in this frame" in train.caption(4) and "No observed motion" in test.caption(1)
+    assert train.deviation(0, "prior") == pytest.approx(np.full(N, 0.04), rel=1e-4)
+    far = np.linalg.norm(rollout(0.2).x[4].numpy() - turned(rollout(0.01).x.numpy())[4], axis=-1)
+    assert test.deviation(4) == pytest.approx(far, rel=1e-5) == test.deviation(4, "prior")
+    assert "**train**, frame 1, 0.020 s" in train.caption(1) and "Not observed in this frame" in train.caption(4)
+    assert "rms distance to the observed motion: prior 40.0 mm, learned 10.0 mm" in train.caption(1)
+    both = 1e3 * np.sqrt(np.mean(far**2))
+    assert f"rms distance to the true motion: prior {both:.1f} mm, learned {both:.1f} mm" in test.caption(4)
     assert "Ground grid: 100 mm" in train.caption(1) and "Not drawn" not in train.caption(1)
     walled = replace(train, world=replace(train.world, planes=domain_walls(train.world.box)))
     assert "Not drawn: walls (6)" in walled.caption(1)
+
+
+def test_a_run_of_fewer_files_is_read(run):
+    """As older runs left them, and those of captures, whose true motion is not known."""
+    (run / "prior.npz").unlink()
+    train, test = read_run(run)
+    assert list(train.bodies) == ["observed", "learned"] and list(test.bodies) == ["truth", "learned"]
+    assert train.caption(1).splitlines()[1].endswith("rms distance to the observed motion: learned 10.0 mm  ")
+    assert viewer.layouts(train) == ("side by side", "learned over observed", "observed", "learned")
+    (run / "truth.npz").unlink()
+    test = read_run(run)[1]
+    assert list(test.bodies) == ["learned"] and viewer.layouts(test) == ("learned",) and "deviation" not in test.scales
+    assert (test.paint(0, "deviation") == GRAY).all() and "No observed and no true motion" in test.caption(1)
+    save_rollout(run / "prior.npz", {"train": rollout(0), "test/test_60": rollout(0.1)})
     (run / "observed.npz").unlink()
-    assert viewer.read_run(run)[0].observed is None
+    train = read_run(run)[0]
+    assert list(train.bodies) == ["prior", "learned"] and train.reference is None
+    assert viewer.layouts(train) == ("side by side", "learned over prior", "prior", "learned")
+
+
+def test_flat_bodies_keep_the_truth_s_splats(run):
+    """Where neighbours lie in a plane no deformation can be fitted: the fit says 0, and a splat of that is not seen."""
+    clouds = rollout(0).x[0] * torch.tensor([1.0, 1.0, 0.0])
+    body = SimpleNamespace(rest=clouds + torch.linspace(0, 1e-3, N)[:, None] * torch.tensor([1.0, 0.5, 0.0]),
+                           covariances=1e-4 * torch.eye(3).expand(N, 3, 3))  # fmt: skip
+    found = covariances({"test/x": body.rest[None].numpy()}, "test", body)
+    assert np.allclose(found, body.covariances, atol=1e-9)
 
 
 def test_the_bodies_stand_beside_each_other_on_the_ground(run):
-    train, _ = viewer.read_run(run)
+    train, _ = read_run(run)
     assert train.across @ train.up == 0 and np.linalg.norm(train.across) == pytest.approx(1)
-    assert (train.learned.centers @ train.across).min() + train.side @ train.across > (train.observed.centers @ train.across).max()
+    moving = np.arange(T)[:, None, None] * train.across  # by ten widths a frame: what they take up is that of one frame
+    bodies = {name: replace(body, centers=body.centers + moving[: len(body.centers)]) for name, body in train.bodies.items()}
+    flying = replace(train, bodies=bodies)
+    assert np.allclose(flying.side, train.side) and 0.1 < np.linalg.norm(train.side) < 0.3
+    for frame in range(SEEN):
+        along = [(body.centers[frame] + place * flying.side) @ flying.across for place, body in enumerate(bodies.values())]
+        assert along[0].max() < along[1].min() and along[1].max() < along[2].min()
 
 
 @pytest.mark.parametrize("up", [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-def test_the_first_view_holds_both_bodies_and_the_ground(run, up):
-    clips = [replace(clip, world=replace(clip.world, up=torch.tensor(up))) for clip in viewer.read_run(run)]
-    eye, target = viewer.first_view(clips)
+def test_the_first_view_holds_all_bodies_and_the_ground(run, up):
+    clip = read_run(run)[0]
+    clip = replace(clip, world=replace(clip.world, up=torch.tensor(up)))
+    eye, target = viewer.first_view(clip)
     forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, clips[0].up)
-    assert right @ clips[0].across > 0.99 * np.linalg.norm(right)  # the learned body, shifted along `across`, is to the right
+    right = np.cross(forward, clip.up)
+    assert right @ clip.across > 0.99 * np.linalg.norm(right)  # the learned body, shifted along `across`, is to the right
     upward = np.cross(right / np.linalg.norm(right), forward)
-    points = np.concatenate([clips[0].moved, clips[0].moved + clips[0].side, clips[1].moved])
-    points = np.concatenate([points, points + np.outer(GROUND - points @ clips[0].up, clips[0].up)]) - eye
+    points = np.concatenate([clip.moved + place * clip.side for place in range(3)])
+    points = np.concatenate([points, points + np.outer(GROUND - points @ clip.up, clip.up)]) - eye
     tangent = np.abs(points @ np.stack([right / np.linalg.norm(right), upward], axis=1)) / (points @ forward)[:, None]
     inside = tangent / np.tan(viewer.FIELD_OF_VIEW / 2)  # 1 at the rim of a square window
-    assert 0.5 < inside.max() < 1 and forward @ clips[0].up < 0
+    assert 0.5 < inside.max() < 1 and forward @ clip.up < 0
 
 
 def test_colours_say_what_they_are_by(run):
-    train, test = viewer.read_run(run)
+    train, test = read_run(run)
     assert (train.paint(0, "appearance") == 0.25).all()
     by_stiffness = train.paint(0, "heterogeneity")
     softest, stiffest = by_stiffness[train.factor.argmin()], by_stiffness[train.factor.argmax()]
@@ -104,20 +154,23 @@ def test_colours_say_what_they_are_by(run):
     assert (scale.low + scale.high) / 2 == 1 and scale.high == pytest.approx(1 + np.abs(train.factor - 1).max())
     even = replace(train, factor=np.full(N, 1.001))
     assert (even.scales["heterogeneity"].low, even.scales["heterogeneity"].high) == pytest.approx((0.99, 1.01))
-    assert train.scales["deviation"].high == pytest.approx(10, rel=1e-3) and "[mm]" in train.scales["deviation"].label
-    by_deviation = train.paint(0, "deviation")
-    assert np.allclose(by_deviation, matplotlib.colormaps["viridis"](1.0)[:3], atol=0.01)  # all at the sequence's largest
-    assert (train.paint(SEEN, "deviation") == viewer.GRAY).all() and (test.paint(0, "deviation") == viewer.GRAY).all()
-    assert "deviation" not in test.scales
+    assert (train.paint(0, "heterogeneity", "prior") == matplotlib.colormaps["coolwarm"](0.5)[:3]).all()  # it has one stiffness
+    # one scale for both: up to the prior's 40 mm, of which the learned body's 10 mm are a quarter
+    assert train.scales["deviation"].high == pytest.approx(40, rel=1e-3)
+    for model, share in (("prior", 1.0), ("learned", 0.25)):
+        assert np.allclose(train.paint(0, "deviation", model), matplotlib.colormaps["viridis"](share)[:3], atol=0.01)
+    assert (train.paint(SEEN, "deviation") == GRAY).all()
+    assert train.scales["deviation"].label == "distance to the observed motion [mm]"
+    assert test.scales["deviation"].label == "distance to the true motion [mm]"
     thrown = train.learned.centers + 0.02 * (np.arange(T) == 1)[:, None, None]
-    worst = replace(train, learned=replace(train.learned, centers=thrown))
+    worst = replace(train, bodies=train.bodies | {"learned": replace(train.learned, centers=thrown + np.array([0, 0.05, 0]))})
     assert worst.scales["deviation"].high == pytest.approx(1e3 * worst.deviation(1).max(), rel=1e-3)  # of the worst frame
     with pytest.raises(ConfigError, match="color: expected appearance or heterogeneity or deviation, found 'speed'"):
         train.paint(0, "speed")
 
 
 def test_the_legend_goes_through_the_scale_s_colours():
-    picture = viewer.Scale("distance [mm]", "viridis", 0, 5).legend()
+    picture = Scale("distance [mm]", "viridis", 0, 5).legend()
     assert picture.dtype == np.uint8 and picture.shape[1] > 4 * picture.shape[0]
     row = picture[picture.shape[0] // 5].astype(float) / 255
     inside = row[(row.min(1) < 0.9) & (np.ptp(row, axis=1) > 0.1)]  # the bar: neither white nor its black frame
@@ -130,7 +183,7 @@ def test_what_is_missing_or_mistyped_is_named(run, monkeypatch, capsys):
                                (["run=x", "port=no"], "port: expected a number .*, found 'no'")):  # fmt: skip
         with pytest.raises(ConfigError, match=message):
             viewer.options(arguments)
-    clips = viewer.read_run(run)
+    clips = read_run(run)
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "viser", None)
         with pytest.raises(ConfigError, match=r"expected the package viser, found none: pip install -e '\.\[viewer\]'"):
@@ -139,23 +192,27 @@ def test_what_is_missing_or_mistyped_is_named(run, monkeypatch, capsys):
             viewer.main([f"run={run}"])
         assert ended.value.code == 2 and "ConfigError: viewer" in capsys.readouterr().err
     save_rollout(run / "rollout.npz", {"train": Rollout(**{**vars(rollout(0)), "x": rollout(0).x[:, :9]})})
-    with pytest.raises(DataError, match=r"rollout\.npz: train: expected the checkpoint's 27 particles, found 9"):
-        viewer.read_run(run)
+    with pytest.raises(DataError, match=r"rollout\.npz: train: expected the checkpoint's 27 particles .*, found 9 in 5"):
+        read_run(run)
+    save_rollout(run / "rollout.npz", {"train": rollout(0)})
+    save_rollout(run / "prior.npz", {"train": Rollout(**{**vars(rollout(0)), "x": rollout(0).x[:4]})})
+    with pytest.raises(DataError, match=r"prior\.npz: train: expected .* in the rollout's 5 frames, found 27 in 4"):
+        read_run(run)
     (run / "rollout.npz").write_bytes(b"no zip")
     with pytest.raises(DataError, match=r"rollout\.npz: expected a readable npz file"):
-        viewer.read_run(run)
+        read_run(run)
     (run / "rollout.npz").unlink()
     with pytest.raises(DataError, match=r"rollout\.npz: file not found; expected the folder of a finished run.*ckpt_path="):
-        viewer.read_run(run)
+        read_run(run)
     with pytest.raises(DataError, match=r"run: expected the folder of a finished run .*, found no folder .*nowhere"):
-        viewer.read_run(run / "nowhere")
+        read_run(run / "nowhere")
 
 
 def test_the_server_plays_and_ends(run):
     pytest.importorskip("viser")
     from urllib.request import urlopen
 
-    clips = viewer.read_run(run)
+    clips = read_run(run)
     with pytest.raises(ConfigError, match=r"host: expected 127\.0\.0\.1, .*found '203\.0\.113\.7'"):
         viewer.Viewer(clips, host="203.0.113.7")
     with socket.create_server(("127.0.0.1", 0)) as taken:
@@ -166,27 +223,35 @@ def test_the_server_plays_and_ends(run):
             assert page.status == 200
         assert shown.server.scene.get_handle_by_name("/ground").position @ clips[0].up == pytest.approx(GROUND)
         (seen, _, _), (splats, points, label) = shown.nodes["observed"], shown.nodes["learned"]
+        calibrated = shown.nodes["prior"][0]
         shown.frame.value = 2
         assert "frame 2" in shown.caption.content and seen.visible and splats.visible and not points.visible
-        assert np.allclose(seen.centers * shown.unit, clips[0].observed.centers[2], atol=1e-6)
-        assert np.allclose(splats.centers * shown.unit, clips[0].learned.centers[2] + clips[0].side, atol=1e-6)
+        assert np.allclose(seen.centers * shown.unit, clips[0].bodies["observed"].centers[2], atol=1e-6)
+        assert np.allclose(splats.centers * shown.unit, clips[0].learned.centers[2] + 2 * clips[0].side, atol=1e-6)
+        assert np.allclose(calibrated.centers * shown.unit, clips[0].bodies["prior"].centers[2] + clips[0].side, atol=1e-6)
         # float16 as viser keeps them: to 2^-11, which in m^2 they would not be
         assert np.allclose(splats.covariances * shown.unit**2, clips[0].learned.covariances[2], rtol=2**-11, atol=1e-12)
-        shown.layout.value = "overlaid"
+        shown.layout.value = "prior over observed"
+        assert calibrated.visible and seen.visible and not splats.visible
+        shown.layout.value = "learned over observed"
+        assert splats.visible and seen.visible and not calibrated.visible
         assert np.allclose(splats.centers * shown.unit, clips[0].learned.centers[2], atol=1e-6)
-        assert (seen.rgbs == round(255 * viewer.GRAY)).all() and shown.nodes["observed"][2].text == "observed (gray)"
+        assert (seen.rgbs == round(255 * GRAY)).all() and shown.nodes["observed"][2].text == "observed (gray)"
         shown.layout.value = "observed"
-        assert seen.visible and not splats.visible and not label.visible
+        assert seen.visible and not splats.visible and not label.visible and not calibrated.visible
         shown.layout.value = "side by side"
         assert not shown.legend.visible
         shown.color.value, shown.geometry.value = "deviation", "particles"
         assert shown.legend.visible and points.visible and not splats.visible
-        assert np.allclose(points.points, clips[0].learned.centers[2] + clips[0].side, atol=1e-6)
+        assert np.allclose(points.points, clips[0].learned.centers[2] + 2 * clips[0].side, atol=1e-6)
         shown.frame.value = 4  # past what was observed
         assert "rms" not in shown.caption.content and not shown.nodes["observed"][1].visible
+        shown.layout.value = "prior over observed"
         shown.sequence.value = "test/test_60"
-        assert "**test/test_60**, frame 0" in shown.caption.content and shown.layout.disabled and not shown.legend.visible
-        assert np.allclose(points.points, clips[1].learned.centers[0], atol=1e-6)
+        assert "**test/test_60**, frame 0" in shown.caption.content and shown.layout.value == "prior over truth"
+        assert shown.nodes["truth"][1].visible and not shown.nodes["observed"][1].visible and not points.visible
+        shown.layout.value = "side by side"
+        assert np.allclose(points.points, clips[1].learned.centers[0] + 2 * clips[1].side, atol=1e-6)
         shown.play.value, shown.rate.value = True, 30
         until = time.time() + 10
         while "frame 0" in shown.caption.content and time.time() < until:
@@ -195,3 +260,20 @@ def test_the_server_plays_and_ends(run):
     finally:
         shown.stop()
     assert not shown.player.is_alive()
+
+
+def test_the_server_shows_a_learned_body_alone(run):
+    pytest.importorskip("viser")
+    for name in ("prior.npz", "truth.npz"):
+        (run / name).unlink()
+    shown = viewer.Viewer(read_run(run))
+    try:
+        assert shown.layout.value == "side by side" and "truth" not in shown.nodes and "prior" not in shown.nodes
+        shown.color.value, shown.layout.value = "deviation", "observed"
+        shown.sequence.value = "test/test_60"
+        assert shown.layout.value == "learned" and shown.layout.disabled and not shown.legend.visible
+        assert shown.nodes["learned"][0].visible and not shown.nodes["observed"][0].visible
+        shown.sequence.value = "train"
+        assert shown.layout.value == "side by side" and not shown.layout.disabled and shown.nodes["observed"][0].visible
+    finally:
+        shown.stop()

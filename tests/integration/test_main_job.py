@@ -18,10 +18,10 @@ from hydra import compose, initialize_config_dir
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from mosa import pipeline
+from mosa.clips import read_run
 from mosa.modules.body import ContactOffset, Start
 from mosa.twin import Twin
 from mosa.types import Ground
-from mosa.viewer import read_run
 
 ROOT = Path(__file__).parents[2]
 
@@ -74,10 +74,17 @@ def test_a_run_leaves_its_outputs(run):
 def test_a_run_can_be_looked_at(run):
     train, *held_out = read_run(run)
     assert train.name == "train" and {clip.name for clip in held_out} == {"test/test_60", "test/test_40"}
-    assert train.observed.centers.shape == train.twin.centers.shape  # all frames were learned from
-    assert train.observed.covariances.shape == train.twin.covariances.shape
+    observed, prior, learned = train.bodies.values()
+    assert observed.centers.shape == prior.centers.shape == learned.centers.shape  # all frames were learned from
+    assert observed.covariances.shape == prior.covariances.shape == learned.covariances.shape
     assert float(train.deviation(0).max()) < 0.02 * train.size  # one particle is the same one in both
-    assert all(clip.observed is None for clip in held_out)
+    figures = json.loads((run / "metrics.json").read_text())
+    for clip in held_out:
+        assert list(clip.bodies) == ["truth", "prior", "learned"]
+        for model, key in (("prior", f"prior/{clip.name}/rms_m"), ("learned", f"{clip.name}/rms_m")):
+            squares = [np.square(clip.deviation(t, model)).mean() for t in range(len(clip.times))]
+            after = [np.sqrt(np.mean(squares[contact:])) for contact in range(len(squares))]  # the figure's: from contact on
+            assert any(value == pytest.approx(figures[key], rel=1e-5) for value in after), key
 
 
 def test_eval_reproduces_the_figures_from_the_checkpoint_alone(run, cache, tmp_path):

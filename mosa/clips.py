@@ -1,0 +1,247 @@
+"""What a run's files become for the viewer: motions, what is measured between them, and its colours."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+from mosa.errors import ConfigError, DataError
+from mosa.modules.body import Body, World
+from mosa.modules.observer import deformed_covariances
+from mosa.reconstruction.cues import neighbourhood
+from mosa.twin import Twin
+
+BODIES = ("observed", "truth", "prior", "learned")
+"""What a clip can have, from left to right: the motion learned from, or where none was the true one, and the two models'."""
+COLORS = ("appearance", "heterogeneity", "deviation")
+DISTANCE = 1.4
+"""From one body to the next, in widths of what they take up together in the frame where that is most."""
+GRAY = 0.6
+"""Of what has no value, and of a body under another one: white would not be seen on viser's white."""
+FAINT = 0.25
+"""Opacity of a body under another one, relative to its own: where both lie together the upper one's colours are to be seen."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Colours of a quantity: `colors` (of matplotlib) over low to high, in the unit that `label` names. beyond: max where values
+    can lie above high, which the legend then shows."""
+
+    label: str
+    colors: str
+    low: float
+    high: float
+    beyond: str = "neither"
+
+    def paint(self, values: np.ndarray) -> np.ndarray:
+        """(N, 3) colours in [0, 1] of (N,) values."""
+        return matplotlib.colormaps[self.colors]((values - self.low) / (self.high - self.low))[:, :3]
+
+    def legend(self) -> np.ndarray:
+        """(H, W, 3) picture of the colour bar, 8 bit."""
+        figure = Figure(figsize=(3.2, 0.7), dpi=200, layout="constrained")
+        canvas = FigureCanvasAgg(figure)
+        shown = ScalarMappable(Normalize(self.low, self.high), self.colors)
+        bar = figure.colorbar(shown, cax=figure.add_subplot(), orientation="horizontal", extend=self.beyond)
+        bar.set_label(self.label, fontsize=9)
+        bar.ax.tick_params(labelsize=8)
+        canvas.draw()
+        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+@dataclass(frozen=True)
+class Motion:
+    """N splats over T frames: centers (T, N, 3) [m], covariances (T, N, 3, 3) [m^2]."""
+
+    centers: np.ndarray
+    covariances: np.ndarray
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A sequence of a run. times: (T,) [s]; bodies: by name, in the order of BODIES: learned always, over all frames; prior, the
+    calibrated law's without adapter and heterogeneity, where the run left it; one of observed, over the frames that were learned
+    from, and truth, or neither; appearance: (N, 3) in [0, 1]; opacities: (N,); factor: (N,) 1 + a tanh eta, by which a particle's
+    stiffness differs from the law's."""
+
+    name: str
+    times: np.ndarray
+    bodies: dict[str, Motion]
+    appearance: np.ndarray
+    opacities: np.ndarray
+    factor: np.ndarray
+    world: World
+
+    @property
+    def learned(self) -> Motion:
+        return self.bodies["learned"]
+
+    @property
+    def reference(self) -> str | None:
+        """What the models are compared with: observed, truth, or None."""
+        return next((name for name in ("observed", "truth") if name in self.bodies), None)
+
+    @property
+    def models(self) -> list[str]:
+        """prior, where it is there, and learned."""
+        return [name for name in self.bodies if name != self.reference]
+
+    @property
+    def overlays(self) -> dict[str, tuple[str, str]]:
+        """By what they are called, the pairs (above, below) that can lie over each other: each model over what it is compared
+        with, or learned over prior where that is nothing."""
+        if self.reference is not None:
+            pairs = [(model, self.reference) for model in reversed(self.models)]
+        else:
+            pairs = [("learned", below) for below in self.models[:-1]]
+        return {f"{above} over {below}": (above, below) for above, below in pairs}
+
+    @property
+    def up(self) -> np.ndarray:
+        """(3,) unit vector."""
+        return self.world.up.numpy()
+
+    @property
+    def size(self) -> float:
+        """Largest extent of the body at the start [m]."""
+        return float(np.ptp(self.learned.centers[0], axis=0).max())
+
+    @property
+    def across(self) -> np.ndarray:
+        """(3,) horizontal unit vector, from each body to the next."""
+        across = np.eye(3)[np.abs(self.up).argmin()]
+        across = across - (across @ self.up) * self.up
+        return across / np.linalg.norm(across)
+
+    @property
+    def moved(self) -> np.ndarray:
+        """(M, 3) all positions of all bodies [m]."""
+        return np.concatenate([motion.centers.reshape(-1, 3) for motion in self.bodies.values()])
+
+    @cached_property
+    def side(self) -> np.ndarray:
+        """(3,) shift of a body beside the one before it [m]."""
+        along = [motion.centers @ self.across for motion in self.bodies.values()]
+        widths = [np.ptp(np.concatenate([x[t] for x in along if t < len(x)])) for t in range(len(self.times))]
+        return DISTANCE * float(max(widths)) * self.across
+
+    def deviation(self, frame: int, model: str = "learned") -> np.ndarray | None:
+        """(N,) distance [m] of a model's particles from those of the reference; None where it has no such frame."""
+        if self.reference is None or frame >= len(self.bodies[self.reference].centers):
+            return None
+        return np.linalg.norm(self.bodies[model].centers[frame] - self.bodies[self.reference].centers[frame], axis=-1)
+
+    @cached_property
+    def scales(self) -> dict[str, Scale]:
+        """Of each quantity, one for all frames and models: a colour means one value while the sequence plays, in both bodies."""
+        span = max(float(np.abs(self.factor - 1).max()), 0.01)  # what differs by less than 1 % shall not look like a contrast
+        found = {"heterogeneity": Scale(r"stiffness factor $1 + a\,\tanh\,\eta$ [-]", "coolwarm", 1 - span, 1 + span)}
+        if self.reference is not None:
+            frames = range(len(self.bodies[self.reference].centers))
+            high = max(float(np.quantile(self.deviation(t, model), 0.99)) for t in frames for model in self.models)
+            label = {"observed": "distance to the observed motion [mm]", "truth": "distance to the true motion [mm]"}
+            found["deviation"] = Scale(label[self.reference], "viridis", 0, max(1e3 * high, 1e-3), "max")
+        return found
+
+    def paint(self, frame: int, by: str, model: str = "learned") -> np.ndarray:
+        """(N, 3) colours in [0, 1] of a model's body. heterogeneity: blue softer, red stiffer, the prior has none; deviation: up
+        to the 99th percentile of the sequence's worst frame, gray where there is nothing to compare with. Errors: ConfigError for
+        another name."""
+        if by not in COLORS:
+            raise ConfigError(f"color: expected {' or '.join(COLORS)}, found {by!r}")
+        if by == "appearance":
+            return self.appearance
+        if by == "heterogeneity":
+            return self.scales[by].paint(self.factor if model == "learned" else np.ones_like(self.factor))
+        far = self.deviation(frame, model)
+        return np.full_like(self.appearance, GRAY) if far is None else self.scales[by].paint(1e3 * far)
+
+    def caption(self, frame: int) -> str:
+        """What a frame is, and what the scene leaves out."""
+        said = f"**{self.name}**, frame {frame}, {self.times[frame] - self.times[0]:.3f} s  \n"
+        if self.reference is None:
+            said += "No observed and no true motion to compare with."
+        elif self.deviation(frame) is None:
+            said += "Not observed in this frame."
+        else:
+            far = {model: 1e3 * float(np.sqrt(np.square(self.deviation(frame, model)).mean())) for model in self.models}
+            motion = {"observed": "observed", "truth": "true"}[self.reference]
+            said += f"rms distance to the {motion} motion: " + ", ".join(f"{model} {value:.1f} mm" for model, value in far.items())
+        if self.world.ground is not None:
+            said += f"  \nGround grid: {1e3 * cell(self.size):g} mm"
+        hidden = {"walls": len(self.world.planes), "colliders": len(self.world.colliders)}
+        if any(hidden.values()):
+            said += "  \nNot drawn: " + ", ".join(f"{kind} ({count})" for kind, count in hidden.items() if count)
+        return said
+
+
+def cell(size: float) -> float:
+    """Width [m] of a ground cell for a body of that size: the power of ten below it."""
+    return 10.0 ** math.floor(math.log10(size))
+
+
+@torch.no_grad()
+def read_run(folder: str | Path) -> list[Clip]:
+    """The sequences of a run, the training one first. prior.npz, observed.npz and truth.npz may be missing: older runs left fewer
+    files, captures have no truth. Errors: DataError naming the file that is missing or of another run."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise DataError(f"run: expected the folder of a finished run (run=outputs/train/<date>/<time>), found no folder {folder}")
+    rollouts = arrays(folder / "rollout.npz")  # first: it is what a run that has not ended lacks
+    twin = Twin.load(folder / "checkpoints" / "last.ckpt")
+    body = twin.body
+    paths = {kind: folder / f"{'rollout' if kind == 'learned' else kind}.npz" for kind in BODIES}
+    files = {kind: arrays(path) for kind, path in paths.items() if kind != "learned" and path.is_file()} | {"learned": rollouts}
+    factor = body.factor(body.heterogeneity)
+    clips = []
+    for name in (key.removesuffix("/x") for key in rollouts if key.endswith("/x")):
+        bodies, shape = {}, (len(rollouts[f"{name}/x"]), len(body.rest))
+        for kind, stored in files.items():
+            if f"{name}/x" not in stored or (kind == "truth" and "observed" in bodies):
+                continue
+            frames, particles = stored[f"{name}/x"].shape[:2]
+            if particles != shape[1] or frames > shape[0] or (kind != "observed" and frames < shape[0]):
+                raise DataError(f"{paths[kind]}: {name}: expected the checkpoint's {shape[1]} particles in the rollout's "
+                                f"{shape[0]} frames, found {particles} in {frames}; all files must be of one run")
+            bodies[kind] = Motion(stored[f"{name}/x"], covariances(stored, name, body))
+        clips.append(Clip(name, rollouts[f"{name}/times"], bodies, body.colors.clamp(0, 1).numpy(), body.opacities.numpy(),
+                          factor.numpy(), twin.world))  # fmt: skip
+    if not clips:
+        raise DataError(f"{folder / 'rollout.npz'}: expected the rollouts of a run, found none")
+    return clips
+
+
+def covariances(stored: dict[str, np.ndarray], name: str, body: Body) -> np.ndarray:
+    """(T, N, 3, 3) [m^2] of a motion's splats: the stored ones; else those at rest, deformed by the stored F_tot, or where there
+    are positions alone by a local fit to them."""
+    if f"{name}/covariances" in stored:
+        return stored[f"{name}/covariances"]
+    if f"{name}/F_tot" in stored:
+        F = torch.from_numpy(stored[f"{name}/F_tot"])
+    else:
+        around = neighbourhood(body.rest)
+        F = torch.stack([around.deformation(x) for x in torch.from_numpy(stored[f"{name}/x"])])
+        F[:, around.weight == 0] = torch.eye(3)  # neighbours in a plane say nothing: as at rest
+    return deformed_covariances(F, body.covariances).numpy()
+
+
+def arrays(path: Path) -> dict[str, np.ndarray]:
+    """Contents of an npz file. Errors: DataError naming it."""
+    if not path.is_file():
+        raise DataError(f"{path}: file not found; expected the folder of a finished run (run=outputs/train/<date>/<time>); "
+                        "train.py writes this file at its end; it resumes with ckpt_path=<run folder>/checkpoints/last.ckpt")
+    try:
+        with np.load(path) as stored:
+            return {key: stored[key] for key in stored.files}
+    except (OSError, ValueError, EOFError, KeyError) as error:
+        raise DataError(f"{path}: expected a readable npz file, found a damaged one ({error})") from error
