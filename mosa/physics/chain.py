@@ -90,7 +90,7 @@ class Chain:
         self._warm: set[tuple] = set()
         self._graphs: dict[tuple, torch.cuda.CUDAGraph] = {}
         self._key: tuple = ()
-        self._passes: dict[tuple, Callable[[Chain], None]] = {}  # of the class: no cycle keeps the buffers when the chain goes
+        self._passes: dict[tuple, Callable[[Chain], None]] = {}  # no methods: see `Simulator`
         self.again = "graphs" if graphs else "states"
         for full in (False, True):
             self._passes["forward", full] = partial(Chain._forward, full=full)

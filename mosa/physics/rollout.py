@@ -131,7 +131,7 @@ class Simulator:
         self._workspaces: dict = {}
         self._long = self.device.type == "cuda"  # a CPU gains nothing
         self.chained = self.device.type == "cuda" if chained is None else chained
-        # not a method: only what holds itself in no way is freed, with its buffers, as soon as nobody needs it
+        # no method: the cycle would keep a dropped simulator's buffers until the garbage collector looks
         self._ask = partial(_asked, self.law, dtype)
         self._chains = Chains(self.numerics, self._ask)
 

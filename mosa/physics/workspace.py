@@ -65,8 +65,8 @@ class Steps(NamedTuple):
 MAX_GRAPHS = 64
 """Captured graphs a workspace keeps: one per pass and time step."""
 SPARE = 8
-"""One node in so many is room for larger windows, half as many as there are up to `window.SMALL`: more nodes than there is room for
-cost new buffers and captures."""
+"""Room for larger windows: half as many nodes again, at most `window.SMALL`, or one in so many where that is more. A window that
+finds none costs new buffers and captures."""
 IDLE = 8
 """Times the window's nodes that stay (`window.SMALL` in any case) for when it grows again: idle ones cost memory and, on CUDA,
 threads that end at once."""
