@@ -15,7 +15,7 @@ from mosa.modules.fused.selection import PRECISIONS, check_options, chosen, weig
 from mosa.modules.progressive import Correction, ProgressiveOperator, apply
 from mosa.modules.stiffening import ADAPTER_MARGIN, acoustic_stiffening, worst_stiffening
 from mosa.physics.activations import backward_at_hand
-from mosa.physics.rollout import AdapterOperator, MaterialState
+from mosa.physics.asking import AdapterOperator, MaterialState
 
 
 class OperatorStatistics(NamedTuple):

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError
+from mosa.physics.asking import MaterialState
 from mosa.physics.elasticity import lame, wave_modulus
 from mosa.physics.laws import law_named
 from mosa.physics.plasticity import friction_alpha
-from mosa.physics.rollout import MaterialState, Simulator
+from mosa.physics.rollout import Simulator
 
 NU_MAX, ANGLE_MAX = 0.49, 89.0
 

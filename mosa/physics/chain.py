@@ -20,13 +20,13 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from mosa.physics.activations import at_hand, same_weights
+from mosa.physics.asking import ANSWER
 from mosa.physics.capturing import ATTEMPTS, Captures
-from mosa.physics.mpm import WIDENED, LeftWindow, SegmentSolver, wants_gradient, warp_stream
+from mosa.physics.mpm import WIDENED, LeftWindow, SegmentSolver, wants_gradient
 from mosa.physics.mpm_kernels import NO_EVENT
 from mosa.physics.window import fallen, grid_window
-from mosa.physics.workspace import Numerics, Workspace, copies
+from mosa.physics.workspace import Numerics, Workspace, copies, warp_stream
 
-ANSWER = ("G", "h", "plastic_G", "plastic_h")
 MARGIN = 4
 """Nodes of a window beyond what the speeds at the start ask for."""
 

@@ -7,15 +7,15 @@ import math
 from collections.abc import Iterable
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from mosa.errors import SimulationDiverged
+from mosa.physics.asking import ANSWER
 from mosa.physics.mpm_kernels import INVERTED, NO_EVENT, NONFINITE, OUTSIDE, WINDOW
 from mosa.physics.window import MAX_NODES, SMALL, extent, fallen, grid_window, window_of
 from mosa.physics.workspace import Numerics, Steps, Workspace, copies
 
-HELD = ("parameters", "G", "h", "plastic_G", "plastic_h")
+HELD = ("parameters", *ANSWER)
 LONGEST = 256
 """Most substeps of a segment of which no gradient is wanted, on CUDA: each segment costs a look at the host."""
 LONGEST_KEPT = 96
@@ -88,11 +88,12 @@ class SegmentSolver:
         # the speed at the start tells the window; a body that is being accelerated may need the most that the time step bound
         # allows, half a cell per substep
         steps = steps or Steps(self.numerics.dt, self.numerics.dt)
-        for margin in (2, 3 + substeps // 2)[: 1 if substeps > WIDENED else 2]:
+        cut = substeps > WIDENED  # where the first window does not do, not widened
+        for margin in (2,) if cut else (2, 3 + substeps // 2):
             found, flags, work = self._attempt(state, held, poses, substeps, margin, steps, kept)
             if not self.left_window(flags, first, steps.dt):
                 return *found, work.tape() if kept else []
-        raise LeftWindow if substeps > WIDENED else self.left_behind(flags, first, steps.dt)
+        raise LeftWindow if cut else self.left_behind(flags, first, steps.dt)
 
     def piece(self, state: tuple[Tensor, ...], left: int, most: int, dt: float) -> int:
         """How many of the `left` substeps the next window is to serve: at most `most`, and so few that it is not much larger than
@@ -250,11 +251,3 @@ def advance_segment(
         reactions.append(reaction)
         done, steps = done + piece, Steps(steps.dt, steps.dt)
     return state, reactions[0] if len(reactions) == 1 else tuple(torch.cat(parts) for parts in zip(*reactions, strict=True))
-
-
-def warp_stream(device: torch.device):
-    """Context in which Warp launches on torch's current stream."""
-    if device.type != "cuda":
-        return wp.ScopedDevice("cpu")
-    # without waiting for Warp's own stream: nothing is left on it, and a stream that is being captured could not
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)

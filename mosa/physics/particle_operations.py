@@ -9,9 +9,8 @@ from torch import Tensor
 
 from mosa.physics.laws import Law
 from mosa.physics.material_kernels import field_types, return_kernel, state_kernel, stress_kernel
-from mosa.physics.mpm import warp_stream
 from mosa.physics.particle_memory import aligned, zeros_in_one
-from mosa.physics.workspace import SCALARS, Numerics, launch
+from mosa.physics.workspace import SCALARS, Numerics, launch, warp_stream
 
 
 def _arrays(tensors: list[Tensor | None], kinds: list) -> list:

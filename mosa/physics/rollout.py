@@ -11,19 +11,19 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError
 from mosa.physics.adaptive import StepChooser, StepControl, check_counts
+from mosa.physics.asking import AdapterOperator, MaterialState, ask
 from mosa.physics.boundary import Plane, ground_plane, pack_planes
-from mosa.physics.chain import ANSWER
 from mosa.physics.chains import SEGMENT, Chains
 from mosa.physics.collider_motion import Motion, Trajectory, sample_frame, sample_poses
 from mosa.physics.colliders import Collider, pack_colliders, reach
-from mosa.physics.laws import SLOTS, Law, law_named
+from mosa.physics.laws import SLOTS, law_named
 from mosa.physics.memory import room
 from mosa.physics.mpm import LONGEST, LONGEST_KEPT, SegmentSolver, advance_segment, substep_bytes, wants_gradient
 from mosa.physics.particle_operations import first_advance, material_state
@@ -32,28 +32,6 @@ from mosa.physics.workspace import SCALARS, Numerics, Steps
 from mosa.types import Ground, ParticleState, Rollout
 
 _UNBOUNDED = 1e30
-
-
-class MaterialState(NamedTuple):
-    """What an adapter reads, in the material frame. w: (N, 6) vech(W - I); stress: (N, 6) vech(R^T tau R) [Pa] of the prior;
-    plastic_strain: (N, 6) vech(dev log W), None for laws that do not yield. vech order: xx, yy, zz, yz, zx, xy."""
-
-    w: Tensor
-    stress: Tensor
-    plastic_strain: Tensor | None = None
-
-
-class AdapterOperator(NamedTuple):
-    """What an adapter answers, held in the material frame until it is asked again.
-
-    G: (N, 6, 6), h: (N, 6) [Pa]: tau_hat = tau + R mat(G vech(R^T tau R) + h) R^T. plastic_G: (N, 6, 6), plastic_h: (N, 6), both or
-    neither: the yield function takes |dev(mat((I + plastic_G) vech(E) + plastic_h))| for |E|.
-    """
-
-    G: Tensor
-    h: Tensor
-    plastic_G: Tensor | None = None
-    plastic_h: Tensor | None = None
 
 
 class Simulator:
@@ -132,7 +110,7 @@ class Simulator:
         self._long = self.device.type == "cuda"  # a CPU gains nothing
         self.chained = self.device.type == "cuda" if chained is None else chained
         # no method: the cycle would keep a dropped simulator's buffers until the garbage collector looks
-        self._ask = partial(_asked, self.law, dtype)
+        self._ask = partial(ask, self.law, dtype)
         self._chains = Chains(self.numerics, self._ask)
 
     def pack(self, parameters: dict[str, Tensor], particles: int, rotation: Tensor | None = None) -> Tensor:
@@ -362,27 +340,6 @@ class Simulator:
         if not densities:
             raise ConfigError("density: expected positive numbers [kg/m^3] for all particles")
         return density, mass
-
-
-def _asked(
-    law: Law, dtype: torch.dtype, adapter: Callable, F: Tensor, C: Tensor, packed: Tensor, collect: Callable | None = None,
-    into: tuple[Tensor, Tensor, Tensor] | None = None,
-) -> dict[str, Tensor | None]:  # fmt: skip
-    """The adapter's answer by name, checked. into: as `material_state`."""
-    n = len(F)
-    answer = AdapterOperator(*adapter(MaterialState(*material_state(law, F, C, packed, into))))
-    plastic = (answer.plastic_G, answer.plastic_h) if law.plastic else (None, None)
-    result = dict(zip(ANSWER, (answer.G, answer.h, *plastic)))
-    for name, value in result.items():
-        if name.startswith("plastic") and all(part is None for part in plastic):
-            continue
-        shape = (n, 6, 6) if name.endswith("G") else (n, 6)
-        if value is None or tuple(value.shape) != shape or value.dtype != dtype:
-            found = "none" if value is None else f"{tuple(value.shape)} of {value.dtype}"
-            raise ConfigError(f"adapter output {name}: expected shape {shape} of {dtype}, found {found}")
-    if collect is not None:
-        collect(adapter.statistics())
-    return result
 
 
 def _segments(substeps: int, stride: int | None, most: int = 0) -> list[int]:

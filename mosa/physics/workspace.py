@@ -83,6 +83,14 @@ def launch(kernel, dim: int, inputs: list, device, adj_inputs: list | None = Non
         wp.launch(kernel, dim, inputs=inputs, adj_inputs=adj_inputs, adjoint=True, device=device, block_dim=block)
 
 
+def warp_stream(device: torch.device):
+    """Context in which Warp launches on torch's current stream."""
+    if device.type != "cuda":
+        return wp.ScopedDevice("cpu")
+    # without waiting for Warp's own stream: nothing is left on it, and a stream that is being captured could not
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
+
+
 def copies(tensors: Sequence[Tensor]) -> list[Tensor]:
     """Contiguous copies, in one launch on CUDA."""
     made = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in tensors]

@@ -11,8 +11,8 @@ from mosa.errors import ConfigError, SimulationDiverged
 from mosa.modules.adapter import Adapter, StressAdapter
 from mosa.modules.material import material_states
 from mosa.modules.microplane import MANDEL
+from mosa.physics.asking import AdapterOperator
 from mosa.physics.elasticity import lame
-from mosa.physics.rollout import AdapterOperator
 
 E, NU = 1e5, 0.35
 MU, LAM = lame(torch.tensor(E, dtype=torch.float64), torch.tensor(NU, dtype=torch.float64))

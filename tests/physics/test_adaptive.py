@@ -7,10 +7,11 @@ import torch
 
 from mosa.errors import ConfigError
 from mosa.physics.adaptive import StepControl, current_modulus
+from mosa.physics.asking import AdapterOperator
 from mosa.physics.collider_motion import Motion, Trajectory
 from mosa.physics.colliders import Box, Collider
 from mosa.physics.elasticity import lame
-from mosa.physics.rollout import AdapterOperator, Simulator
+from mosa.physics.rollout import Simulator
 from mosa.physics.time_step import required_substeps
 from mosa.types import Ground, ParticleState
 

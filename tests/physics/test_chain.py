@@ -11,9 +11,10 @@ from mosa.errors import ConfigError, SimulationDiverged
 from mosa.modules.adapter import StressAdapter, pool
 from mosa.physics import chain as chain_module
 from mosa.physics import chains as chains_module
+from mosa.physics.asking import AdapterOperator
 from mosa.physics.capturing import ATTEMPTS
 from mosa.physics.chains import Plan, chain_length, grouped
-from mosa.physics.rollout import SEGMENT, AdapterOperator, Simulator
+from mosa.physics.rollout import SEGMENT, Simulator
 from mosa.types import Ground, ParticleState
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]

@@ -6,7 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mosa.physics.rollout import AdapterOperator, Simulator
+from mosa.physics.asking import AdapterOperator
+from mosa.physics.rollout import Simulator
 from mosa.types import Ground, ParticleState
 
 pytestmark = pytest.mark.gpu

@@ -9,10 +9,11 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError, SimulationDiverged
+from mosa.physics.asking import AdapterOperator, MaterialState
 from mosa.physics.colliders import Collider, Sphere
 from mosa.physics.elasticity import lame
 from mosa.physics.mpm import SegmentSolver, grid_window, substep_bytes
-from mosa.physics.rollout import AdapterOperator, MaterialState, Simulator
+from mosa.physics.rollout import Simulator
 from mosa.physics.window import GAINED, extent, fallen, window_of
 from mosa.physics.workspace import Workspace
 from mosa.types import Ground, ParticleState
