@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import lightning as L
-import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.loggers import TensorBoardLogger
@@ -46,7 +45,7 @@ from mosa.run import (
     write_figures,
 )  # fmt: skip
 from mosa.schema import EVALUATION, SIMULATION, TRAINING, check
-from mosa.twin import Twin, save_observed, save_rollout
+from mosa.twin import Twin, save_observed, save_rollout, save_truth
 from mosa.types import MotionCues, Reconstruction, Scene
 
 
@@ -279,9 +278,8 @@ def write_outputs(folder: Path, cfg: DictConfig, body: Body, evaluated: list[Seq
     results.md; metrics.json."""
     for variant, name in (("adapted", "rollout.npz"), ("prior", "prior.npz")):
         save_rollout(folder / name, {prefix: variants[variant] for prefix, variants in kept.items()})
-    known = {f"{s.prefix}/x": true_motion(body, s.scene) for s in evaluated if s.scene.truth is not None}
-    if known:
-        np.savez_compressed(folder / "truth.npz", **{key: x.float().numpy() for key, x in known.items()})
+    if known := {s.prefix: true_motion(body, s.scene) for s in evaluated if s.scene.truth is not None}:
+        save_truth(folder / "truth.npz", known)
     if cfg.evaluation.video:
         shown = [s for s in evaluated if s.prefix.startswith("test")] or evaluated[-1:]
         pictures = {s.prefix: comparison(body, s, kept[s.prefix]) for s in shown}

@@ -151,19 +151,26 @@ def vector(name: str, value: Sequence[float]) -> Tensor:
 
 def save_rollout(path: str | Path, parts: dict[str, Rollout]) -> None:
     """npz with x [T, N, 3], F and F_tot [T, N, 3, 3], times [T] and counts [T - 1] (substeps) under `<name>/...`."""
-    arrays = {}
-    for name, r in parts.items():
-        arrays |= {f"{name}/x": r.x, f"{name}/F": r.F, f"{name}/F_tot": r.F_tot, f"{name}/times": r.times,
-                   f"{name}/counts": torch.tensor(r.counts, dtype=torch.int64)}
-    np.savez_compressed(path, **{k: v.detach().cpu().numpy() for k, v in arrays.items()})
+    save_parts(path, {
+        name: {"x": r.x, "F": r.F, "F_tot": r.F_tot, "times": r.times, "counts": torch.tensor(r.counts, dtype=torch.int64)}
+        for name, r in parts.items()
+    })  # fmt: skip
 
 
 def save_observed(path: str | Path, parts: dict[str, MotionCues]) -> None:
     """npz with x [T, N, 3] and covariances [T, N, 3, 3] of the motions learned from, under `<name>/...` as `save_rollout`."""
-    arrays = {}
-    for name, cues in parts.items():
-        arrays |= {f"{name}/x": cues.positions, f"{name}/covariances": cues.covariances}
-    np.savez_compressed(path, **{k: v.detach().cpu().numpy() for k, v in arrays.items()})
+    save_parts(path, {name: {"x": cues.positions, "covariances": cues.covariances} for name, cues in parts.items()})
+
+
+def save_truth(path: str | Path, parts: dict[str, Tensor]) -> None:
+    """npz with x [T, N, 3], single precision, where the body's particles would truly be, under `<name>/...` as `save_rollout`."""
+    save_parts(path, {name: {"x": x.float()} for name, x in parts.items()})
+
+
+def save_parts(path: str | Path, parts: dict[str, dict[str, Tensor]]) -> None:
+    """npz of the tensors under `<name>/<key>`."""
+    arrays = {f"{name}/{key}": t for name, tensors in parts.items() for key, t in tensors.items()}
+    np.savez_compressed(path, **{key: t.detach().cpu().numpy() for key, t in arrays.items()})
 
 
 def write_ply(path: str | Path, points: np.ndarray, colors: np.ndarray) -> None:

@@ -78,6 +78,10 @@ class SimulationSettings:
     adaptive: bool = False
     min_substeps: int = 1
 
+    def strides(self, least: int) -> int:
+        """Substeps of the fewest whole strides that are at least `least`."""
+        return self.stride * -(-least // self.stride)
+
     def __post_init__(self) -> None:
         if self.precision not in (32, 64):
             raise ConfigError(f"simulation.precision: expected 32 or 64, found {self.precision!r}: 16 bits cannot carry an MPM")
@@ -214,7 +218,7 @@ class Body(nn.Module):
             factor=self.stiffening(adapted), courant=settings.courant, limit=settings.max_substeps,
             viscosity=viscosity,
         )
-        multiple = settings.stride * -(-EVEN // settings.stride)
+        multiple = settings.strides(EVEN)
         return -(-count // multiple) * multiple
 
     def step_control(self, adapted: bool) -> StepControl:
@@ -222,7 +226,7 @@ class Body(nn.Module):
         settings = self.settings
         return StepControl(
             courant=settings.courant, factor=self.stiffening(adapted), minimum=settings.min_substeps,
-            maximum=settings.max_substeps, multiple=settings.stride * -(-8 // settings.stride),
+            maximum=settings.max_substeps, multiple=settings.strides(8),
         )  # fmt: skip
 
     def simulate(
