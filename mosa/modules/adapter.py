@@ -72,6 +72,9 @@ class Adapter(nn.Module):
         """Modulus over the prior's that the time step allows for; poisson: the prior's."""
         return ADAPTER_MARGIN
 
+    def follow(self, poisson: Tensor) -> None:
+        """Told before every rollout: the prior's Poisson number at that moment, (), with its graph."""
+
     def __getstate__(self) -> dict:
         return {**self.__dict__, "_last": None}  # it holds a graph, which can be neither copied nor pickled
 

@@ -8,11 +8,13 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 
 import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError
+from mosa.modules.criteria import corrected_rollout
 from mosa.modules.heterogeneity import HeterogeneityField
 from mosa.modules.material import Material
 from mosa.physics.adaptive import StepControl
@@ -242,17 +244,24 @@ class Body(nn.Module):
         collect: Callable | None = None,
         progress: Callable[[int], None] | None = None,
         counts: Sequence[int] | None = None,
+        observed: Tensor | None = None,
+        gain: float = 0.0,
+        substeps: int | None = None,
     ) -> Rollout:
         """Roll `frames` frames out (frame 0 is the start). Differentiable in every parameter and in `start`.
 
         collect: called with the statistics of every evaluation of the adapter (penalties, mean |C|). counts: of substeps, to
-        replay those of an adaptive rollout. Errors: SimulationDiverged, ConfigError (time step).
+        replay those of an adaptive rollout. observed, gain: (T, N, 3) [m] and a number; at every frame the velocities are corrected
+        towards what was seen (`criteria.corrected_rollout`). substeps: of every frame, where differences hold them fixed; None: as
+        many as the time step bound asks for. Errors: SimulationDiverged, ConfigError (time step).
         """
         material, contact, heterogeneity, adapter = self.parts(variant)
         if not with_heterogeneity:
             heterogeneity = None
         if not with_adapter or (adapter is not None and not adapter.is_on):  # before its stage an adapter is the prior
             adapter = None
+        if adapter is not None:
+            adapter.follow(material.poisson(live=True))
         dtype = torch.float64 if self.settings.precision == 64 else torch.float32
         factor = self.factor(heterogeneity)
         parameters = material.per_particle(factor)
@@ -264,6 +273,8 @@ class Body(nn.Module):
             timing = {"control": self.step_control(self.adapter is not None), "counts": counts, "lag": 0.0}
             substeps = self.settings.max_substeps
             state = self.initial_state(start, 0.0, gravity)
+        elif substeps is not None:
+            state = self.initial_state(start, frame_dt / substeps, gravity)
         else:
             fall = float(gravity.norm()) * frames * frame_dt
             speed = float(start.velocity.detach().norm()) + fall
@@ -275,31 +286,38 @@ class Body(nn.Module):
                 float(material.max_viscosity(factor.detach())),
             )  # fmt: skip
             state = self.initial_state(start, frame_dt / substeps, gravity)
-        simulator = self.simulator(material.law, substeps, frame_dt, world)
+        simulator = self.simulator(material.law, substeps, frame_dt, world, getattr(adapter, "strain", None))
         lift = contact() * up
         state = replace(state, x=state.x + lift)
         state = ParticleState(*(getattr(state, name).to(dtype) for name in ("x", "v", "C_affine", "F", "F_tot")))
         stride = None if adapter is not None and adapter.steady else self.settings.stride
-        rollout = simulator.rollout(
-            state, {k: p.to(dtype) for k, p in parameters.items()}, self.volume.to(dtype), self.density, frames,
-            adapter=adapter, stride=stride, collect=collect, progress=progress,
+        roll = partial(
+            simulator.rollout, parameters={k: p.to(dtype) for k, p in parameters.items()}, volume=self.volume.to(dtype),
+            density=self.density, adapter=adapter, stride=stride, collect=collect,
             motions=[c.motion.shifted(lift) for c in world.colliders],  # the offset is the ground's: they keep their place
-            **timing,
-        )
+        )  # fmt: skip
+        if observed is None:
+            rollout = roll(state, frames=frames, progress=progress, **timing)
+        else:
+            if timing:
+                raise ConfigError("simulation.adaptive: expected false where a criterion corrects the prediction frame by frame")
+            rollout = corrected_rollout(roll, state, (observed[:frames] + lift.detach()).to(dtype), gain, frame_dt)
         self.last_substeps = -(-sum(rollout.counts) // len(rollout.counts)) if rollout.counts else substeps
         fields = {name: getattr(rollout, name).to(self.rest.dtype) for name in ("x", "v", "F", "F_tot")}
         return replace(rollout, **{**fields, "x": fields["x"] - lift})
 
-    def simulator(self, law: str, substeps: int, frame_dt: float, world: World) -> Simulator:
-        """The simulator of `law` in `world`, one per time step (kernels are compiled once per law and precision)."""
-        key = (law, substeps, frame_dt, str(self.rest.device), id(world))
-        if getattr(self, "_simulator_key", None) != key:
+    def simulator(self, law: str, substeps: int, frame_dt: float, world: World, strain: str | None = None) -> Simulator:
+        """The simulator of `law` in `world`, one per time step (kernels are compiled once per law and precision).
+
+        strain: of an adapter whose operator is a stiffness (`Simulator`)."""
+        key = (law, substeps, frame_dt, str(self.rest.device), strain)
+        if getattr(self, "_simulator_key", None) != key or self._simulator_world is not world:
             dtype = torch.float64 if self.settings.precision == 64 else torch.float32
             self._simulator = Simulator(
                 law, dx=self.settings.dx, substeps=substeps, frame_dt=frame_dt, gravity=world.gravity, up=world.up,
                 ground=world.ground, planes=world.planes, colliders=world.colliders, box=world.box,
-                dtype=dtype, device=self.rest.device, **self.law_options,
+                dtype=dtype, device=self.rest.device, strain=strain, **self.law_options,
             )
-            self._simulator_key, self._simulator_world = key, world  # held, so that its id is not given to another world
+            self._simulator_key, self._simulator_world = key, world
         return self._simulator
 

@@ -67,6 +67,8 @@ class Material(nn.Module):
         self.stiffness = "E" if "E" in parameters else "kappa"
         self.modulated = tuple(modulated) if modulated is not None else tuple(n for n in STIFFNESS if n in parameters)
         self.raw = nn.ParameterDict()
+        self.begins: dict[str, float] = {}
+        """Unconstrained values that the parameters start from, whatever is loaded later."""
         self.held: list[str] = []
         for name, value in parameters.items():
             self._add(name, value, name not in frozen)
@@ -99,7 +101,8 @@ class Material(nn.Module):
             self.held.append(name)
             self.register_buffer(f"held_{name}", torch.tensor(value))
         elif form.low < value < form.high:
-            self.raw[name] = nn.Parameter(torch.tensor(form.inverse(value)), requires_grad=learned)
+            self.begins[name] = form.inverse(value)
+            self.raw[name] = nn.Parameter(torch.tensor(self.begins[name]), requires_grad=learned)
         else:
             raise ConfigError(
                 f"prior.parameters.{name}: expected a number between {form.low:g} and {form.high:g}, found {value:g}"
@@ -133,9 +136,9 @@ class Material(nn.Module):
         values = {n: v.detach() for n, v in self.per_particle(factor).items()}
         return law_named(self.law).explicit_viscosity(values).max()
 
-    def poisson(self) -> Tensor:
-        """Poisson number of the small-strain response, (), without gradient: nu, or that of mu and kappa, at most 0.49."""
-        p = {n: v.detach() for n, v in self.physical().items()}
+    def poisson(self, live: bool = False) -> Tensor:
+        """Poisson number of the small-strain response, (): nu, or that of mu and kappa, at most 0.49. live: with its graph."""
+        p = {n: v if live else v.detach() for n, v in self.physical().items()}
         if "nu" in p:
             return p["nu"]
         mu = p.get("mu", torch.zeros_like(p["kappa"]))

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mosa.errors import ConfigError
 
 STAGES = ("prior", "prior_eta", "joint")
+OPTIMIZERS = ("auto", "gauss_newton", "adam")
 
 
 @dataclass(frozen=True)
 class Stage:
     """One stage of the fit.
 
-    lr: global parameters; lr_networks: heterogeneity field; lr_adapter: adapter; lr_contact [cells]: contact offset;
+    iterations: of Adam; optimizer: auto | gauss_newton | adam, auto being the first where all that is learned has few numbers;
+    newton_iterations: of Gauss-Newton, at most. The rates are Adam's. lr: global parameters; lr_networks: heterogeneity field; lr_adapter: adapter; lr_contact [cells]: contact offset;
     converged: relative change of the mean loss of 10 iterations below which the stage ends (0: run all iterations);
     start: backbone whose parameters the stage starts from (joint: prior | prior_eta).
     """
@@ -27,14 +29,37 @@ class Stage:
     lr_contact: float = 0.0
     converged: float = 0.0
     start: str | None = None
+    optimizer: str = "auto"
+    newton_iterations: int = 8
 
     def __post_init__(self) -> None:
         if self.name not in STAGES:
             raise ConfigError(f"fit: expected a stage among {', '.join(STAGES)}, found {self.name!r}")
         if self.iterations < 0:
             raise ConfigError(f"fit.{self.name}.iterations: expected a number >= 0, found {self.iterations}")
+        if self.optimizer not in OPTIMIZERS:
+            raise ConfigError(f"fit.{self.name}.optimizer: expected one of {', '.join(OPTIMIZERS)}, found {self.optimizer!r}")
+        if isinstance(self.newton_iterations, bool) or not isinstance(self.newton_iterations, int) or self.newton_iterations < 1:
+            raise ConfigError(f"fit.{self.name}.newton_iterations: expected a whole number of at least 1, found "
+                              f"{self.newton_iterations!r}")
         if self.start not in (None, "prior", "prior_eta"):
             raise ConfigError(f"fit.{self.name}.start: expected prior or prior_eta, found {self.start!r}")
+
+    @property
+    def newton(self) -> bool:
+        """Whether the stage runs Gauss-Newton, once `resolved`."""
+        return self.optimizer == "gauss_newton"
+
+    def resolved(self, few: bool) -> Stage:
+        """With the optimiser that it runs. few: whether Gauss-Newton can learn all that the stage learns.
+
+        Errors: ConfigError where it is asked for and cannot."""
+        if self.optimizer == "gauss_newton" and not few:
+            raise ConfigError(f"fit.{self.name}.optimizer: gauss_newton learns few numbers (adapter=operator or none, "
+                              "heterogeneity.kind=modes), not networks; expected adam or auto")
+        chosen = "adam" if self.optimizer == "adam" or not few else "gauss_newton"
+        iterations = min(self.iterations, self.newton_iterations) if chosen == "gauss_newton" else self.iterations
+        return replace(self, optimizer=chosen, iterations=iterations)
 
     def decay(self, iteration: int) -> float:
         """Factor of the learning rates: constant for the first half, then a cosine down to a tenth."""

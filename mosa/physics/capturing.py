@@ -1,12 +1,54 @@
 """Capturing launches as a graph, which anything else that the thread does meanwhile may break."""
 
 import gc
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
 ATTEMPTS = 3
 """Captures in a row that may fail before there are no more: a library that sets itself up when it is first captured spoils one."""
+
+
+class Turns:
+    """Many threads launch at once, or one captures alone: Warp's capture on a CPU records every thread's launches."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._launching, self._capturing = 0, None
+
+    @contextmanager
+    def launching(self) -> Iterator[None]:
+        """Beside other launches; within this thread's own capture too."""
+        if self._capturing == threading.get_ident():
+            yield
+            return
+        with self._changed:
+            self._changed.wait_for(lambda: self._capturing is None)
+            self._launching += 1
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._launching -= 1
+                self._changed.notify_all()
+
+    @contextmanager
+    def capturing(self) -> Iterator[None]:
+        """When no other thread launches, and until it ends none begins to."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._capturing is None and self._launching == 0)
+            self._capturing = threading.get_ident()
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._capturing = None
+                self._changed.notify_all()
+
+
+ON_CPU = Turns()
+"""Of this process."""
 
 
 @contextmanager

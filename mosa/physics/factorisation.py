@@ -9,6 +9,7 @@ import warp as wp
 from torch import Tensor
 
 from mosa.physics.kinematics import svd
+from mosa.physics.workspace import launch
 
 _MATRIX = {torch.float32: wp.mat33f, torch.float64: wp.mat33d}
 _VECTOR = {torch.float32: wp.vec3f, torch.float64: wp.vec3d}
@@ -43,5 +44,5 @@ def singular_value_decomposition(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             wp.stream_from_torch(torch.cuda.current_stream(F.device)))
         with stream:
             arrays = [wp.from_torch(t, dtype=vector if t is S else matrix) for t in (flat, U, S, V)]
-            wp.launch(_KERNELS[F.dtype], len(flat), inputs=arrays, device=arrays[0].device)
+            launch(_KERNELS[F.dtype], len(flat), arrays, arrays[0].device)
     return U.reshape(F.shape), S.reshape(F.shape[:-1]), V.reshape(F.shape)

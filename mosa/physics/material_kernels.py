@@ -13,6 +13,7 @@ import warp as wp
 from mosa.physics.kinematics import contract, hencky_material, rotation, rotation_of, svd
 from mosa.physics.laws import SLOTS, Law
 from mosa.physics.particle_memory import particle_memory
+from mosa.physics.strain import FACTORISED, STRAINS, conjugate_stress, green_strain, green_stress, material_strain
 
 vec6 = wp.types.vector(length=6, dtype=wp.float64)
 mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float64)
@@ -26,6 +27,19 @@ def vech(A: wp.mat33d):
 @wp.func
 def unvech(a: vec6):
     return wp.mat33d(a[0], a[5], a[4], a[5], a[1], a[3], a[4], a[3], a[2])
+
+
+@wp.func
+def mandel(A: wp.mat33d):
+    """vech in Mandel scaling, in which the double contraction is a dot product."""
+    r = wp.sqrt(wp.float64(2.0))
+    return vec6(A[0, 0], A[1, 1], A[2, 2], r * A[1, 2], r * A[2, 0], r * A[0, 1])
+
+
+@wp.func
+def unmandel(a: vec6):
+    r = wp.sqrt(wp.float64(0.5))
+    return wp.mat33d(a[0], r * a[5], r * a[4], r * a[5], a[1], r * a[3], r * a[4], r * a[3], a[2])
 
 
 @wp.func
@@ -44,10 +58,16 @@ def field_types(scalar):
 
 
 @cache
-def stress_kernel(stress, uses_rotation: bool, scalar, adapted: bool):
-    """tau(F) [Pa]; adapted: + R mat(G vech(R^T tau R) + h) R^T with the operator held in the material frame."""
+def stress_kernel(stress, uses_rotation: bool, scalar, adapted: bool, strain: str | None = None, shear: int = 0):
+    """tau(F) [Pa]; adapted: + R mat(G vech(R^T tau R) + h) R^T with the operator held in the material frame.
+
+    strain: a name of `STRAINS`; the operator is then a stiffness in units of 2 mu, G in Mandel scaling (h is not read), and what is
+    added is the stress of the energy mu E : G : E. shear: place of mu among the law's parameters.
+    """
     field33, field6, field66, fieldp = field_types(scalar)
-    own, needs_rotation = particle_memory(scalar, SLOTS), uses_rotation or adapted
+    energetic = adapted and strain is not None
+    own, needs_rotation = particle_memory(scalar, SLOTS), uses_rotation or (adapted and not energetic)
+    factorised, measure = strain in FACTORISED, STRAINS.index(strain) if energetic else 0
 
     @wp.kernel(module="unique")
     def stress_of_particles(
@@ -59,8 +79,17 @@ def stress_kernel(stress, uses_rotation: bool, scalar, adapted: bool):
         R = Fi
         if wp.static(needs_rotation):
             R = rotation(Fi, rotation_of(Fi))
-        T = stress(Fi, R, own.matrix33(C_affine, i), own.parameters(parameters, i))
-        if wp.static(adapted):
+        p = own.parameters(parameters, i)
+        T = stress(Fi, R, own.matrix33(C_affine, i), p)
+        if wp.static(energetic):
+            modulus = wp.float64(2.0) * p[wp.static(shear)]
+            if wp.static(factorised):
+                U, S, V = svd(Fi)
+                E = mandel(material_strain(wp.static(measure), Fi, S, V))
+                T = T + conjugate_stress(wp.static(measure), Fi, S, V, unmandel(modulus * (own.matrix66(G, i) * E)))
+            else:
+                T = T + green_stress(Fi, unmandel(modulus * (own.matrix66(G, i) * mandel(green_strain(Fi)))))
+        elif wp.static(adapted):
             s = vech(wp.transpose(R) * T * R)
             T = T + R * unvech(own.matrix66(G, i) * s + own.vector6(h, i)) * wp.transpose(R)
         tau[i] = field33(T)
@@ -129,7 +158,8 @@ def state_kernel(stress, uses_rotation: bool, scalar, plastic: bool):
     return material_state
 
 
-def kernels_of(law: Law, scalar, adapted: bool, plastic_adapted: bool):
-    """(stress kernel, return-mapping kernel or None) of a law."""
-    stress = stress_kernel(law.stress, law.uses_rotation, scalar, adapted)
+def kernels_of(law: Law, scalar, adapted: bool, plastic_adapted: bool, strain: str | None = None):
+    """(stress kernel, return-mapping kernel or None) of a law. strain: of an operator that is a stiffness, see `stress_kernel`."""
+    shear = law.offsets["mu"] if adapted and strain is not None else 0
+    stress = stress_kernel(law.stress, law.uses_rotation, scalar, adapted, strain if adapted else None, shear)
     return stress, return_kernel(law.return_map, scalar, plastic_adapted) if law.plastic else None

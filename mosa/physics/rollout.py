@@ -28,6 +28,7 @@ from mosa.physics.memory import room
 from mosa.physics.mpm import LONGEST, LONGEST_KEPT, SegmentSolver, advance_segment, substep_bytes, wants_gradient
 from mosa.physics.particle_operations import first_advance, material_state
 from mosa.physics.plasticity import yield_factor
+from mosa.physics.strain import STRAINS
 from mosa.physics.workspace import SCALARS, Numerics, Steps
 from mosa.types import Ground, ParticleState, Rollout
 
@@ -47,6 +48,8 @@ class Simulator:
     chained: whether the evaluations of an adapter that is a torch module and the segments between them run as chains (chain.py);
     None: on CUDA, where a chain is one captured graph. Not with colliders or adaptive substeps, which are cut in segments.
     Gradients through a chain reach the adapter's parameters, not other tensors that it may use.
+    strain: hencky | biot | green: what adapters answer is a stiffness S in units of 2 mu, of the energy mu E : S : E that is added to
+    the prior's; None: an operator on the prior's stress.
     Errors: ConfigError naming the argument. Not safe for use by two threads: buffers are shared between rollouts.
     """
 
@@ -72,11 +75,16 @@ class Simulator:
         rebuild: bool = False,
         on_inversion: str = "warn",
         chained: bool | None = None,
+        strain: str | None = None,
     ) -> None:
         self.law = law_named(law)
         for name, value in (("dx", dx), ("frame_dt", frame_dt), ("substeps", substeps)):
             if not (math.isfinite(value) and value > 0):
                 raise ConfigError(f"{name}: expected a positive number, found {value}")
+        if strain is not None and (strain not in STRAINS or "mu" not in self.law.offsets or self.law.viscosity is not None):
+            if strain not in STRAINS:
+                raise ConfigError(f"strain: expected one of {', '.join(STRAINS)} or None, found {strain!r}")
+            raise ConfigError(f"strain: expected a law with a shear modulus mu, found {law!r}: a stiffness is counted in multiples of 2 mu")
         if dtype not in SCALARS:
             raise ConfigError(f"dtype: expected torch.float32 or torch.float64, found {dtype}")
         if init_affine not in ("spin", "zero"):
@@ -104,7 +112,7 @@ class Simulator:
             law=self.law, dtype=dtype, device=self.device, dx=float(dx), dt=self.dt, gravity=tuple(gravity.tolist()),
             planes=values, modes=modes, plane_count=len(all_planes), low=low, high=high, norm_eps=float(norm_eps),
             rebuild=rebuild, check_J=self.law.needs_positive_J or on_inversion == "error",
-            colliders=packed_colliders,
+            colliders=packed_colliders, strain=strain,
         )  # fmt: skip
         self._workspaces: dict = {}
         self._long = self.device.type == "cuda"  # a CPU gains nothing

@@ -16,7 +16,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from mosa.physics.capturing import Captures
+from mosa.physics.capturing import ON_CPU, Captures
 from mosa.physics.collider_workspace import ColliderBuffers
 from mosa.physics.colliders import PackedColliders
 from mosa.physics.laws import SLOTS, Law
@@ -32,7 +32,8 @@ SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
 class Numerics:
     """What is constant over a rollout. dx [m], dt [s] where the step is fixed, gravity (3,) [m/s^2], planes (P, 5) and modes (P,)
     from `pack_planes`, low and high (3,) [m] corners of the admissible domain, norm_eps under the root of yield norms, colliders
-    None where there are none."""
+    None where there are none, strain: measure of an operator that is a stiffness (`stress_kernel`), None for one that acts on the
+    stress."""
 
     law: Law
     dtype: torch.dtype
@@ -49,6 +50,7 @@ class Numerics:
     rebuild: bool
     check_J: bool
     colliders: PackedColliders | None = None
+    strain: str | None = None
 
 
 class Steps(NamedTuple):
@@ -77,10 +79,11 @@ BLOCK = 64
 def launch(kernel, dim: int, inputs: list, device, adj_inputs: list | None = None) -> None:
     """On Warp's current stream. adj_inputs: launch the adjoint."""
     block = BLOCK if device.is_cuda else None
-    if adj_inputs is None:
-        wp.launch(kernel, dim, inputs=inputs, device=device, block_dim=block)
-    else:
-        wp.launch(kernel, dim, inputs=inputs, adj_inputs=adj_inputs, adjoint=True, device=device, block_dim=block)
+    with nullcontext() if device.is_cuda else ON_CPU.launching():
+        if adj_inputs is None:
+            wp.launch(kernel, dim, inputs=inputs, device=device, block_dim=block)
+        else:
+            wp.launch(kernel, dim, inputs=inputs, adj_inputs=adj_inputs, adjoint=True, device=device, block_dim=block)
 
 
 def warp_stream(device: torch.device):
@@ -114,7 +117,7 @@ class Workspace:
         self.numerics, self.particles, self.substeps, self.with_adjoint = numerics, particles, substeps, with_adjoint
         self.scalar = SCALARS[numerics.dtype]
         self.kernels = transfer_kernels(self.scalar)
-        self.stress, self.mapping = kernels_of(numerics.law, self.scalar, adapted, plastic_adapted)
+        self.stress, self.mapping = kernels_of(numerics.law, self.scalar, adapted, plastic_adapted, numerics.strain)
         self.plastic = numerics.law.plastic
         n = particles
         states = substeps + 1 if with_adjoint else 2
@@ -281,14 +284,16 @@ class Workspace:
             # on Warp's own stream: torch's default one cannot be captured
             capture = wp.ScopedCapture(device=self.flags_wp.device, force_module_load=False)
             graph = None
-            if self._captures.succeeds(capture, body):
-                graph = self._graphs[key] = capture.graph
+            with nullcontext() if cuda else ON_CPU.capturing():
+                if self._captures.succeeds(capture, body):
+                    graph = self._graphs[key] = capture.graph
         if graph is None:
             with wp.ScopedStream(stream) if cuda else nullcontext():
                 body()  # the first pass compiles and loads the kernels, which a capture must not do
             self._graphs[key] = "loaded"
         else:
-            wp.capture_launch(graph, stream=stream)
+            with nullcontext() if cuda else ON_CPU.launching():
+                wp.capture_launch(graph, stream=stream)
 
     def _run(self, kernel, dim: int, inputs: list, adj_inputs: list | None = None) -> None:
         launch(kernel, dim, inputs, self.flags_wp.device, adj_inputs)

@@ -1,0 +1,66 @@
+"""What a fit compares with the motion that was seen: a free rollout, a prediction that is corrected by it, or both.
+
+In a free rollout the errors of grid and contact accumulate through the bounce, and a law is bent to undo them. A prediction error
+method (Ljung, System Identification, chapter 3) asks less: from what was seen up to a frame, predict the next. Here the observer
+is Luenberger's with a fixed gain on the velocities; positions and deformation gradients stay those of the simulation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from mosa.errors import ConfigError
+from mosa.types import Rollout
+
+CRITERIA = ("free", "corrected", "both")
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """name: free | corrected | both; gain: share of the distance to what was seen that a corrected velocity would close in a frame.
+
+    Errors: ConfigError naming the key.
+    """
+
+    name: str = "corrected"
+    gain: float = 0.5
+
+    def __post_init__(self) -> None:
+        if self.name not in CRITERIA:
+            raise ConfigError(f"criterion.name: expected one of {', '.join(CRITERIA)}, found {self.name!r}")
+        if not 0 < self.gain <= 1:
+            raise ConfigError(f"criterion.gain: expected a number above 0 and at most 1, found {self.gain}")
+
+    @property
+    def gains(self) -> tuple[float, ...]:
+        """One rollout is compared for each; 0 is the free one."""
+        return {"free": (0.0,), "corrected": (self.gain,), "both": (0.0, self.gain)}[self.name]
+
+
+def corrected_rollout(roll: Callable[..., Rollout], state, observed: Tensor, gain: float, frame_dt: float) -> Rollout:
+    """Frames predicted one by one: after each, v += gain (x_seen - x)/frame_dt. Its positions are those before the correction.
+
+    roll: a simulator's rollout with everything but state, frames and times given; observed: (T, N, 3) [m] with its frame 0;
+    frame_dt [s]. Differentiable.
+    """
+    parts: list[Rollout] = []
+    current = state
+    for frame in range(1, len(observed)):
+        part = roll(current, frames=2, started=frame > 1, start_time=(frame - 1) * frame_dt)
+        parts.append(part)
+        current = replace(part.final, v=part.final.v + (gain / frame_dt) * (observed[frame] - part.final.x))
+    if not parts:
+        return roll(state, frames=1)
+    stacked = {
+        name: torch.cat([getattr(parts[0], name), *(getattr(part, name)[1:] for part in parts[1:])]) for name in ("x", "v", "F", "F_tot")
+    }
+    reactions = None if parts[0].reactions is None else torch.cat([part.reactions for part in parts])
+    times = frame_dt * torch.arange(len(observed), dtype=parts[0].times.dtype, device=parts[0].times.device)
+    return Rollout(
+        **stacked, times=times, final=parts[-1].final, inverted=sum(part.inverted for part in parts), reactions=reactions,
+        counts=tuple(count for part in parts for count in part.counts),
+    )  # fmt: skip

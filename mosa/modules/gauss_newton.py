@@ -1,0 +1,204 @@
+"""Gauss-Newton for the few numbers of a law: it moves what the data determine and leaves the rest where the prior has it.
+
+Minimises 1/2 |r(theta)|^2 + 1/2 sum ((theta - mean)/sd)^2 with columns of the Jacobian by one-sided differences. The standard
+deviations of whole blocks are found from the data (MacKay, Bayesian interpolation, Neural Computation 4, 1992), and the inverse of
+the last matrix is the Laplace approximation of the posterior.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from mosa.errors import MosaError, SimulationDiverged
+
+
+@dataclass
+class Block:
+    """Numbers of one kind. mean, sd: of their prior, (n,); step: of differences; bounds: they are held within; learned: whether
+    evidence finds the common factor of the sd, within `limits`."""
+
+    name: str
+    mean: Tensor
+    sd: Tensor
+    step: float
+    learned: bool = False
+    bounds: tuple[float, float] = (-math.inf, math.inf)
+    limits: tuple[float, float] = (0.03, 5.0)
+    factor: float = 1.0
+
+    def __post_init__(self) -> None:
+        self.mean, self.sd = (t.detach().double().cpu().flatten() for t in (self.mean, self.sd))
+
+    @property
+    def size(self) -> int:
+        return len(self.mean)
+
+
+@dataclass
+class Seat:
+    """A model that can be moved and asked. tensors: its parameters, one for each block; residuals: a vector, of the numbers that
+    stand in them; it may raise MosaError. Seats share nothing that either writes to: each has a thread of its own."""
+
+    tensors: Sequence[Tensor]
+    residuals: Callable[[], Tensor]
+
+    def read(self) -> Tensor:
+        """(D,) float64 on the CPU."""
+        return torch.cat([t.detach().double().cpu().flatten() for t in self.tensors])
+
+    @torch.no_grad()
+    def write(self, numbers: Tensor) -> None:
+        parts = numbers.split([t.numel() for t in self.tensors])
+        for tensor, part in zip(self.tensors, parts):
+            tensor.copy_(part.reshape(tensor.shape).to(tensor))
+
+
+@dataclass
+class Posterior:
+    """mean (D,), covariance (D, D) float64 of the numbers of `names`, and `determined` (D,) in [0, 1]: the share of each number's
+    precision that comes from the data and not from its prior."""
+
+    names: list[str]
+    mean: Tensor
+    covariance: Tensor
+    determined: Tensor
+
+    def draws(self, count: int, generator: torch.Generator) -> Tensor:
+        """(count, D) float64."""
+        L = torch.linalg.cholesky(self.covariance)
+        return self.mean + torch.randn(count, len(self.mean), generator=generator, dtype=torch.float64) @ L.T
+
+
+@dataclass
+class GaussNewton:
+    """One or more seats of the same model; the first one holds the result. progress: called after every column."""
+
+    blocks: list[Block]
+    seats: list[Seat]
+    halvings: int = 4
+    progress: Callable[[], None] | None = None
+    matrix: Tensor | None = field(default=None, init=False)
+    data: Tensor | None = field(default=None, init=False)
+
+    def _vector(self, get: Callable[[Block], Tensor | float]) -> Tensor:
+        return torch.cat([torch.as_tensor(get(b), dtype=torch.float64).expand(b.size) for b in self.blocks])
+
+    def mean(self) -> Tensor:
+        """(D,) of the prior."""
+        return self._vector(lambda b: b.mean)
+
+    def precision(self) -> Tensor:
+        """(D,) of the prior."""
+        return 1 / self._vector(lambda b: b.sd * b.factor).square()
+
+    def clamped(self, numbers: Tensor) -> Tensor:
+        """Within the blocks' bounds."""
+        return torch.minimum(torch.maximum(numbers, self._vector(lambda b: b.bounds[0])), self._vector(lambda b: b.bounds[1]))
+
+    def cost(self, numbers: Tensor, r: Tensor) -> float:
+        """Minus the logarithm of the posterior, up to a constant."""
+        return 0.5 * float(r.square().sum()) + 0.5 * float((self.precision() * (numbers - self.mean()).square()).sum())
+
+    def jacobian(self, numbers: Tensor, r: Tensor) -> Tensor:
+        """(R, D) of the type and on the device of r (R,): one residual vector per column, the columns shared among the seats."""
+        steps, highest = self._vector(lambda b: b.step), self._vector(lambda b: b.bounds[1])
+        steps = torch.where(numbers + steps > highest, -steps, steps)
+        J = torch.empty(len(numbers), len(r), dtype=r.dtype, device=r.device)
+        left, lock = iter(range(len(numbers))), threading.Lock()
+
+        def work(seat: Seat) -> None:
+            while True:
+                with lock:
+                    i = next(left, None)
+                if i is None:
+                    return
+                moved = numbers.clone()
+                moved[i] += steps[i]
+                seat.write(moved)
+                J[i] = (seat.residuals() - r) / float(steps[i])
+                if self.progress is not None:
+                    with lock:
+                        self.progress()
+
+        try:
+            if len(self.seats) == 1:
+                work(self.seats[0])
+            else:
+                with ThreadPoolExecutor(len(self.seats)) as pool:
+                    for future in [pool.submit(work, seat) for seat in self.seats]:
+                        future.result()
+        finally:
+            for seat in self.seats:
+                seat.write(numbers)
+        return J.T
+
+    @torch.no_grad()
+    def iterate(self, learn: bool = True) -> dict[str, float]:
+        """One iteration from where the first seat stands. learn: update the blocks' factors by the evidence first.
+
+        Returns cost before and after, the share of the step that was taken (0: no part of it improved), the step's length in
+        standard deviations of the posterior, and each learned block's factor. Errors: SimulationDiverged where a column fails.
+        """
+        seat = self.seats[0]
+        numbers = seat.read()
+        for other in self.seats[1:]:
+            other.write(numbers)
+        r = seat.residuals()
+        J = self.jacobian(numbers, r)
+        H, g = (J.T @ J).double().cpu(), (J.T @ r).double().cpu()
+        del J
+        if not bool(torch.isfinite(H).all()):
+            raise SimulationDiverged("Gauss-Newton: a column of the Jacobian is not finite; start from a softer or stiffer prior")
+        away = numbers - self.mean()
+        if learn:
+            self._evidence(away, H)
+        precision = self.precision()
+        M = H + torch.diag(precision)
+        direction = torch.linalg.solve(M, -(g + precision * away))
+        before = after = self.cost(numbers, r)
+        share, taken = 1.0, 0.0
+        for _ in range(self.halvings):
+            moved = self.clamped(numbers + share * direction)
+            seat.write(moved)
+            try:
+                after = self.cost(moved, seat.residuals())
+            except MosaError:
+                after = math.inf
+            if after < before:
+                taken = share
+                break
+            share *= 0.4
+        if taken == 0.0:
+            seat.write(numbers)
+            after = before
+        self.matrix, self.data = M, H
+        length = float((direction @ M @ direction).clamp(min=0).sqrt())
+        return {"before": before, "after": after, "share": taken, "length": length} | {
+            f"sd/{b.name}": b.factor * float(b.sd.mean()) for b in self.blocks if b.learned}
+
+    def _evidence(self, away: Tensor, H: Tensor) -> None:
+        """MacKay's update of each learned block's factor: theta^2/sd^2 should sum to the number of well determined directions."""
+        variance = torch.linalg.inv(H + torch.diag(self.precision())).diagonal()
+        sizes = [b.size for b in self.blocks]
+        for b, spread, moved in zip(self.blocks, variance.split(sizes), away.split(sizes)):
+            determined = float((1 - spread / (b.sd * b.factor) ** 2).sum())
+            size = float((moved / b.sd).square().sum())
+            if b.learned and determined > 1e-6 and size > 0:
+                b.factor = min(max((size / determined) ** 0.5, b.limits[0]), b.limits[1])
+
+    def posterior(self) -> Posterior:
+        """Laplace's, from the last iteration's matrix. Errors: ValueError before the first."""
+        if self.matrix is None:
+            raise ValueError("posterior: expected an iteration before it is asked for")
+        names = [f"{b.name}[{i}]" if b.size > 1 else b.name for b in self.blocks for i in range(b.size)]
+        covariance = torch.linalg.inv(self.matrix)
+        covariance = 0.5 * (covariance + covariance.T)
+        determined = (1 - covariance.diagonal() * self.precision()).clamp(0, 1)
+        return Posterior(names, self.seats[0].read(), covariance, determined)

@@ -1,0 +1,116 @@
+"""The default adapter: an anisotropic stiffness added to the prior's energy, so that the learned law has an energy at every strain.
+
+psi(F) = psi_prior(F) + mu E : S : E, E a strain in the material frame (`physics.strain`), mu the prior's shear modulus at the particle.
+At small strain the prior's stiffness 2 mu C0 becomes 2 mu (C0 + S). S follows from numbers A as
+
+    C0 + S = C0^(1/2) exp(A) C0^(1/2),      A symmetric, orthogonal to the two isotropic tensors,
+
+which is positive definite whatever A is, isotropic only for A = 0, and leaves E and nu their meaning: they carry the isotropic part.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import torch
+from torch import Tensor, nn
+
+from mosa.errors import ConfigError
+from mosa.modules.adapter import Adapter, OperatorStatistics
+from mosa.modules.microplane import isotropic_stiffness
+from mosa.modules.stiffening import ADAPTER_MARGIN, acoustic_stiffening
+from mosa.physics.asking import AdapterOperator, MaterialState
+from mosa.physics.strain import STRAINS
+
+NUMBERS = 19
+"""Symmetric 6 x 6 matrices have 21 numbers, of which two are isotropic: the prior's own."""
+
+
+@lru_cache(maxsize=8)
+def anisotropic_basis(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """(19, 6, 6) orthonormal symmetric matrices in Mandel scaling, orthogonal to I and to 1x1: no sum of them is isotropic."""
+    basis = []
+    for i in range(6):
+        for j in range(i, 6):
+            E = torch.zeros(6, 6, dtype=torch.float64)
+            E[i, j] = E[j, i] = 1.0 if i == j else math.sqrt(0.5)
+            basis.append(E.flatten())
+    one = torch.tensor([1.0, 1, 1, 0, 0, 0], dtype=torch.float64)
+    isotropic = torch.linalg.qr(torch.stack([torch.eye(6, dtype=torch.float64).flatten(), torch.outer(one, one).flatten()], 1)).Q
+    symmetric = torch.stack(basis, 1)
+    rest = symmetric - isotropic @ (isotropic.T @ symmetric)
+    U, values, _ = torch.linalg.svd(rest, full_matrices=False)
+    assert int((values > 0.5).sum()) == NUMBERS
+    return U[:, :NUMBERS].T.unflatten(-1, (6, 6)).to(device, dtype).contiguous()
+
+
+def root_stiffness(poisson: Tensor) -> Tensor:
+    """(6, 6) C0^(1/2) in Mandel scaling and units of sqrt(2 mu); poisson: () below 1/2."""
+    one = torch.tensor([1.0, 1, 1, 0, 0, 0], dtype=poisson.dtype, device=poisson.device) / math.sqrt(3)
+    bulk = ((1 + poisson) / (1 - 2 * poisson)).sqrt()
+    return torch.eye(6, dtype=poisson.dtype, device=poisson.device) + (bulk - 1) * torch.outer(one, one)
+
+
+class HyperelasticAdapter(Adapter):
+    """A constant anisotropic stiffness with an energy. `numbers`: (19,) coordinates of A in `anisotropic_basis`, 0 at the prior.
+
+    strain: hencky | biot | green, the measure E. Errors: ConfigError for an unknown one; `switch_on` refuses fluids.
+    """
+
+    def __init__(self, *, strain: str = "hencky") -> None:
+        super().__init__()
+        if strain not in STRAINS:
+            raise ConfigError(f"adapter.strain: expected one of {', '.join(STRAINS)}, found {strain!r}")
+        self.strain = strain
+        self.numbers = nn.Parameter(torch.zeros(NUMBERS))
+        self._live: Tensor | None = None
+
+    def __getstate__(self) -> dict:
+        return {**super().__getstate__(), "_live": None}
+
+    @property
+    def steady(self) -> bool:
+        return True
+
+    def follow(self, poisson: Tensor) -> None:
+        """The prior's Poisson number now, (), with its graph: C0 is that of the law in use, so that C0 + S stays positive."""
+        self._live = poisson
+
+    def _poisson(self) -> Tensor:
+        return self.poisson if self._live is None else self._live.to(self.numbers.device)
+
+    def stiffness(self) -> Tensor:
+        """C0 + S (6, 6) float64 in Mandel scaling and units of 2 mu, with its graph; positive definite."""
+        root = root_stiffness(self._poisson().double())
+        A = torch.einsum("k,kij->ij", self.numbers.double(), anisotropic_basis(torch.float64, self.numbers.device))
+        return root @ torch.linalg.matrix_exp(A) @ root
+
+    def correction(self) -> Tensor:
+        """S (6, 6) float64, see `stiffness`."""
+        return self.stiffness() - isotropic_stiffness(self._poisson().double())
+
+    @torch.no_grad()
+    def stiffening(self, poisson: Tensor | float) -> float:
+        """Largest acoustic modulus of C0 + S over the prior's, `ADAPTER_MARGIN` at least."""
+        if not self.is_on:
+            return ADAPTER_MARGIN
+        relative = self.relative().cpu()
+        return max(ADAPTER_MARGIN, acoustic_stiffening(relative, self._poisson().double().cpu()))
+
+    def relative(self) -> Tensor:
+        """(6, 6) float64 S C0^-1 on vech components: what is added to the prior's stress at small strain."""
+        C0 = isotropic_stiffness(self._poisson().double())
+        scale = torch.tensor([1.0, 1, 1, 2**0.5, 2**0.5, 2**0.5], dtype=torch.float64, device=C0.device)
+        return (self.correction() @ torch.linalg.inv(C0)) * scale / scale[:, None]
+
+    def forward(self, state: MaterialState) -> AdapterOperator:
+        """G: S for every particle, (N, 6, 6) in Mandel scaling and units of 2 mu; h: zeros. Errors: ConfigError before `switch_on`."""
+        self.check_on()
+        n = len(state.w)
+        S = self.correction().to(state.w)
+        return AdapterOperator(S.expand(n, 6, 6).contiguous(), state.w.new_zeros(n, 6))
+
+    def statistics(self) -> OperatorStatistics:
+        """mean_abs_C: mean |entry| of S C0^-1, which is what the paper's C does to the stress at small strain; mean: the numbers."""
+        return OperatorStatistics(self.relative().abs().mean(), self.numbers, torch.zeros_like(self.numbers))

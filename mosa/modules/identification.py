@@ -1,0 +1,241 @@
+"""Identification of a body's few numbers by Gauss-Newton: which numbers there are, what is compared, and what was found.
+
+The numbers are the prior's global parameters, the contact offset, the adapter's and the stiffness modes'; what is compared are the
+motion cues (`residuals`), in the rollouts that the criterion asks for (`criteria`).
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mosa.errors import ConfigError, SimulationDiverged
+from mosa.modules import residuals
+from mosa.modules.body import Body, ContactOffset, World
+from mosa.modules.criteria import Criterion
+from mosa.modules.gauss_newton import Block, GaussNewton, Posterior, Seat
+from mosa.modules.hyperelastic import HyperelasticAdapter
+from mosa.modules.material import FORMS, NU_MAX
+from mosa.modules.stages import Stage
+from mosa.modules.stiffness_modes import StiffnessModes
+
+STIFFNESS_STEPS = (0.3, 0.6, 1.0, 1.5, 2.2, 3.2, 4.5, 7.0)
+POISSON_STEPS = (0.2, 0.32, 0.42)
+"""Where a calibration looks first: multiples of the stiffness that the configuration starts from, and Poisson numbers."""
+NOISE_ITERATIONS = 3
+"""Iterations in which the noise is found again; later its scale stays, so that costs can be compared."""
+MOST_THREADS = 8
+ROUNDED = 8
+"""Substeps are held fixed within an iteration, at a multiple of this above what the time step bound asks for at its start."""
+
+
+@dataclass(frozen=True)
+class IdentificationSettings:
+    """count: independent data in a frame; operator_sd, stiffness_sd: prior standard deviations of the operator's numbers and of the
+    stiffness modes before the evidence finds their factor; smoothness: power with which that of the modes falls with their wave
+    number; evidence: whether it is found; tolerance: of the last step, in posterior standard deviations; threads: rollouts side by
+    side on a CPU, 0 for one a core. Errors: ConfigError naming the key."""
+
+    count: float = 30.0
+    operator_sd: float = 0.1
+    stiffness_sd: float = 0.3
+    smoothness: float = 1.0
+    evidence: bool = True
+    tolerance: float = 0.3
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("count", "operator_sd", "stiffness_sd", "tolerance"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0):
+                raise ConfigError(f"identification.{name}: expected a positive number, found {value!r}")
+        if isinstance(self.threads, bool) or not (isinstance(self.threads, int) and self.threads >= 0):
+            raise ConfigError(f"identification.threads: expected a whole number of at least 0, found {self.threads!r}")
+
+
+def few_numbers(module: torch.nn.Module | None) -> bool:
+    """Whether Gauss-Newton can learn a part of a body: an adapter or a heterogeneity field."""
+    return module is None or isinstance(module, (HyperelasticAdapter, StiffnessModes))
+
+
+def blocks_of(body: Body, *, adapter: bool, heterogeneity: bool, settings: IdentificationSettings,
+              calibrating: bool = False) -> list[Block]:
+    """The numbers that are learned, in the order of `tensors_of`."""
+    blocks = []
+    for name, raw in body.material.raw.items():
+        if raw.requires_grad:
+            bounds = (FORMS[name].inverse(0.02), FORMS[name].inverse(0.98 * NU_MAX)) if name == "nu" else (-math.inf, math.inf)
+            start = body.material.begins[name]
+            blocks.append(Block(name, torch.tensor([start]), torch.tensor([1.5]), 0.05 if name == "nu" else 0.02, bounds=bounds))
+    if body.contact.enabled:
+        sd = 0.05 if calibrating else 0.03
+        blocks.append(Block("contact", torch.tensor([ContactOffset.START]), torch.tensor([sd]), 0.02, bounds=ContactOffset.LIMITS))
+    if adapter:
+        zero = torch.zeros(body.adapter.numbers.numel())
+        blocks.append(Block("operator", zero, zero + settings.operator_sd, 0.02, learned=settings.evidence))
+    if heterogeneity:
+        falls = (1 + (body.heterogeneity.size / 2) ** 2) ** (-settings.smoothness / 2)
+        blocks.append(Block("stiffness", 0 * falls, settings.stiffness_sd * falls, 0.1, learned=settings.evidence))
+    return blocks
+
+
+def tensors_of(body: Body, *, adapter: bool, heterogeneity: bool) -> list[Tensor]:
+    """The parameters of `blocks_of`."""
+    tensors: list[Tensor] = [raw for raw in body.material.raw.values() if raw.requires_grad]
+    tensors += [body.contact.cells] if body.contact.enabled else []
+    tensors += [body.adapter.numbers] if adapter else []
+    return tensors + ([body.heterogeneity.coefficients] if heterogeneity else [])
+
+
+def write_numbers(body: Body, numbers: Tensor) -> None:
+    """Set a learned body to numbers (D,) of its joint stage's posterior, a draw of it for instance."""
+    tensors = tensors_of(body, adapter=_learned(body.adapter), heterogeneity=_learned(body.heterogeneity))
+    Seat(tensors, lambda: numbers).write(numbers)
+
+
+def _learned(module) -> bool:
+    return module is not None and few_numbers(module)
+
+
+class Identification:
+    """One stage's. takes: with start, cues, frame_dt; kinds: which of position, rotation, stretch are compared.
+
+    The stage `prior` learns the backbone alone from positions in free rollouts, `prior_eta` also the stiffness modes, `joint` the
+    adapter too; both under the criterion. progress: called after every column of a Jacobian.
+    """
+
+    def __init__(
+        self, body: Body, takes: Sequence, world: World, stage: Stage, criterion: Criterion, settings: IdentificationSettings,
+        kinds: tuple[bool, bool, bool] = (True, True, True), progress: Callable[[], None] | None = None,
+    ) -> None:  # fmt: skip
+        self.body, self.takes, self.world, self.settings = body, list(takes), world, settings
+        self.calibrating = stage.name == "prior"
+        self.adapter = stage.name == "joint" and _learned(body.adapter)
+        self.heterogeneity = not self.calibrating and _learned(body.heterogeneity)
+        self.gains = (0.0,) if self.calibrating else criterion.gains
+        self.kinds = (True, False, False) if self.calibrating and kinds[0] else kinds
+        if not any(self.kinds):
+            raise ConfigError("losses: identification compares motion cues, and the weights of position, rotation and stretch are all "
+                              "0; use fit=adam, which learns from images too")
+        self.chosen = residuals.sampled(len(body.rest), body.rest.device)
+        blocks = blocks_of(body, adapter=self.adapter, heterogeneity=self.heterogeneity, settings=settings,
+                           calibrating=self.calibrating)
+        bodies = [body] + [copy.deepcopy(body) for _ in range(self._threads(sum(b.size for b in blocks)) - 1)]
+        self.iteration, self.noise, self.substeps = 0, None, None
+        self.newton = GaussNewton(blocks, [self._seat(each) for each in bodies], progress=progress)
+        self.converged = False
+
+    def _threads(self, numbers: int) -> int:
+        if self.body.rest.is_cuda:
+            return 1
+        affinity = getattr(os, "sched_getaffinity", None)  # not on every system
+        cores = len(affinity(0)) if affinity is not None else os.cpu_count() or 1
+        return max(1, min(self.settings.threads or min(cores, MOST_THREADS), numbers))
+
+    def _seat(self, body: Body) -> Seat:
+        return Seat(tensors_of(body, adapter=self.adapter, heterogeneity=self.heterogeneity), lambda: self._whitened(body))
+
+    @property
+    def pairs(self) -> list[tuple[int, float]]:
+        """(take, gain) of every rollout that is compared."""
+        return [(i, gain) for i in range(len(self.takes)) for gain in self.gains]
+
+    @torch.no_grad()
+    def rollout(self, body: Body, index: int, gain: float = 0.0, substeps: int | None = None):
+        take = self.takes[index]
+        cues = take.cues
+        return body.simulate(
+            take.start, self.world, len(cues.positions), take.frame_dt, with_adapter=self.adapter,
+            with_heterogeneity=self.heterogeneity, observed=cues.positions if gain else None, gain=gain, substeps=substeps,
+        )  # fmt: skip
+
+    def _fields(self, body: Body) -> list[residuals.Fields]:
+        return [
+            residuals.fields(self.rollout(body, i, gain, self.substeps[i]), self.takes[i].cues, self.takes[i].start.rotation, self.chosen)
+            for i, gain in self.pairs
+        ]
+
+    def _whitened(self, body: Body) -> Tensor:
+        # torch's switch is a thread's own, and these may be other threads than the one that switched it
+        with torch.no_grad():
+            share = self.settings.count / len(self.gains) * (100 / 30 if self.calibrating else 1)
+            counts = tuple(share * on for on in self.kinds)
+            return residuals.whitened(self._fields(body), self.noise, [counts] * len(self.pairs))
+
+    def search(self) -> float:
+        """Start a calibration from the best of a coarse grid: smallest mean distance [m] of free rollouts from the cues, which is
+        returned. Errors: SimulationDiverged where no start of the grid can be simulated."""
+        material = self.body.material
+        starts = material.begins
+        rows = []
+        for multiple in STIFFNESS_STEPS:
+            moved = {n: starts[n] + math.log(multiple) for n in ("E", "mu", "kappa") if n in starts and n in material.modulated}
+            if "nu" in starts:
+                rows += [moved | {"nu": FORMS["nu"].inverse(nu)} for nu in POISSON_STEPS]
+            else:
+                rows.append(moved)
+        learned = {n for n, raw in material.raw.items() if raw.requires_grad}
+        best: tuple[float, dict] = (math.inf, {})
+        for row in rows:
+            row = {n: v for n, v in row.items() if n in learned}
+            self._set(row)
+            try:
+                distance = self.distance()
+            except (SimulationDiverged, ConfigError):
+                continue
+            if distance < best[0]:
+                best = (distance, row)
+        if not math.isfinite(best[0]):
+            raise SimulationDiverged("fit.prior: none of the starts of the coarse grid can be simulated; set prior.parameters nearer to "
+                                     "the body's, or raise simulation.max_substeps")
+        self._set(best[1])
+        return best[0]
+
+    @torch.no_grad()
+    def _set(self, row: dict[str, float]) -> None:
+        for name, value in row.items():
+            self.body.material.raw[name].fill_(value)
+
+    def distance(self) -> float:
+        """Mean distance [m] of free rollouts from the cues after frame 0."""
+        found = [self.rollout(self.body, i).x - take.cues.positions for i, take in enumerate(self.takes)]
+        return sum(float(d[1:].norm(dim=-1).mean()) for d in found) / len(found)
+
+    def iterate(self) -> dict[str, float]:
+        """One iteration of Gauss-Newton, see `GaussNewton.iterate`."""
+        # substeps are a step function of the numbers: held fixed, differences are those of a smooth function
+        self.substeps = []
+        for i in range(len(self.takes)):
+            self.rollout(self.body, i)
+            self.substeps.append(-(-int(1.05 * self.body.last_substeps) // ROUNDED) * ROUNDED)
+        if self.iteration < NOISE_ITERATIONS or self.noise is None:
+            with torch.no_grad():
+                self.noise = residuals.spread(self._fields(self.body))
+        report = self.newton.iterate(learn=self.iteration >= 1)
+        self.iteration += 1
+        small = self.iteration > NOISE_ITERATIONS and report["length"] * report["share"] < self.settings.tolerance
+        self.converged = small or report["share"] == 0
+        return report
+
+    def state(self) -> dict:
+        """Plain containers and tensors: what going on from a checkpoint needs beside the body."""
+        return {"iteration": self.iteration, "factors": [b.factor for b in self.newton.blocks],
+                "noise": None if self.noise is None else [[t.cpu() for t in each] for each in self.noise]}
+
+    def restore(self, state: dict) -> None:
+        """As after the iterations that `state` was taken from."""
+        self.iteration = int(state["iteration"])
+        for block, factor in zip(self.newton.blocks, state["factors"], strict=True):
+            block.factor = float(factor)
+        device = self.body.rest.device
+        self.noise = None if state["noise"] is None else [tuple(t.to(device) for t in each) for each in state["noise"]]
+
+    def posterior(self) -> Posterior:
+        """Laplace's approximation at what was found."""
+        return self.newton.posterior()

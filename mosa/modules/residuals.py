@@ -1,0 +1,90 @@
+"""Distances between a rollout and the motion cues as least squares wants them, with a noise that is found from them.
+
+Three fields per rollout, over frames and particles: position [m], rotation [rad] (vector of R_cue^T R) and singular values [-]. Each
+frame of each field is divided by its own root mean square, floored at what the cues can be trusted to. Particles near each other
+move alike, and so do frames: a frame counts as `count` independent data, not as many as it has particles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mosa.physics.factorisation import singular_value_decomposition
+from mosa.types import MotionCues, Rollout
+
+FLOORS = (1e-3, 0.02, 0.01)
+"""Errors of the cues per component: positions [m], rotations [rad], singular values (docs/cues.md)."""
+SAMPLES = 2000
+"""Particles compared at most: far more than a frame has independent data."""
+
+
+@dataclass(frozen=True)
+class Fields:
+    """position, rotation, stretch: (T - 1, M, 3) each, frames after the first of M particles."""
+
+    position: Tensor
+    rotation: Tensor
+    stretch: Tensor
+
+    def __iter__(self):
+        return iter((self.position, self.rotation, self.stretch))
+
+
+def sampled(particles: int, device: torch.device) -> Tensor:
+    """(M,) evenly spread indices of at most `SAMPLES` particles (they are stored along a lattice)."""
+    count = min(particles, SAMPLES)
+    return (torch.arange(count, device=device) * particles) // count
+
+
+@torch.no_grad()
+def fields(rollout: Rollout, cues: MotionCues, start_rotation: Tensor, chosen: Tensor) -> Fields:
+    """rollout: of T frames; cues: of at least as many, relative to the rest pose; start_rotation: (3, 3) Q of the sequence."""
+    frames = len(rollout.x)
+    U, S, V = singular_value_decomposition(rollout.F_tot[1:, chosen])
+    relative = cues.rotation[1:frames, chosen].mT @ (U @ V.mT @ start_rotation.T.to(U))
+    vector = 0.5 * torch.stack([relative[..., 2, 1] - relative[..., 1, 2], relative[..., 0, 2] - relative[..., 2, 0],
+                                relative[..., 1, 0] - relative[..., 0, 1]], -1)
+    weight = cues.weight[1:frames, chosen, None]
+    return Fields(rollout.x[1:, chosen] - cues.positions[1:frames, chosen], vector * weight,
+                  (S - cues.stretch[1:frames, chosen]) * weight)
+
+
+def spread(found: list[Fields]) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """Root mean square (T - 1,) over particles of each frame's vectors, floored: the noise of the three kinds."""
+    return [
+        tuple(field.square().sum(-1).mean(-1).sqrt().clamp(min=floor * 3**0.5) for field, floor in zip(each, FLOORS))
+        for each in found
+    ]
+
+
+def whitened(found: list[Fields], noise: list[tuple[Tensor, Tensor, Tensor]], counts: list[tuple[float, float, float]]) -> Tensor:
+    """One vector whose squared length is minus twice the log likelihood, up to a constant."""
+    parts = []
+    for each, scales, numbers in zip(found, noise, counts):
+        for field, scale, count in zip(each, scales, numbers):
+            parts.append((field * ((count / field.shape[1]) ** 0.5 / scale)[:, None, None]).flatten())
+    return torch.cat(parts)
+
+
+def independent(field: Tensor, largest: float = 30.0) -> float:
+    """How many independent vectors a frame of a residual field (T, M, 3) holds, by its own correlations; at least 1.
+
+    Participation ratios (tr K)^2/tr K^2 of the correlations between particles (over frames and components) and between frames
+    (over particles and components), of fields whose frames are scaled alike: their product over the number of frames.
+    """
+    frames, particles = field.shape[:2]
+    scaled = field / field.square().sum(-1).mean(-1).sqrt().clamp(min=1e-12)[:, None, None]
+    rows = scaled.reshape(frames, -1)
+    in_time = _participation(rows)
+    modes = scaled.transpose(0, 1).reshape(particles, -1)
+    in_space = _participation(modes)
+    return float(min(max(in_space * in_time / frames, 1.0), largest))
+
+
+def _participation(rows: Tensor) -> float:
+    """(tr K)^2/tr K^2 of K = rows rows^T, from the smaller of the two Gram matrices."""
+    gram = rows @ rows.T if rows.shape[0] <= rows.shape[1] else rows.T @ rows
+    return float(gram.diagonal().sum() ** 2 / gram.square().sum().clamp(min=1e-30))

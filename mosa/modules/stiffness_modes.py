@@ -1,0 +1,77 @@
+"""Spatial variation of the stiffness as a sum of smooth modes: eta(X) = sum_k a_k B_k(X), for identification with few numbers.
+
+B_k are products of cosines on the body's box, from half a wave along its longest side down to a shortest wavelength, each with mean 0
+and variance 1 over the particles. P(X) = P_global (1 + amplitude tanh eta(X)) as in `heterogeneity` (paper, section 3.1).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from mosa.errors import ConfigError
+
+
+class StiffnessModes(nn.Module):
+    """low, high: (3,) corners of the body's box [m]; amplitude: largest relative deviation; wavelength: of the shortest mode, over
+    the box's longest side; most: of the modes, the longest waves first. Call `settle(rest)` once with the particles.
+
+    Errors: ConfigError naming the key.
+    """
+
+    def __init__(self, low: Tensor, high: Tensor, amplitude: float = 0.2, wavelength: float = 0.33, most: int = 80) -> None:
+        super().__init__()
+        if not 0 < amplitude < 1:
+            raise ConfigError(f"heterogeneity.amplitude: expected a number between 0 and 1, found {amplitude}")
+        if not 0 < wavelength <= 2:
+            raise ConfigError(f"heterogeneity.wavelength: expected a number above 0 and at most 2, found {wavelength}")
+        if not (isinstance(most, int) and most >= 1):
+            raise ConfigError(f"heterogeneity.most: expected a whole number of at least 1, found {most!r}")
+        if not bool((high > low).all()):
+            raise ConfigError(f"heterogeneity: the box of the object has no volume: {low.tolist()} to {high.tolist()}")
+        self.register_buffer("low", low.detach().clone())
+        self.register_buffer("high", high.detach().clone())
+        self.amplitude = amplitude
+        extent = (high - low).double().cpu()
+        sides = (extent / extent.max()).tolist()
+        limit = 2 / wavelength  # in half waves per longest side
+        counts = [range(int(limit * side) + 1) for side in sides]
+        found = []
+        for a in counts[0]:
+            for b in counts[1]:
+                for c in counts[2]:
+                    size = sum((n / s) ** 2 for n, s in zip((a, b, c), sides)) ** 0.5
+                    if 0 < size <= limit:
+                        found.append((size, a, b, c))
+        found = sorted(found)[:most]
+        if not found:
+            raise ConfigError(f"heterogeneity.wavelength: no wave of {wavelength} times the body fits into it; expected less than 2")
+        self.register_buffer("waves", torch.tensor([f[1:] for f in found], dtype=torch.float32))
+        self.register_buffer("size", torch.tensor([f[0] for f in found], dtype=torch.float32))
+        self.register_buffer("mean", torch.zeros(len(found)))
+        self.register_buffer("scale", torch.ones(len(found)))
+        self.coefficients = nn.Parameter(torch.zeros(len(found)))
+
+    def raw(self, X: Tensor) -> Tensor:
+        """(N, K) products of cosines at X (N, 3) [m]."""
+        x = (X - self.low) / (self.high - self.low)
+        return torch.cos(torch.pi * x[:, None, :] * self.waves).prod(-1)
+
+    @torch.no_grad()
+    def settle(self, rest: Tensor) -> None:
+        """Mean 0 and variance 1 of every mode over the particles `rest` (N, 3)."""
+        values = self.raw(rest.to(self.low))
+        self.mean.copy_(values.mean(0))
+        self.scale.copy_(1 / values.std(0).clamp(min=1e-3))
+
+    def basis(self, X: Tensor) -> Tensor:
+        """(N, K)."""
+        return (self.raw(X) - self.mean) * self.scale
+
+    def forward(self, X: Tensor) -> Tensor:
+        """eta (N,) at rest positions X (N, 3) [m]."""
+        return self.basis(X) @ self.coefficients
+
+    def factor(self, X: Tensor) -> Tensor:
+        """1 + amplitude tanh eta(X), (N,)."""
+        return 1 + self.amplitude * torch.tanh(self(X))
