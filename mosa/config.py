@@ -8,11 +8,11 @@ from dataclasses import asdict
 from typing import Any
 
 import torch
-from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from mosa.errors import ConfigError
+from mosa.modules.adapters import adapter_class
 from mosa.modules.body import Body, SimulationSettings, World
 from mosa.modules.heterogeneity import HeterogeneityField
 from mosa.modules.material import Material
@@ -119,14 +119,11 @@ def known_keys(where: str, build: Callable, keys: Mapping[str, Any], *positional
 
 
 def build_adapter(config: Mapping[str, Any]) -> torch.nn.Module | None:
-    """The adapter that `_target_` names, None where there is none. Errors: ConfigError naming the key."""
-    if not config.get("_target_"):
+    """The adapter of that name, None where there is none. Errors: ConfigError naming the key."""
+    build = adapter_class(config)
+    if build is None:
         return None
-    try:
-        build = get_class(config["_target_"])
-    except (ImportError, ValueError) as error:
-        raise ConfigError(f"adapter._target_: expected a class, found {config['_target_']!r} ({error})") from error
-    return known_keys("adapter", build, {k: v for k, v in config.items() if k != "_target_"})
+    return known_keys("adapter", build, {k: v for k, v in config.items() if k not in ("name", "_target_")})
 
 
 def build_stages(fit: Mapping[str, Any], *, heterogeneity: bool, adapter: bool) -> list[Stage]:
