@@ -24,7 +24,7 @@ from mosa.analysis.tables import parameter_table, results_table
 from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLast
 from mosa.config import build_body, build_stages, build_world, plain, rehearse, run_config, world_config
 from mosa.data.datamodule import MultiViewDataModule, training_observations
-from mosa.errors import ConfigError, MosaError
+from mosa.errors import ConfigError, DataError, MosaError
 from mosa.evaluation import Sequence, evaluate, floor_figures, identification, law_figures, render, true_motion
 from mosa.modules.body import Body, Start
 from mosa.modules.lit_mosa import LitMosa, Take
@@ -327,10 +327,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         rollout = twin.simulate(**simulate, progress=True)
         print(f"simulated {len(rollout.x)} frames into {twin.export(rollout, folder)}")
         return None
-    run = OmegaConf.create(twin.config["cfg"])
-    if cfg.get("scene"):
-        run.scene = cfg.scene
-    scene, held_out = scenes(run)
+    scene, held_out = scenes(evaluated_scene(cfg, twin))
     body, world = twin.body, twin.world
     if cfg.get("scene"):
         splats = splats_of(body)
@@ -338,7 +335,10 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         # the body moves in the world that the scene shows, among the run's walls and colliders
         world = build_world(world_config(scene) | (twin.config["cfg"].get("world") or {}))
     else:
-        found = {k: Start.read(s, body.rest) for k, s in twin.config["starts"].items()}
+        found = {k: Start.read(s, body.rest) for k, s in (twin.config.get("starts") or {}).items()}
+        if len(found) != 1 + len(held_out):
+            raise DataError(f"ckpt_path: {cfg.ckpt_path}: expected a start for each of the scene's {1 + len(held_out)} sequences, "
+                            f"found {len(found)}: the scene is another one than the run's")
     evaluated = sequences(body, scene, held_out, found)
     figures, kept = evaluate(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
     figures |= identification(body, scene) | law_figures(body)
@@ -346,6 +346,18 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         figures |= floor_figures(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
     write_outputs(folder, cfg, body, evaluated, figures, kept)
     return optimized(figures, "test/rms_m")
+
+
+def evaluated_scene(cfg: DictConfig, twin: Twin) -> DictConfig:
+    """The keys of the scene to evaluate on: eval.py's own, else what the run stored, which is read as data. Stored paths are read
+    from, and never written to: what is made goes to eval.py's own cache. Errors: DataError."""
+    stored = twin.config["cfg"].get("scene")
+    if not cfg.get("scene") and not isinstance(stored, dict):
+        raise DataError(f"ckpt_path: {cfg.ckpt_path}: expected the stored configuration's scene, found none; set scene=<option>")
+    keys = plain(cfg.scene) if cfg.get("scene") else {**stored, "also_train": None, "cache": None}
+    if not cfg.get("scene") and keys.get("path") is not None:
+        print(f"scene: reads {keys['path']} below {keys.get('root')}, as the checkpoint says (scene=... reads another)")
+    return OmegaConf.create({"scene": keys | {"cache": keys.get("cache") or cfg.get("cache")}})
 
 
 def quiet() -> None:

@@ -21,7 +21,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mosa.analysis.figures import side_by_side, write_video
-from mosa.errors import ConfigError, DataError
+from mosa.checkpoints import TENSORS, checked, read_checkpoint
+from mosa.errors import ConfigError, DataError, MosaError
 from mosa.modules.body import Body, Start, World
 from mosa.modules.observer import deformed_covariances, observe
 from mosa.physics.colliders import Collider, colliders_from_config
@@ -38,17 +39,19 @@ class Twin:
 
     @classmethod
     def load(cls, path: str | Path, device: str = "cpu") -> Twin:
-        """Read a checkpoint. Errors: DataError where the file is missing or was not written by this program."""
+        """Read a checkpoint, as data alone (docs/safety.md). Errors: DataError naming file and part where it is missing, damaged,
+        or was not written by this program."""
         from mosa.config import build_body, build_world  # the builder needs the whole package, a twin's user only this line
 
-        checkpoint = read_checkpoint(path)
-        saved = checkpoint["mosa"]
-        state = {k.removeprefix("body."): v for k, v in checkpoint["state_dict"].items() if k.startswith("body.")}
-        body = build_body(saved["config"], {k: state[k] for k in ("rest", "volume", "colors", "opacities", "covariances")})
-        body.load_state_dict(state)
-        start = Start.read(saved["start"])
-        config = saved["config"]
-        return cls(body.to(device).eval(), build_world(config["world"]), config["frame_dt"], config, start)
+        config, begun, tensors = checked(read_checkpoint(path), path)
+        try:
+            body = build_body(config, {name: tensors[name] for name in TENSORS})
+            body.load_state_dict(tensors)
+            world, start = build_world(config["world"]), Start.read(begun)
+        except Exception as error:  # every part has been checked; a file of a stranger may still fit no body
+            reason = str(error) if isinstance(error, MosaError) else f"{type(error).__name__}: {error}"
+            raise DataError(f"ckpt_path: {path}: no body can be built from it ({' '.join(reason.split())[:300]})") from error
+        return cls(body.to(device).eval(), world, config["frame_dt"], config, start)
 
     @torch.no_grad()
     def simulate(
@@ -114,20 +117,6 @@ class Twin:
         if video:
             write_video(folder / "simulation.mp4", side_by_side({title: self.render(rollout)}), fps=max(5.0, 0.3 / self.frame_dt))
         return folder
-
-
-def read_checkpoint(path: str | Path) -> dict:
-    """The checkpoint's dictionary. Errors: DataError naming the file."""
-    path = Path(path)
-    if not path.is_file():
-        raise DataError(f"ckpt_path: no file {path}; a run writes <run folder>/checkpoints/last.ckpt")
-    try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        raise DataError(f"ckpt_path: {path} is not a readable checkpoint ({type(error).__name__}: {error})") from error
-    if "mosa" not in checkpoint:
-        raise DataError(f"ckpt_path: {path} was not written by this program (no entry 'mosa')")
-    return checkpoint
 
 
 def rotation_matrix(value: Sequence[float] | Tensor) -> Tensor:

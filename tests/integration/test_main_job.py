@@ -34,8 +34,7 @@ def cache(tmp_path_factory):
 
 def command(script: str, folder: Path, cache: Path, *overrides: str) -> list[str]:
     common = [f"hydra.run.dir={folder}"]
-    if script == "train.py":
-        common += ["debug=default", f"scene.cache={cache}"]
+    common += ["debug=default", f"scene.cache={cache}"] if script == "train.py" else [f"cache={cache}"]
     return [sys.executable, script, *common, *overrides]
 
 
@@ -207,8 +206,8 @@ def test_another_scene_is_evaluated_in_its_own_world(run, cache, tmp_path, monke
     raised = Ground(0.07, "separate", 0.3)
 
     def scenes(run_config):
-        scene, _ = load(run_config)
-        return replace(scene, ground=raised, gravity=torch.tensor([0.0, -3.7, 0.0])), []
+        scene, others = load(run_config)
+        return replace(scene, ground=raised, gravity=torch.tensor([0.0, -3.7, 0.0])), others
 
     load = pipeline.scenes
     monkeypatch.setattr(pipeline, "scenes", scenes)
