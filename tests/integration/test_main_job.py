@@ -223,4 +223,4 @@ def test_a_sweep_goes_on_after_a_job_that_fails_and_says_so_at_the_end(cache, tm
     result = subprocess.run(sweep, cwd=ROOT, capture_output=True, text=True, timeout=400)
     assert result.returncode == 1
     assert all(f"found {count}" in result.stderr for count in (1000, 2000))
-    assert "2 jobs of the sweep failed; the first: trainer.devices" in result.stderr
+    assert "2 jobs of the sweep failed:\n  0: ConfigError: trainer.devices" in result.stderr
