@@ -25,6 +25,7 @@ from mosa.checkpoints import TENSORS, checked, read_checkpoint
 from mosa.errors import ConfigError, DataError, MosaError
 from mosa.modules.body import Body, Start, World
 from mosa.modules.observer import deformed_covariances, observe
+from mosa.npz import write_npz
 from mosa.physics.colliders import Collider, colliders_from_config
 from mosa.rendering.cameras import look_at
 from mosa.types import Cameras, MotionCues, Rollout
@@ -159,7 +160,7 @@ def save_truth(path: str | Path, parts: dict[str, Tensor]) -> None:
 def save_parts(path: str | Path, parts: dict[str, dict[str, Tensor]]) -> None:
     """npz of the tensors under `<name>/<key>`."""
     arrays = {f"{name}/{key}": t for name, tensors in parts.items() for key, t in tensors.items()}
-    np.savez_compressed(path, **{key: t.detach().cpu().numpy() for key, t in arrays.items()})
+    write_npz(path, {key: t.detach().cpu().numpy() for key, t in arrays.items()})
 
 
 def write_ply(path: str | Path, points: np.ndarray, colors: np.ndarray) -> None:

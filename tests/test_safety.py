@@ -1,14 +1,17 @@
 """A checkpoint from a stranger is data: whatever it names, nothing of it is executed, resolved or written to."""
 
+import io
 import os
 import zipfile
 
+import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
 from strangers import checkpoint
 
 from mosa.errors import DataError
+from mosa.npz import read_npz, write_npz
 from mosa.pipeline import evaluated_scene
 from mosa.twin import Twin
 
@@ -154,3 +157,56 @@ def test_stored_paths_are_not_written_to(tmp_path):
     assert keys.name == "tiny" and keys.cache == str(tmp_path / "mine")
     own = OmegaConf.create({"ckpt_path": "a.ckpt", "cache": None, "scene": {"format": "builtin", "name": "tiny", "cache": "own"}})
     assert evaluated_scene(own, twin).scene.cache == "own"  # what the user names himself is obeyed
+
+
+def entry(name: str, array: np.ndarray, shape: tuple[bytes, bytes] = (b"", b"")) -> bytes:
+    """An npz with one array, whose header may say another shape (was, is) in as many bytes: its padding is shortened."""
+    plain, file = io.BytesIO(), io.BytesIO()
+    np.lib.format.write_array(plain, array, allow_pickle=True)
+    was, now = shape
+    content = plain.getvalue()
+    if was:
+        longer = len(now) - len(was)
+        content = content.replace(was, now).replace(b" " * longer + b"\n", b"\n", 1) if longer > 0 else content.replace(
+            was, now + b" " * -longer)
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(f"{name}.npy", content)
+    return file.getvalue()
+
+
+def test_an_npz_comes_back_as_it_was_written(tmp_path):
+    write_npz(tmp_path / "a.npz", {"train/x": np.arange(6.0).reshape(2, 3)})
+    assert np.array_equal(read_npz(tmp_path / "a.npz")["train/x"], np.arange(6.0).reshape(2, 3))
+    assert [file.name for file in tmp_path.iterdir()] == ["a.npz"]
+
+
+def test_an_npz_that_cannot_be_finished_leaves_nothing(tmp_path):
+    class Full:
+        def __array__(self, *_, **__):
+            raise OSError(28, "No space left on device")
+
+    write_npz(tmp_path / "a.npz", {"x": np.zeros(3)})
+    with pytest.raises(OSError, match="No space"):
+        write_npz(tmp_path / "a.npz", {"x": np.ones(3), "y": Full()})
+    assert [file.name for file in tmp_path.iterdir()] == ["a.npz"] and not read_npz(tmp_path / "a.npz")["x"].any()
+
+
+def test_a_malicious_npz_runs_nothing_and_takes_no_memory(tmp_path):
+    touched, file = tmp_path / "touched", tmp_path / "a.npz"
+    file.write_bytes(entry("x", np.array([Runs(touched)], dtype=object)))
+    with pytest.raises(DataError, match=r"a\.npz: x\.npy: expected numbers, found object"):
+        read_npz(file)
+    assert not touched.exists()
+    for claimed in (b"(10000000000000,)", b"(-1,)"):
+        file.write_bytes(entry("x", np.zeros(100), (b"(100,)", claimed)))
+        with pytest.raises(DataError, match="expected as many numbers as are stored, found a header of shape"):
+            read_npz(file)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.98])
+def test_a_cut_npz_is_named(tmp_path, share):
+    write_npz(tmp_path / "a.npz", {"x": np.random.default_rng(0).random(1000)})
+    content = (tmp_path / "a.npz").read_bytes()
+    (tmp_path / "a.npz").write_bytes(content[: int(share * len(content))])
+    with pytest.raises(DataError, match=r"a\.npz: expected a readable npz"):
+        read_npz(tmp_path / "a.npz")
