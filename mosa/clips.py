@@ -235,8 +235,8 @@ def check_motion(stored: dict[str, np.ndarray], name: str, path: Path, keys: tup
     for key in (key for key in keys if f"{name}/{key}" in stored):
         found, each = stored[f"{name}/{key}"], (3,) if key == "x" else (3, 3)
         if found.dtype.kind != "f" or found.shape != (*frames, *each) or len(frames) != 2 or 0 in frames:
-            raise DataError(f"{path}: {name}/{key}: expected floating point numbers of shape {('T', 'N', *each)}, as many frames and "
-                            f"particles as {name}/x has, found {found.dtype} {found.shape}")
+            raise DataError(f"{path}: {name}/{key}: expected floating point numbers of shape {('T', 'N', *each)}, as many frames "
+                            f"and particles as {name}/x has, found {found.dtype} {found.shape}")
         if not np.isfinite(found).all():
             raise DataError(f"{path}: {name}/{key}: expected finite numbers")
 
