@@ -12,18 +12,19 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import hydra
 from omegaconf import DictConfig
 
+from mosa.jobs import Failures, attempt
+
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="eval")
 def main(cfg: DictConfig) -> float | None:
-    from mosa.errors import MosaError
-    from mosa.pipeline import evaluate_checkpoint
+    def job(cfg: DictConfig) -> float | None:
+        from mosa.pipeline import evaluate_checkpoint
 
-    try:
         return evaluate_checkpoint(cfg)
-    except MosaError as error:
-        print(f"\n{type(error).__name__}: {error}", file=sys.stderr)
-        sys.exit(2)
+
+    return attempt(job, cfg)
 
 
 if __name__ == "__main__":
     main()
+    sys.exit(1 if Failures.count else 0)

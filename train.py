@@ -10,34 +10,21 @@ if os.environ.get("LOCAL_RANK", "0") != "0":  # a further process of a fit on se
     sys.stdout = open(os.devnull, "w")  # until the process ends
 
 import hydra
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig
 
-failed: list[str] = []
-"""What went wrong in the jobs of a sweep that run in this process."""
+from mosa.jobs import Failures, attempt
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
 def main(cfg: DictConfig) -> float | None:
-    from mosa.errors import MosaError
-    from mosa.pipeline import train
+    def job(cfg: DictConfig) -> float | None:
+        from mosa.pipeline import train  # what takes seconds to import, where a mistake in an override has been said
 
-    try:
         return train(cfg)
-    except MosaError as error:
-        print(f"\n{type(error).__name__}: {error}", file=sys.stderr)
-        if HydraConfig.get().mode == RunMode.MULTIRUN:
-            failed.append(str(error))
-            return float("inf")  # the sweep's other jobs go on
-        sys.exit(2)
-    except KeyboardInterrupt:
-        if os.environ.get("LOCAL_RANK", "0") == "0":
-            print("\nstopped; resume with ckpt_path=<run folder>/checkpoints/last.ckpt", file=sys.stderr)
-        sys.exit(130)
+
+    return attempt(job, cfg)
 
 
 if __name__ == "__main__":
     main()
-    if failed:
-        sys.exit(f"\n{len(failed)} jobs of the sweep failed; the first: {failed[0]}")
+    sys.exit(1 if Failures.count else 0)

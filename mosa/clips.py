@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body import Body, World
 from mosa.modules.observer import deformed_covariances
+from mosa.npz import read_npz
 from mosa.reconstruction.cues import neighbourhood
 from mosa.twin import Twin
 
@@ -205,20 +206,39 @@ def read_run(folder: str | Path) -> list[Clip]:
     factor = body.factor(body.heterogeneity)
     clips = []
     for name in (key.removesuffix("/x") for key in rollouts if key.endswith("/x")):
+        check_motion(rollouts, name, paths["learned"], ("x",))
         bodies, shape = {}, (len(rollouts[f"{name}/x"]), len(body.rest))
+        times = rollouts.get(f"{name}/times")
+        if times is None or times.shape != shape[:1] or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+            raise DataError(f"{paths['learned']}: {name}/times: expected {shape[0]} increasing times, found "
+                            f"{'none' if times is None else times.tolist()[:8]}")
         for kind, stored in files.items():
             if f"{name}/x" not in stored or (kind == "truth" and "observed" in bodies):
                 continue
+            check_motion(stored, name, paths[kind], ("x",))
             frames, particles = stored[f"{name}/x"].shape[:2]
             if particles != shape[1] or frames > shape[0] or (kind != "observed" and frames < shape[0]):
                 raise DataError(f"{paths[kind]}: {name}: expected the checkpoint's {shape[1]} particles in the rollout's "
                                 f"{shape[0]} frames, found {particles} in {frames}; all files must be of one run")
+            check_motion(stored, name, paths[kind], ("F_tot", "covariances"))
             bodies[kind] = Motion(stored[f"{name}/x"], covariances(stored, name, body))
         clips.append(Clip(name, rollouts[f"{name}/times"], bodies, body.colors.clamp(0, 1).numpy(), body.opacities.numpy(),
                           factor.numpy(), twin.world))  # fmt: skip
     if not clips:
         raise DataError(f"{folder / 'rollout.npz'}: expected the rollouts of a run, found none")
     return clips
+
+
+def check_motion(stored: dict[str, np.ndarray], name: str, path: Path, keys: tuple[str, ...]) -> None:
+    """What there is of a motion is finite, and of the positions' frames and particles. Errors: DataError naming file and entry."""
+    frames = stored[f"{name}/x"].shape[:2]
+    for key in (key for key in keys if f"{name}/{key}" in stored):
+        found, each = stored[f"{name}/{key}"], (3,) if key == "x" else (3, 3)
+        if found.dtype.kind != "f" or found.shape != (*frames, *each) or len(frames) != 2 or 0 in frames:
+            raise DataError(f"{path}: {name}/{key}: expected floating point numbers of shape {('T', 'N', *each)}, as many frames "
+                            f"and particles as {name}/x has, found {found.dtype} {found.shape}")
+        if not np.isfinite(found).all():
+            raise DataError(f"{path}: {name}/{key}: expected finite numbers")
 
 
 def covariances(stored: dict[str, np.ndarray], name: str, body: Body) -> np.ndarray:
@@ -240,8 +260,4 @@ def arrays(path: Path) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise DataError(f"{path}: file not found; expected the folder of a finished run (run=outputs/train/<date>/<time>); "
                         "train.py writes this file at its end; it resumes with ckpt_path=<run folder>/checkpoints/last.ckpt")
-    try:
-        with np.load(path) as stored:
-            return {key: stored[key] for key in stored.files}
-    except (OSError, ValueError, EOFError, KeyError) as error:
-        raise DataError(f"{path}: expected a readable npz file, found a damaged one ({error})") from error
+    return read_npz(path)

@@ -8,16 +8,17 @@ from dataclasses import asdict
 from typing import Any
 
 import torch
-from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from mosa.errors import ConfigError
+from mosa.modules.adapters import adapter_class
 from mosa.modules.body import Body, SimulationSettings, World
 from mosa.modules.heterogeneity import HeterogeneityField
 from mosa.modules.material import Material
 from mosa.modules.stages import Stage
 from mosa.physics.boundary import Plane
+from mosa.physics.collider_motion import Motion
 from mosa.physics.colliders import colliders_from_config, domain_walls
 from mosa.types import Ground, Scene
 
@@ -49,7 +50,11 @@ def build_world(config: Mapping[str, Any]) -> World:
 
 def build_walls(walls: Mapping[str, Any] | None, box: Tensor) -> tuple[Plane, ...]:
     """The six sides of the box, none where `walls` is None. Errors: ConfigError naming the key."""
-    return () if walls is None else tuple(known_keys("world.walls", domain_walls, walls, box))
+    if walls is None:
+        return ()
+    if "mode" not in walls:
+        raise ConfigError("world.walls: expected null, or {mode: separate, friction: 0.1}, found no mode")
+    return tuple(known_keys("world.walls", domain_walls, walls, box))
 
 
 def run_config(cfg: dict[str, Any], scene: Scene, dx: float) -> dict[str, Any]:
@@ -107,7 +112,9 @@ def rehearse(cfg: Mapping[str, Any]) -> None:
     build_simulation(cfg["simulation"], 1.0)
     build_stages(cfg["fit"], heterogeneity=heterogeneity is not None, adapter=adapter is not None)
     build_walls(cfg["world"]["walls"], torch.stack([low, high]))
-    colliders_from_config(cfg["world"]["colliders"] or ())
+    for collider in colliders_from_config(cfg["world"]["colliders"] or ()):
+        if isinstance(collider.motion, Motion) and collider.motion.times is not None:
+            collider.motion.sample(1, 1, 1.0)  # as many velocities as times
 
 
 def known_keys(where: str, build: Callable, keys: Mapping[str, Any], *positional: Any) -> Any:
@@ -119,14 +126,11 @@ def known_keys(where: str, build: Callable, keys: Mapping[str, Any], *positional
 
 
 def build_adapter(config: Mapping[str, Any]) -> torch.nn.Module | None:
-    """The adapter that `_target_` names, None where there is none. Errors: ConfigError naming the key."""
-    if not config.get("_target_"):
+    """The adapter of that name, None where there is none. Errors: ConfigError naming the key."""
+    build = adapter_class(config)
+    if build is None:
         return None
-    try:
-        build = get_class(config["_target_"])
-    except (ImportError, ValueError) as error:
-        raise ConfigError(f"adapter._target_: expected a class, found {config['_target_']!r} ({error})") from error
-    return known_keys("adapter", build, {k: v for k, v in config.items() if k != "_target_"})
+    return known_keys("adapter", build, {k: v for k, v in config.items() if k not in ("name", "_target_")})
 
 
 def build_stages(fit: Mapping[str, Any], *, heterogeneity: bool, adapter: bool) -> list[Stage]:

@@ -23,11 +23,14 @@ from mosa.analysis.figures import side_by_side, write_strip, write_video
 from mosa.analysis.tables import parameter_table, results_table
 from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLast
 from mosa.config import build_body, build_stages, build_world, plain, rehearse, run_config, world_config
+from mosa.data.agreement import seen_at
 from mosa.data.datamodule import MultiViewDataModule, training_observations
-from mosa.errors import ConfigError, MosaError
+from mosa.errors import ConfigError, DataError, MosaError
 from mosa.evaluation import Sequence, evaluate, floor_figures, identification, law_figures, render, true_motion
-from mosa.modules.body import Body, Start
+from mosa.modules.body import Body, Start, World
 from mosa.modules.lit_mosa import LitMosa, Take
+from mosa.physics.collider_overlap import check_clear
+from mosa.physics.colliders import colliders_from_config
 from mosa.physics.memory import KEPT_ON_CPU
 from mosa.reconstruction.starts import first_contact, sequence_start, splats_of
 from mosa.rendering.cameras import crop_boxes, crop_images
@@ -114,6 +117,13 @@ def starts(
     return found
 
 
+def check_starts(world: World, body: Body, found: dict[str, Start]) -> None:
+    """No sequence starts inside of a solid. Errors: ConfigError naming the collider."""
+    for prefix, start in found.items():
+        x = (body.rest - body.center) @ start.rotation.to(body.rest).T + start.center.to(body.rest)
+        check_clear(world.colliders, x, f"the body of {prefix}")
+
+
 def sequences(body: Body, training: Scene, others: list[Scene], found: dict[str, Start]) -> list[Sequence]:
     """found: start by prefix, in the order of the sequences (`starts`)."""
     return [Sequence(p, s, start, first_contact(body, start, s)) for (p, start), s in zip(found.items(), [training, *others])]
@@ -136,6 +146,8 @@ def train(cfg: DictConfig) -> float | None:
         scene, held_out = scenes(cfg)
     taught = list(cfg.scene.get("also_train") or [])
     parallel.check_share(len(device_names(cfg)), 1 + len(taught), min(cfg.fit.views, len(scene.training_cameras)))
+    if (place := seen_at(scene)) is not None:  # before the reconstruction; the body itself is checked after it
+        check_clear(colliders_from_config(plain(cfg.world)["colliders"] or ()), place[None], "the object, as frame 0 shows it,")
     if scene.synthetic:
         print(f"scene {scene.name}: synthetic, made by this program; not a capture")
     with clock.measure("reconstruction"):
@@ -146,6 +158,7 @@ def train(cfg: DictConfig) -> float | None:
         found = shared_starts(cfg, folder, lambda: starts(body, reconstruction, scene, held_out, taught), body)
     config["starts"] = {k: s.written() for k, s in found.items()}
     world = build_world(config["world"])
+    check_starts(world, body, found)
     with clock.measure("fit"):
         more = [(s, found[f"train/{s.sequence}"]) for s in held_out if s.sequence in taught]
         module, data = assemble_fit(cfg, scene, reconstruction, body, found["train"], config, device, more)
@@ -327,10 +340,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         rollout = twin.simulate(**simulate, progress=True)
         print(f"simulated {len(rollout.x)} frames into {twin.export(rollout, folder)}")
         return None
-    run = OmegaConf.create(twin.config["cfg"])
-    if cfg.get("scene"):
-        run.scene = cfg.scene
-    scene, held_out = scenes(run)
+    scene, held_out = scenes(evaluated_scene(cfg, twin))
     body, world = twin.body, twin.world
     if cfg.get("scene"):
         splats = splats_of(body)
@@ -338,7 +348,11 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         # the body moves in the world that the scene shows, among the run's walls and colliders
         world = build_world(world_config(scene) | (twin.config["cfg"].get("world") or {}))
     else:
-        found = {k: Start.read(s, body.rest) for k, s in twin.config["starts"].items()}
+        found = {k: Start.read(s, body.rest) for k, s in (twin.config.get("starts") or {}).items()}
+        if len(found) != 1 + len(held_out):
+            raise DataError(f"ckpt_path: {cfg.ckpt_path}: expected a start for each of the scene's {1 + len(held_out)} sequences, "
+                            f"found {len(found)}: the scene is another one than the run's")
+    check_starts(world, body, found)
     evaluated = sequences(body, scene, held_out, found)
     figures, kept = evaluate(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
     figures |= identification(body, scene) | law_figures(body)
@@ -346,6 +360,18 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         figures |= floor_figures(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
     write_outputs(folder, cfg, body, evaluated, figures, kept)
     return optimized(figures, "test/rms_m")
+
+
+def evaluated_scene(cfg: DictConfig, twin: Twin) -> DictConfig:
+    """The keys of the scene to evaluate on: eval.py's own, else what the run stored, which is read as data. Stored paths are read
+    from, and never written to: what is made goes to eval.py's own cache. Errors: DataError."""
+    stored = twin.config["cfg"].get("scene")
+    if not cfg.get("scene") and not isinstance(stored, dict):
+        raise DataError(f"ckpt_path: {cfg.ckpt_path}: expected the stored configuration's scene, found none; set scene=<option>")
+    keys = plain(cfg.scene) if cfg.get("scene") else {**stored, "also_train": None, "cache": None}
+    if not cfg.get("scene") and keys.get("path") is not None:
+        print(f"scene: reads {keys['path']} below {keys.get('root')}, as the checkpoint says (scene=... reads another)")
+    return OmegaConf.create({"scene": keys | {"cache": keys.get("cache") or cfg.get("cache")}})
 
 
 def quiet() -> None:

@@ -53,8 +53,15 @@ ENTRIES = Kind("a list of sections", lambda v: isinstance(v, list) and all(isins
 THREE = Kind("three numbers", lambda v: isinstance(v, list) and len(v) == 3 and all(map(is_number, v)))
 TURN = Kind("four numbers, an axis and degrees", lambda v: isinstance(v, list) and len(v) == 4 and all(map(is_number, v)))
 POSITIVE, WEIGHT, COUNT = number(0, above=True), number(0), whole(1)
+WIDEST = 4096
+"""Of a layer of a network: many times what any run has used, and far below what memory would not hold."""
+
+SECTIONS = ("scene", "prior", "adapter", "reconstruction", "simulation", "fit", "rendering", "trainer", "logger", "evaluation",
+            "heterogeneity", "losses", "world", "fit.prior", "fit.prior_eta", "fit.joint", "reconstruction.static",
+            "reconstruction.appearance", "reconstruction.dynamic")  # fmt: skip
 
 TRAINING: dict[str, Kind] = {
+    **{name: SECTION for name in SECTIONS},
     "seed": whole(0, 2**32 - 1),
     "scene.also_train": or_null(NAMES),
     "fit.views": COUNT,
@@ -66,12 +73,12 @@ TRAINING: dict[str, Kind] = {
     "losses.*": WEIGHT,
     "heterogeneity.enabled": FLAG,
     "heterogeneity.amplitude": POSITIVE,
-    "heterogeneity.hidden": COUNT,
-    "heterogeneity.frequencies": whole(0),
+    "heterogeneity.hidden": whole(1, WIDEST),
+    "heterogeneity.frequencies": whole(0, 32),
     "adapter.alpha": POSITIVE,
     "adapter.l_max": or_null(POSITIVE),
     "adapter.input_scale": POSITIVE,
-    "adapter.hidden": COUNT,
+    "adapter.hidden": whole(1, WIDEST),
     **{f"adapter.{name}": FLAG for name in ("rest_free", "plastic", "major_symmetry", "recompute", "no_C", "no_pre", "no_post",
                                             "no_prior_stress")},
     "simulation.particles": whole(8),
@@ -118,12 +125,15 @@ TRAINING: dict[str, Kind] = {
     "reconstruction.dynamic.free_shape": FLAG,
     "reconstruction.dynamic.elastic": WEIGHT,
     "reconstruction.dynamic.bending": WEIGHT,
-    "reconstruction.dynamic.hidden": COUNT,
+    "reconstruction.dynamic.hidden": whole(1, WIDEST),
     "world.walls": or_null(SECTION),
     "world.colliders": or_null(ENTRIES),
     "logger.enabled": FLAG,
     "logger.images_every": whole(0),
 }
+BODY = {key: kind for key, kind in TRAINING.items()
+        if key.split(".")[0] in ("seed", "simulation", "prior", "heterogeneity", "adapter", "world")}  # fmt: skip
+"""Of these, what a checkpoint's body is built from."""
 EVALUATION: dict[str, Kind] = {
     "evaluation.floor": FLAG,
     "evaluation.samples": COUNT,

@@ -21,11 +21,16 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mosa.analysis.figures import side_by_side, write_video
-from mosa.errors import ConfigError, DataError
-from mosa.modules.body import Body, Start, World
+from mosa.checkpoints import TENSORS, checked, read_checkpoint
+from mosa.errors import ConfigError, DataError, MosaError
+from mosa.limits import machine_memory
+from mosa.modules.body import VARIANTS, Body, Start, World
 from mosa.modules.observer import deformed_covariances, observe
+from mosa.npz import write_npz
+from mosa.physics.collider_overlap import check_clear
 from mosa.physics.colliders import Collider, colliders_from_config
 from mosa.rendering.cameras import look_at
+from mosa.schema import is_number
 from mosa.types import Cameras, MotionCues, Rollout
 
 
@@ -38,17 +43,19 @@ class Twin:
 
     @classmethod
     def load(cls, path: str | Path, device: str = "cpu") -> Twin:
-        """Read a checkpoint. Errors: DataError where the file is missing or was not written by this program."""
+        """Read a checkpoint, as data alone (docs/safety.md). Errors: DataError naming file and part where it is missing, damaged,
+        or was not written by this program."""
         from mosa.config import build_body, build_world  # the builder needs the whole package, a twin's user only this line
 
-        checkpoint = read_checkpoint(path)
-        saved = checkpoint["mosa"]
-        state = {k.removeprefix("body."): v for k, v in checkpoint["state_dict"].items() if k.startswith("body.")}
-        body = build_body(saved["config"], {k: state[k] for k in ("rest", "volume", "colors", "opacities", "covariances")})
-        body.load_state_dict(state)
-        start = Start.read(saved["start"])
-        config = saved["config"]
-        return cls(body.to(device).eval(), build_world(config["world"]), config["frame_dt"], config, start)
+        config, begun, tensors = checked(read_checkpoint(path), path)
+        try:
+            body = build_body(config, {name: tensors[name] for name in TENSORS})
+            body.load_state_dict(tensors)
+            world, start = build_world(config["world"]), Start.read(begun)
+        except Exception as error:  # every part has been checked; a file of a stranger may still fit no body
+            reason = str(error) if isinstance(error, MosaError) else f"{type(error).__name__}: {error}"
+            raise DataError(f"ckpt_path: {path}: no body can be built from it ({' '.join(reason.split())[:300]})") from error
+        return cls(body.to(device).eval(), world, config["frame_dt"], config, start)
 
     @torch.no_grad()
     def simulate(
@@ -68,23 +75,30 @@ class Twin:
         rotation: (ax, ay, az, degrees) about the body's centre, or a (3, 3) matrix, relative to the rest shape; height [m] of the
         lowest point above the ground; velocity [m/s]; angular_velocity [rad/s]; what is left out is taken from the training
         sequence. colliders: rigid solids instead of the world's, or entries as a configuration has them; `reactions` of the result
-        holds the forces on them. Errors: ConfigError (shapes), SimulationDiverged (the body leaves the box of the scene).
+        holds the forces on them. Errors: ConfigError naming the argument (also a solid that the body starts in),
+        SimulationDiverged (the body leaves the box of the scene).
         """
         body, first = self.body, self.training_start
+        check_frames(frames, len(body.rest))
+        if variant not in VARIANTS:
+            raise ConfigError(f"variant: expected one of {', '.join(VARIANTS)}, found {variant!r}")
         Q = first.rotation if rotation is None else rotation_matrix(rotation)
         Q = Q.to(body.rest)
         velocity_ = first.velocity if velocity is None else vector("velocity", velocity)
         spin = first.angular_velocity if angular_velocity is None else vector("angular_velocity", angular_velocity)
         center = first.center.to(body.rest)
         up = self.world.up.to(body.rest)
+        arms = (body.rest - body.center) @ Q.T
         if height is not None:
-            lowest = (((body.rest - body.center) @ Q.T) @ up).min()
+            if not is_number(height) or (height < 0 and self.world.ground is not None):
+                raise ConfigError(f"height: expected metres above the ground, a finite number >= 0, found {height!r}")
             ground = self.world.ground.height if self.world.ground is not None else 0.0
-            center = center + up * (ground + height - lowest - center @ up)
+            center = center + up * (ground + height - (arms @ up).min() - center @ up)
         start = Start(Q, center, velocity_.to(body.rest), spin.to(body.rest))
         world = self.world
         if colliders is not None:
             world = replace(world, colliders=colliders_from_config(colliders, "colliders"))
+        check_clear(world.colliders, center + arms, "the body", "world.colliders" if colliders is None else "colliders")
         with tqdm(total=frames - 1, desc="simulate", unit="frame", disable=not progress) as bar:
             return body.simulate(start, world, frames, self.frame_dt, variant=variant, progress=lambda _: bar.update())
 
@@ -116,36 +130,55 @@ class Twin:
         return folder
 
 
-def read_checkpoint(path: str | Path) -> dict:
-    """The checkpoint's dictionary. Errors: DataError naming the file."""
-    path = Path(path)
-    if not path.is_file():
-        raise DataError(f"ckpt_path: no file {path}; a run writes <run folder>/checkpoints/last.ckpt")
+FASTEST = 1e6
+"""[m/s], [rad/s] of a start: the time step would be refused far below."""
+STORED_BYTES = 4 * (3 + 3 + 9 + 9)
+"""Of a particle in a frame of a rollout: x, v, F, F_tot."""
+
+
+def check_frames(frames: int, particles: int) -> None:
+    """Errors: ConfigError where frames are no whole number, or are more than the machine can hold."""
+    if isinstance(frames, bool) or not isinstance(frames, int) or frames < 1:
+        raise ConfigError(f"frames: expected a whole number of at least 1, found {frames!r}")
+    most = machine_memory() // (2 * STORED_BYTES * particles)
+    if frames > most:
+        raise ConfigError(f"frames: expected at most {most}, which take half of this machine's memory, found {frames}")
+
+
+def numbers(name: str, value: Sequence[float] | Tensor, expected: str) -> Tensor:
+    """float32 tensor of finite numbers. Errors: ConfigError naming the field."""
     try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        raise DataError(f"ckpt_path: {path} is not a readable checkpoint ({type(error).__name__}: {error})") from error
-    if "mosa" not in checkpoint:
-        raise DataError(f"ckpt_path: {path} was not written by this program (no entry 'mosa')")
-    return checkpoint
+        result = torch.as_tensor(value)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}") from error
+    if result.dtype == torch.bool or result.is_complex() or not bool(torch.isfinite(result.float()).all()):
+        raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}")
+    return result.float()
 
 
 def rotation_matrix(value: Sequence[float] | Tensor) -> Tensor:
-    """(3, 3) from (ax, ay, az, degrees) or a matrix."""
-    value = torch.as_tensor(value, dtype=torch.float32)
+    """(3, 3) from (ax, ay, az, degrees) or a matrix. Errors: ConfigError for anything else, and a matrix that is no rotation."""
+    expected = "(ax, ay, az, degrees) with a non-zero axis or a 3x3 rotation matrix"
+    value = numbers("rotation", value, expected)
     if value.shape == (3, 3):
+        R = value.double()
+        defect = float((R @ R.T - torch.eye(3).double()).abs().max())
+        if defect > 1e-3 or float(torch.linalg.det(R)) < 0:
+            raise ConfigError(f"rotation: expected R R^T = I and det R = 1, found a defect of {defect:.3g} and a determinant of "
+                              f"{float(torch.linalg.det(R)):.3g}: scaled, sheared or mirrored bodies are not what was learned")
         return value
-    if value.shape != (4,) or float(value[:3].norm()) == 0:
-        raise ConfigError(f"rotation: expected (ax, ay, az, degrees) with a non-zero axis or a 3x3 matrix, found {value.tolist()}")
-    axis = (value[:3] / value[:3].norm()).double().numpy()
+    if value.shape != (4,) or not 0 < float(value[:3].double().norm()) < math.inf:
+        raise ConfigError(f"rotation: expected {expected}, found {value.tolist()}")
+    axis = (value[:3].double() / value[:3].double().norm()).numpy()
     return torch.tensor(Rotation.from_rotvec(axis * math.radians(float(value[3]))).as_matrix(), dtype=torch.float32)
 
 
 def vector(name: str, value: Sequence[float]) -> Tensor:
     """(3,) tensor. Errors: ConfigError naming the field."""
-    result = torch.as_tensor(value, dtype=torch.float32)
-    if result.shape != (3,) or not bool(torch.isfinite(result).all()):
-        raise ConfigError(f"{name}: expected three finite numbers, found {value}")
+    expected = f"three finite numbers within {FASTEST:g}"
+    result = numbers(name, value, expected)
+    if result.shape != (3,) or float(result.abs().max()) > FASTEST:
+        raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}")
     return result
 
 
@@ -170,7 +203,7 @@ def save_truth(path: str | Path, parts: dict[str, Tensor]) -> None:
 def save_parts(path: str | Path, parts: dict[str, dict[str, Tensor]]) -> None:
     """npz of the tensors under `<name>/<key>`."""
     arrays = {f"{name}/{key}": t for name, tensors in parts.items() for key, t in tensors.items()}
-    np.savez_compressed(path, **{key: t.detach().cpu().numpy() for key, t in arrays.items()})
+    write_npz(path, {key: t.detach().cpu().numpy() for key, t in arrays.items()})
 
 
 def write_ply(path: str | Path, points: np.ndarray, colors: np.ndarray) -> None:

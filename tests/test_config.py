@@ -49,7 +49,12 @@ def test_a_mistyped_option_is_refused(override):
     ({"_target_": "mosa.modules.adapter.StressAdapter", "alpha": 2}, "adapter.alpha"),
     ({"_target_": "mosa.modules.direct.DirectAdapter", "no_C": True}, "no_C"),
     ({"_target_": "mosa.modules.adapter.StressAdapter", "alfa": 0.1}, "adapter.alfa: unknown key; expected one of alpha"),
-    ({"_target_": "mosa.modules.adapter.Stress"}, "adapter._target_"),
+    ({"name": "stress", "alfa": 0.1}, "adapter.alfa: unknown key; expected one of alpha"),
+    ({"name": "stres"}, "adapter.name: expected stress, direct"),
+    ({"name": ["stress"]}, "adapter.name: expected stress"),
+    ({"name": "direct", "_target_": "mosa.modules.adapter.StressAdapter"}, "found both"),
+    ({"_target_": "mosa.modules.adapter.Stress"}, "adapter._target_: expected a known adapter"),
+    ({"_target_": ["subprocess.Popen"]}, "adapter._target_"),
 ])  # fmt: skip
 def test_a_mistake_in_the_adapter_names_its_key(adapter, message):
     with pytest.raises(ConfigError, match=message):

@@ -53,10 +53,46 @@ def test_walls_and_errors():
 @pytest.mark.parametrize("colliders, message", [
     (5, r"^world\.colliders: expected a list"),
     ([5], r"^world\.colliders\[0\]: expected type"),
-    ([{"type": "sphere", "radius": 0.1, "friction": "abc"}], r"^world\.colliders\[0\]: .*abc"),
-    ([{"type": "sphere", "radius": 0.1, "position": [0, 0]}], r"^world\.colliders\[0\]: position: expected three"),
-    ([{"type": "sphere", "radius": 0.1, "motion": {"waypoints": [{"time": 0}, {"time": 1}]}}], r"waypoints: .*'position'"),
+    ([{"type": "sphere", "radius": 0.1, "friction": "abc"}], r"^world\.colliders\[0\]\.friction: .*abc"),
+    ([{"type": "sphere", "radius": 0.1, "position": [0, 0]}], r"^world\.colliders\[0\]\.position: expected three"),
+    ([{"type": "sphere", "radius": 0.1, "motion": {"waypoints": [{"time": 0}, {"time": 1}]}}], r"waypoints\[0\]: .*'position'"),
 ])  # fmt: skip
 def test_a_collider_of_the_wrong_form_is_named(colliders, message):
     with pytest.raises(ConfigError, match=message):
         build_world(WORLD | {"colliders": colliders})
+
+
+@pytest.mark.parametrize("walls", [{}, {"mode": "separate", "friction": float("inf")}, {"mode": ["slip"]},
+                                   {"mode": "separate", "friction": True}])
+def test_walls_of_the_wrong_form_are_named(walls):
+    with pytest.raises(ConfigError, match=r"^world\.walls"):
+        build_world(WORLD | {"walls": walls})
+
+
+@pytest.mark.parametrize("collider", [
+    {"type": "box", "size": [2, 2, 2]}, {"type": "sphere", "radius": 0.2, "position": [0, 0.1, 0]},
+    {"type": "plane", "normal": [0, 1, 0], "position": [0, 0.5, 0]},
+])  # fmt: skip
+def test_a_collider_that_contains_the_body_is_named(collider):
+    with pytest.raises(ConfigError, match=r"^colliders\[0\]: expected a solid that the body is outside of"):
+        twin().simulate(frames=2, colliders=[collider])
+
+
+@pytest.mark.parametrize("arguments, message", [
+    ({"rotation": [[1.2, 0, 0], [0, 1, 0], [0, 0, 0.8]]}, "rotation: expected R R.T = I"),
+    ({"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "rotation: expected R R.T = I"),
+    ({"rotation": [0, 0, 0, 90]}, "rotation: expected"), ({"rotation": "abc"}, "rotation: expected"),
+    ({"rotation": [1, 0, 0, float("nan")]}, "rotation: expected"), ({"rotation": [1, 0, 0]}, "rotation: expected"),
+    ({"height": "a"}, "height: expected"), ({"height": float("nan")}, "height: expected"), ({"height": -1.0}, "height: expected"),
+    ({"height": True}, "height: expected"), ({"velocity": "abc"}, "velocity: expected three"),
+    ({"velocity": [True, False, True]}, "velocity: expected three"), ({"velocity": [1, 2]}, "velocity: expected three"),
+    ({"velocity": [float("inf"), 0, 0]}, "velocity: expected three"), ({"velocity": [1e30, 0, 0]}, "velocity: expected three"),
+    ({"angular_velocity": {}}, "angular_velocity: expected three"), ({"frames": 2.5}, "frames: expected a whole number"),
+    ({"frames": 0}, "frames: expected a whole number"), ({"frames": True}, "frames: expected a whole number"),
+    ({"frames": 10**12}, "frames: expected at most"), ({"variant": "none"}, "variant: expected one of"),
+    ({"variant": ["prior"]}, "variant: expected one of"), ({"colliders": "sphere"}, "colliders: expected a list"),
+    ({"velocity": [1e5, 0, 0]}, "time step"),
+])  # fmt: skip
+def test_an_argument_of_the_wrong_form_is_named(arguments, message):
+    with pytest.raises(ConfigError, match=message):
+        twin().simulate(**arguments)

@@ -14,6 +14,7 @@ from mosa.data.footage import Footage
 from mosa.data.particles import read_clouds
 from mosa.data.validation import fingerprint, validate
 from mosa.errors import ConfigError
+from mosa.schema import is_number
 from mosa.types import Ground, Scene, Truth
 
 FORMATS = {
@@ -95,12 +96,12 @@ def ground_from(keys) -> Ground | None:
     if unknown:
         raise ConfigError(f"scene.ground.{min(unknown)}: expected the keys height, mode and friction only")
     mode, friction = keys.get("mode", "sticky"), keys.get("friction") or 0.0
-    if mode not in ("sticky", "slip", "separate"):
+    if not isinstance(mode, str) or mode not in ("sticky", "slip", "separate"):
         raise ConfigError(f"scene.ground.mode: expected sticky, slip or separate, found {mode!r}")
-    if not isinstance(keys.get("height"), (int, float)):
+    if not is_number(keys.get("height")):
         raise ConfigError(f"scene.ground.height: expected a height in metres, found {keys.get('height')!r}")
-    if not isinstance(friction, (int, float)) or not friction >= 0:
-        raise ConfigError(f"scene.ground.friction: expected a number >= 0, found {friction!r}")
+    if not is_number(friction) or friction < 0:
+        raise ConfigError(f"scene.ground.friction: expected a finite number >= 0, found {friction!r}")
     if friction > 0 and mode != "separate":
         raise ConfigError(f"scene.ground.friction: acts with mode separate only, found {friction} with mode {mode!r}")
     return Ground(float(keys["height"]), mode, float(friction))

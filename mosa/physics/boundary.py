@@ -5,6 +5,7 @@ part, and the tangential part shrinks by Coulomb friction, |u_t| <- max(0, |u_t|
 Planes act in the order given, after gravity.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -46,8 +47,8 @@ def pack_planes(planes: list[Plane], dtype: torch.dtype, device: torch.device) -
     for i, plane in enumerate(planes):
         if plane.mode not in MODES:
             raise ConfigError(f"plane {i}: mode: expected one of {', '.join(MODES)}, found {plane.mode!r}")
-        if not plane.friction >= 0:
-            raise ConfigError(f"plane {i}: friction: expected a number >= 0, found {plane.friction}")
+        if isinstance(plane.friction, bool) or not 0 <= plane.friction < math.inf:
+            raise ConfigError(f"plane {i}: friction: expected a finite number >= 0, found {plane.friction}")
         if plane.friction > 0 and plane.mode != "separate":
             raise ConfigError(f"plane {i}: friction acts on mode separate only, found mode {plane.mode!r}")
         normal = torch.tensor(plane.normal, dtype=torch.float64)
@@ -57,6 +58,8 @@ def pack_planes(planes: list[Plane], dtype: torch.dtype, device: torch.device) -
         values[i, :3] = normal
         values[i, 3] = normal @ torch.tensor(plane.point, dtype=torch.float64)
         values[i, 4] = plane.friction
+        if not bool(torch.isfinite(values[i]).all()):
+            raise ConfigError(f"plane {i}: expected a finite point and normal, found {plane.point} and {plane.normal}")
         modes[i] = MODES[plane.mode]
     return values.to(dtype=dtype, device=device), modes.to(device)
 

@@ -5,6 +5,7 @@ grid is in `collider_kernels`, the shapes' distances in `collider_shapes`. A col
 B-spline grid lets material on both sides of a thinner one touch.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,8 +17,10 @@ from torch import Tensor
 from mosa.errors import ConfigError
 from mosa.physics import collider_shapes as packing
 from mosa.physics.boundary import MODES, Plane
+from mosa.physics.collider_keys import check_keys
 from mosa.physics.collider_mesh import SignedDistanceField, field_of_mesh
 from mosa.physics.collider_motion import Motion, Trajectory, exponential
+from mosa.schema import is_number
 
 
 @dataclass(frozen=True)
@@ -103,12 +106,13 @@ def pack_colliders(colliders: Sequence[Collider], dtype: torch.dtype, device: to
         if collider.mode not in MODES:
             raise ConfigError(f"{where}: mode: expected one of {', '.join(MODES)}, found {collider.mode!r}")
         for name in ("friction", "thickness"):
-            if not getattr(collider, name) >= 0:
-                raise ConfigError(f"{where}: {name}: expected a number >= 0, found {getattr(collider, name)}")
+            value = getattr(collider, name)
+            if isinstance(value, bool) or not 0 <= value < math.inf:
+                raise ConfigError(f"{where}: {name}: expected a finite number >= 0, found {value}")
         if collider.friction > 0 and collider.mode != "separate":
             raise ConfigError(f"{where}: friction acts on mode separate only, found mode {collider.mode!r}")
         for j, value in enumerate(_sizes(shape)):
-            if not value > 0:
+            if not 0 < value < math.inf:
                 raise ConfigError(f"{where}: {type(shape).__name__}: expected positive lengths [m], found {shape}")
             shapes[i, packing.SIZE + j] = value
         shapes[i, packing.THICKNESS], shapes[i, packing.FRICTION] = collider.thickness, collider.friction
@@ -151,10 +155,10 @@ def reach(shape: Shape) -> float:
 
 def domain_walls(box: Tensor, mode: str = "separate", friction: float = 0.0) -> list[Plane]:
     """Six planes that keep a body inside box (2, 3) [m]. Errors: ConfigError naming the key of `world.walls`."""
-    if mode not in MODES:
+    if not isinstance(mode, str) or mode not in MODES:
         raise ConfigError(f"world.walls.mode: expected one of {', '.join(MODES)}, found {mode!r}")
-    if isinstance(friction, bool) or not isinstance(friction, (int, float)) or not friction >= 0:
-        raise ConfigError(f"world.walls.friction: expected a number >= 0, found {friction!r}")
+    if not is_number(friction) or friction < 0:
+        raise ConfigError(f"world.walls.friction: expected a finite number >= 0, found {friction!r}")
     if friction > 0 and mode != "separate":
         raise ConfigError(f"world.walls.friction: acts with mode separate only, found mode {mode!r}")
     low, high = torch.as_tensor(box).double().tolist()
@@ -191,7 +195,7 @@ def _collider(item: Mapping, where: str) -> Collider:
     if not isinstance(item, Mapping):
         raise ConfigError(f"{where}: expected type and the keys of that type, found {item!r}")
     kind = item.get("type")
-    if kind not in _FIELDS:
+    if not isinstance(kind, str) or kind not in _FIELDS:
         raise ConfigError(f"{where}.type: expected one of {', '.join(_FIELDS)}, found {kind!r}")
     make, needed = _FIELDS[kind]
     extra = {"plane": ("normal",), "mesh": ("spacing", "scale", "margin")}.get(kind, ())
@@ -199,6 +203,10 @@ def _collider(item: Mapping, where: str) -> Collider:
         raise ConfigError(f"{where}: unknown: {', '.join(unknown)}; a {kind} takes {', '.join((*needed, *extra, *_COMMON[1:]))}")
     if missing := [key for key in needed if item.get(key) is None]:
         raise ConfigError(f"{where}: a {kind} needs {', '.join(missing)}")
+    check_keys(item, where)
+    item = {key: value for key, value in item.items() if value is not None}
+    if item.get("friction", 0) > 0 and item.get("mode", "sticky") != "separate":
+        raise ConfigError(f"{where}.friction: acts on mode separate only, found mode {item.get('mode', 'sticky')!r}")
     try:
         if kind == "mesh":
             options = {key: float(item[key]) for key in extra if item.get(key) is not None}
@@ -210,10 +218,6 @@ def _collider(item: Mapping, where: str) -> Collider:
         friction, thickness = float(item.get("friction", 0.0)), float(item.get("thickness", 0.0))
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from error
-    except KeyError as error:
-        raise ConfigError(f"{where}.motion.waypoints: expected time and position in each, found one without {error}") from error
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"{where}: a value has the wrong form ({error}), found {item}") from error
     return Collider(shape, item.get("mode", "sticky"), friction, motion, thickness, str(item.get("name", "")))
 
 
@@ -230,6 +234,8 @@ def _motion(item: dict) -> Motion:
         points = motion.pop("waypoints")
         if motion or item.get("position") is not None:
             raise ConfigError("motion: waypoints stand alone, without position, velocity or angular_velocity")
+        if len(points) < 2:
+            raise ConfigError(f"motion.waypoints: expected at least two poses, found {len(points)}")
         turns = [exponential(_axis_degrees(p["rotation"]) if p.get("rotation") is not None else rotation) for p in points]
         return Motion.waypoints([p["time"] for p in points], [p["position"] for p in points], torch.stack(turns))
     if unknown := [key for key in motion if key not in ("velocity", "angular_velocity", "times")]:

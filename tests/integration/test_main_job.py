@@ -34,8 +34,7 @@ def cache(tmp_path_factory):
 
 def command(script: str, folder: Path, cache: Path, *overrides: str) -> list[str]:
     common = [f"hydra.run.dir={folder}"]
-    if script == "train.py":
-        common += ["debug=default", f"scene.cache={cache}"]
+    common += ["debug=default", f"scene.cache={cache}"] if script == "train.py" else [f"cache={cache}"]
     return [sys.executable, script, *common, *overrides]
 
 
@@ -207,8 +206,8 @@ def test_another_scene_is_evaluated_in_its_own_world(run, cache, tmp_path, monke
     raised = Ground(0.07, "separate", 0.3)
 
     def scenes(run_config):
-        scene, _ = load(run_config)
-        return replace(scene, ground=raised, gravity=torch.tensor([0.0, -3.7, 0.0])), []
+        scene, others = load(run_config)
+        return replace(scene, ground=raised, gravity=torch.tensor([0.0, -3.7, 0.0])), others
 
     load = pipeline.scenes
     monkeypatch.setattr(pipeline, "scenes", scenes)
@@ -224,4 +223,4 @@ def test_a_sweep_goes_on_after_a_job_that_fails_and_says_so_at_the_end(cache, tm
     result = subprocess.run(sweep, cwd=ROOT, capture_output=True, text=True, timeout=400)
     assert result.returncode == 1
     assert all(f"found {count}" in result.stderr for count in (1000, 2000))
-    assert "2 jobs of the sweep failed; the first: trainer.devices" in result.stderr
+    assert "2 jobs of the sweep failed:\n  0: ConfigError: trainer.devices" in result.stderr

@@ -60,7 +60,7 @@ def test_what_is_learned_from_is_not_held_out(cache, tmp_path):
     figures = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert "train/test_60/rms_m" in figures and "test/test_60/rms_m" not in figures
     assert figures["test/rms_m"] == figures["test/test_40/rms_m"]
-    again = run(cache, tmp_path / "eval", "eval.py", f"ckpt_path={tmp_path}/run/checkpoints/last.ckpt")
+    again = run(cache, tmp_path / "eval", "eval.py", f"ckpt_path={tmp_path}/run/checkpoints/last.ckpt", f"cache={cache}")
     assert again.returncode == 0, again.stderr[-3000:]
     second = json.loads((tmp_path / "eval" / "metrics.json").read_text())
     for key in ("train/test_60/rms_m", "test/test_40/rms_m", "prior/train/rms_m"):

@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 
 from mosa.errors import ConfigError
 from mosa.modules.adapter import StressAdapter
+from mosa.modules.adapters import adapter_class
 from mosa.modules.direct import DirectAdapter
 
 CONF = Path(__file__).parents[2] / "conf" / "adapter"
@@ -49,8 +50,7 @@ def test_the_file_lists_the_arguments_with_their_defaults(name, kind):
     """One YAML = one class with explicit keyword arguments."""
     keys = OmegaConf.to_container(OmegaConf.load(CONF / f"{name}.yaml"))
     keys = keys.get("adapter", keys)  # mosa.yaml sets a loss weight beside the adapter
-    module, _, found = keys.pop("_target_").rpartition(".")
-    assert (module, found) == (kind.__module__, kind.__name__)
+    assert adapter_class(keys) is kind and keys.pop("name")
     arguments = {n: p.default for n, p in inspect.signature(kind).parameters.items()}
     assert keys == {n: arguments[n] for n in keys}
     switches = {"no_C", "no_pre", "no_post", "no_prior_stress"}

@@ -1,0 +1,190 @@
+"""A run's checkpoint, read as data: its file may come from a stranger, and is checked before anything is built from it.
+
+What is promised, and what is not, is in docs/safety.md.
+"""
+
+from __future__ import annotations
+
+import math
+import pickletools
+import re
+import zipfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mosa.errors import ConfigError, DataError
+from mosa.limits import machine_memory
+from mosa.schema import BODY, POSITIVE, THREE, WEIGHT, Kind, check, is_number, one_of, or_null, whole
+
+TENSORS = {"rest": (3,), "volume": (), "colors": (3,), "opacities": (), "covariances": (3, 3)}
+"""What a body is made of, with the shape for each particle."""
+RESUMED = ("epoch", "global_step", "pytorch-lightning_version", "loops", "callbacks", "optimizer_states", "lr_schedulers")
+"""What Lightning reads where a fit goes on."""
+NAMED = {"collections OrderedDict", "torch Size", "torch._utils _rebuild_tensor_v2", "torch._utils _rebuild_parameter",
+         *(f"torch {kind}Storage" for kind in ("Float", "Double", "Half", "BFloat16", "Long", "Int", "Short", "Char", "Byte",
+                                               "Bool"))}  # fmt: skip
+"""Functions and classes that a checkpoint of this program refers to; torch knows some more, of which a few make large objects."""
+NODES, DEPTH = 2_000_000, 40
+"""Entries and levels of a checkpoint's containers: losses of a fit of 10,000 steps are 10,000."""
+
+BOX = Kind("two corners, min below max",
+           lambda v: isinstance(v, list) and len(v) == 2 and all(map(THREE.fits, v)) and all(a < b for a, b in zip(*v)))
+TURNED = Kind("a 3x3 rotation matrix", lambda v: is_rotation(v))
+START = {"rotation": TURNED, "center": THREE, "velocity": THREE, "angular_velocity": THREE}
+STORED: dict[str, Kind] = {
+    "density": POSITIVE, "dx": POSITIVE, "frame_dt": POSITIVE, "world.gravity": THREE, "world.box": BOX,
+    "world.up": Kind("a direction", lambda v: THREE.fits(v) and any(v)),
+    "world.ground.height": Kind("a number", is_number), "world.ground.mode": one_of("sticky", "slip", "separate"),
+    "world.ground.friction": WEIGHT,
+    **{f"starts.*.{name}": kind for name, kind in START.items()},
+}  # fmt: skip
+"""Beside the configuration itself, what a run measured."""
+
+
+def is_rotation(value: Any) -> bool:
+    """Nested lists of a 3x3 matrix with R R^T = I and det R = 1, to 1e-3."""
+    if not (isinstance(value, list) and len(value) == 3 and all(map(THREE.fits, value))):
+        return False
+    R = torch.tensor(value, dtype=torch.float64)
+    return float((R @ R.T - torch.eye(3).double()).abs().max()) < 1e-3 and float(torch.linalg.det(R)) > 0
+
+
+def read_checkpoint(path: str | Path) -> dict:
+    """The checkpoint's dictionary: plain containers and dense tensors, nothing executed. Errors: DataError naming the file."""
+    if not isinstance(path, (str, Path)):
+        raise DataError(f"ckpt_path: expected the path of a checkpoint, found {path!r}")
+    path = Path(path)
+    try:
+        if not path.is_file():
+            raise DataError(f"ckpt_path: no file {path}; a run writes <run folder>/checkpoints/last.ckpt")
+        check_archive(path)
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except DataError:
+        raise
+    except Exception as error:  # whatever torch finds: the file is not what its name says
+        first = (str(error).splitlines() or [""])[0][:200]
+        raise DataError(f"ckpt_path: {path} is not a readable checkpoint ({type(error).__name__}: {first})") from error
+    check_containers(checkpoint, path)
+    if not isinstance(checkpoint, dict) or "mosa" not in checkpoint:
+        raise DataError(f"ckpt_path: {path} was not written by this program (no entry 'mosa')")
+    return checkpoint
+
+
+def check_archive(path: Path) -> None:
+    """The archive unpacks to no more than its own size, and its pickle names nothing but tensors. Errors: DataError."""
+    if not zipfile.is_zipfile(path):
+        raise DataError(f"ckpt_path: {path} is not a readable checkpoint (expected a zip archive: cut off, or another file?)")
+    size = path.stat().st_size
+    if size > machine_memory():
+        raise DataError(f"ckpt_path: {path} has {size / 1e9:.1f} GB, this machine {machine_memory() / 1e9:.1f} GB of memory")
+    with zipfile.ZipFile(path) as archive:
+        if sum(entry.file_size for entry in archive.infolist()) > size:
+            raise DataError(f"ckpt_path: {path} unpacks to more than its {size} bytes; a run's checkpoint is not compressed")
+        names = archive.namelist()
+        if len(set(names)) < len(names):
+            raise DataError(f"ckpt_path: {path} is not a readable checkpoint (an entry of its archive is there twice)")
+        for entry in names:
+            if not entry.endswith(".pkl"):
+                continue
+            for code, named, _ in pickletools.genops(archive.read(entry)):
+                if "GLOBAL" in code.name and named not in NAMED:  # STACK_GLOBAL names nothing here, and is not written
+                    raise DataError(f"ckpt_path: {path} refers to {named or 'a function or class'}; a run's checkpoint holds "
+                                    "numbers, texts and tensors only, and nothing else is loaded")
+
+
+def check_containers(checkpoint: Any, path: Path) -> None:
+    """Plain values in a bounded tree, whole tensors, no interpolation. Errors: DataError."""
+    left, waiting = NODES, [(checkpoint, 0, "")]
+    while waiting:
+        value, depth, where = waiting.pop()
+        left -= 1
+        if left < 0 or depth > DEPTH:
+            raise DataError(f"ckpt_path: {path}: expected at most {NODES} entries in {DEPTH} levels, found more at {where}")
+        if isinstance(value, Mapping):
+            if bad := [key for key in value if not isinstance(key, (str, int))]:
+                raise DataError(f"ckpt_path: {path}: {where}: expected names, found {bad[0]!r}")
+            waiting += [(v, depth + 1, f"{where}.{k}".strip(".")) for k, v in value.items()]
+        elif isinstance(value, (list, tuple)):
+            waiting += [(v, depth + 1, where) for v in value]
+        elif isinstance(value, Tensor):
+            plain = value.layout == torch.strided and value.device.type == "cpu" and not value.is_quantized
+            if not plain or value.numel() * value.element_size() > value.untyped_storage().nbytes():
+                raise DataError(f"ckpt_path: {path}: {where}: expected a dense tensor of as many numbers as are stored, found one "
+                                f"of shape {tuple(value.shape)}")
+        elif isinstance(value, str) and where.startswith("mosa.config") and ("${" in value or "\0" in value):
+            raise DataError(f"ckpt_path: {path}: {where}: expected a value, found {value[:80]!r}: interpolations of a stored "
+                            "configuration are not resolved")
+        elif not isinstance(value, (str, int, float, type(None))):
+            raise DataError(f"ckpt_path: {path}: {where}: expected numbers, texts and tensors, found {type(value).__name__}")
+
+
+def checked(checkpoint: Mapping[str, Any], path: str | Path) -> tuple[dict, dict, dict[str, Tensor]]:
+    """(configuration, start, tensors of the body) of a read checkpoint. Errors: DataError naming file and part."""
+    saved, state = checkpoint["mosa"], checkpoint.get("state_dict")
+    try:
+        parts(saved, ("config", "start"), "mosa")
+        config = saved["config"]
+        parts(config, ("cfg", "world", "density", "dx", "frame_dt"), "mosa.config")
+        parts(config["cfg"], ("seed", "simulation", "prior", "heterogeneity", "adapter"), "mosa.config.cfg")
+        parts(config["world"], ("ground", "gravity", "up", "box"), "mosa.config.world")
+        parts(saved["start"], START, "mosa.start")
+        starts = config.get("starts") or {}
+        parts(starts, (), "mosa.config.starts")
+        for name, start in starts.items():
+            if re.fullmatch(r"(train|test)(/[\w-]+)?", str(name)) is None:  # it names entries of the files that are written
+                raise ConfigError(f"mosa.config.starts: expected names like train or test/<sequence>, found {str(name)[:80]!r}")
+            parts(start, START, f"mosa.config.starts.{name}")
+        if config["world"]["ground"] is not None:
+            parts(config["world"]["ground"], ("height",), "mosa.config.world.ground")
+        stored = {name: config[name] for name in ("density", "dx", "frame_dt", "world")}
+        check(stored | {"starts": {"fit": saved["start"], **starts}}, STORED)
+        used = {name: config["cfg"][name] for name in ("seed", "simulation", "prior", "heterogeneity", "adapter")}
+        check(used | {"world": config["cfg"].get("world") or {}}, BODY)
+    except ConfigError as error:
+        raise DataError(f"ckpt_path: {path}: stored configuration: {error}") from error
+    if not isinstance(state, Mapping):
+        raise DataError(f"ckpt_path: {path}: expected the part state_dict, found none")
+    tensors = {k.removeprefix("body."): v for k, v in state.items() if isinstance(k, str) and k.startswith("body.")}
+    check_tensors(tensors, path)
+    return config, saved["start"], tensors
+
+
+def parts(found: Any, wanted: Iterable[str], where: str) -> None:
+    """Errors: ConfigError naming the parts that are missing."""
+    if not isinstance(found, Mapping):
+        raise ConfigError(f"{where}: expected a section with {', '.join(wanted)}, found {str(found)[:80]!r}")
+    if missing := [name for name in wanted if name not in found]:
+        raise ConfigError(f"{where}: expected the parts {', '.join(wanted)}, found none called {', '.join(missing)}")
+
+
+def check_tensors(tensors: Mapping[str, Any], path: str | Path) -> None:
+    """Shapes, types and numbers of a body's tensors. Errors: DataError naming the tensor."""
+    if missing := [name for name in TENSORS if not isinstance(tensors.get(name), Tensor)]:
+        raise DataError(f"ckpt_path: {path}: expected the tensors {', '.join(TENSORS)} of a body, found no {', '.join(missing)}")
+    count = len(tensors["rest"]) if tensors["rest"].ndim else 0
+    for name, each in TENSORS.items():
+        found = tensors[name]
+        if tuple(found.shape) != (count, *each) or count == 0 or found.dtype not in (torch.float32, torch.float64):
+            raise DataError(f"ckpt_path: {path}: body.{name}: expected floating point numbers of shape "
+                            f"({', '.join(('N', *map(str, each)))}), N particles, found {found.dtype} {tuple(found.shape)}")
+    for name, value in tensors.items():
+        unset = name.startswith("adapter.") and value.ndim == 0  # an adapter that was not switched on yet has no unit
+        if not isinstance(value, Tensor) or (value.is_floating_point() and not unset and not bool(torch.isfinite(value).all())):
+            raise DataError(f"ckpt_path: {path}: body.{name}: expected finite numbers")
+    if not float(tensors["volume"].min()) > 0 or not math.isfinite(float(tensors["rest"].abs().max())):
+        raise DataError(f"ckpt_path: {path}: body.volume: expected volumes above 0 m^3, found {float(tensors['volume'].min()):g}")
+
+
+def check_resumed(checkpoint: Mapping[str, Any], path: str | Path) -> None:
+    """What a fit goes on from is there. Errors: DataError naming what is missing."""
+    try:
+        parts(checkpoint, (*RESUMED, "state_dict"), "checkpoint")
+        parts(checkpoint["mosa"], ("stage", "losses", "steps_done", "particles"), "mosa")
+        counts = or_null(whole(0))
+        check(checkpoint["mosa"], {name: counts for name in ("stage", "steps_done", "particles")})
+    except ConfigError as error:
+        raise DataError(f"ckpt_path: {path}: {error}; a fit goes on from a checkpoint that train.py wrote") from error

@@ -1,0 +1,37 @@
+"""The adapters that a configuration may name: a name is looked up here, nothing else is ever imported or called for it."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from typing import Any
+
+from torch import nn
+
+from mosa.errors import ConfigError
+
+ADAPTERS = {
+    "stress": "mosa.modules.adapter:StressAdapter",
+    "direct": "mosa.modules.direct:DirectAdapter",
+}
+"""adapter.name -> module:class. A new adapter is one class whose keyword arguments are the keys of its YAML, and one line here."""
+
+
+def adapter_class(config: Mapping[str, Any]) -> type[nn.Module] | None:
+    """The class that `name` names, None where there is none. `_target_` of older files and checkpoints means the same where it is
+    the class of a known adapter. Errors: ConfigError naming the key."""
+    older = {place.replace(":", "."): name for name, place in ADAPTERS.items()}
+    name, target = config.get("name"), config.get("_target_")
+    if target is not None:
+        if not isinstance(target, str) or target not in older:
+            raise ConfigError(f"adapter._target_: expected a known adapter ({', '.join(older)}), found {target!r}; "
+                              "nothing else is imported or called")
+        if name is not None and name != older[target]:
+            raise ConfigError(f"adapter: expected name or the older _target_, found both, {name!r} and {target!r}")
+        name = older[target]
+    if name is None:
+        return None
+    if not isinstance(name, str) or name not in ADAPTERS:
+        raise ConfigError(f"adapter.name: expected {', '.join(ADAPTERS)} or null, found {name!r}")
+    module, _, found = ADAPTERS[name].partition(":")
+    return getattr(importlib.import_module(module), found)

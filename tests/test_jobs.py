@@ -1,0 +1,99 @@
+"""Exit codes and messages of a job and of a sweep, whichever process its jobs ran in."""
+
+import errno
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import OmegaConf
+
+from mosa.errors import ConfigError
+from mosa.jobs import LONGEST, Failures, attempt, folder_name
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture
+def sweep(tmp_path, monkeypatch):
+    """HydraConfig as job 3 of a sweep sees it, and the configuration that callbacks get."""
+    config = OmegaConf.create({"sweep": {"dir": str(tmp_path)}, "job": {"num": 3}})
+    config.mode = RunMode.MULTIRUN
+    monkeypatch.setattr(HydraConfig, "get", staticmethod(lambda: config))
+    return OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path)}}})
+
+
+def fail(error):
+    def job(_):
+        raise error
+
+    return job
+
+
+def test_a_sweep_counts_the_jobs_that_failed_in_this_sweep(sweep, tmp_path, capsys):
+    counter = Failures()
+    counter.on_multirun_start(sweep)
+    assert attempt(lambda _: 0.5, None) == 0.5
+    counter.on_multirun_end(sweep)
+    assert Failures.count == 0
+    assert attempt(fail(ConfigError("seed: wrong")), None) == float("inf")
+    counter.on_multirun_end(sweep)
+    assert Failures.count == 1 and "1 jobs of the sweep failed:\n  3: ConfigError: seed: wrong" in capsys.readouterr().err
+    counter.on_multirun_start(sweep)  # the same command again, in which the job succeeds
+    counter.on_multirun_end(sweep)
+    assert Failures.count == 0
+
+
+def test_a_mistake_of_the_program_is_not_swallowed(sweep):
+    with pytest.raises(ZeroDivisionError):
+        attempt(lambda _: 1 / 0, None)
+    with pytest.raises(ConnectionResetError):
+        attempt(fail(ConnectionResetError(errno.ECONNRESET, "reset")), None)
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EACCES])
+def test_what_a_disk_refuses_is_one_message(sweep, capsys, code):
+    attempt(fail(OSError(code, os.strerror(code), "/full/file")), None)
+    assert f"/full/file: cannot be written or read ({os.strerror(code)})" in capsys.readouterr().err
+
+
+def test_a_single_run_exits_with_2(sweep, monkeypatch):
+    HydraConfig.get().mode = RunMode.RUN
+    with pytest.raises(SystemExit) as caught:
+        attempt(fail(ConfigError("seed: wrong")), None)
+    assert caught.value.code == 2
+
+
+def test_a_long_name_is_cut_and_stays_its_own():
+    assert folder_name("a=1,b=2") == "a=1,b=2"
+    assert "/" not in folder_name("splats=../../x.ply")
+    names = {folder_name("x" * 500 + str(i)) for i in range(50)}
+    assert len(names) == 50 and all(len(name.encode()) <= LONGEST + 9 for name in names)
+    assert len(folder_name("ü" * 500).encode()) <= LONGEST + 9
+
+
+PROGRAM = """
+    import os, signal, sys
+    from mosa.jobs import attempt
+    def job(cfg):
+        os.kill(os.getpid(), signal.SIG{name})
+    attempt(job, None)
+"""
+
+
+@pytest.mark.parametrize(("name", "code"), [("TERM", 143), ("INT", 130)])
+def test_a_stop_says_how_to_go_on(name, code):
+    found = subprocess.run([sys.executable, "-c", textwrap.dedent(PROGRAM.format(name=name))], cwd=ROOT, capture_output=True,
+                           text=True, timeout=60)
+    assert found.returncode == code and "stopped; resume with" in found.stderr and "Traceback" not in found.stderr
+
+
+def test_a_joblib_sweep_with_failed_jobs_does_not_exit_with_0(tmp_path):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    keys = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", f"hydra.sweep.dir={tmp_path}", "debug=default", "seed=-1,-2"]
+    found = subprocess.run([sys.executable, "train.py", "-m", *keys], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert found.returncode == 1 and "2 jobs of the sweep failed" in found.stderr
