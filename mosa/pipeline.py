@@ -24,6 +24,7 @@ from mosa.analysis.tables import parameter_table, results_table
 from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLast
 from mosa.config import build_body, build_stages, build_world, plain, rehearse, run_config, world_config
 from mosa.data.datamodule import MultiViewDataModule, training_observations
+from mosa.data.sequences import load_sequences, taught_names
 from mosa.errors import ConfigError, MosaError
 from mosa.evaluation import Sequence, evaluate, floor_figures, identification, law_figures, render, true_motion
 from mosa.modules.body import Body, Start
@@ -86,17 +87,8 @@ def cache_folder(cfg: DictConfig) -> Path:
 
 
 def scenes(cfg: DictConfig) -> tuple[Scene, list[Scene]]:
-    """The training sequence and the others of the same object. Errors: ConfigError where scene.also_train names none of these."""
-    from mosa.data.scene import held_out_sequences, load_scene
-
-    keys = plain(cfg.scene)
-    wanted = keys.pop("also_train", None) or []
-    scene, others = load_scene(**keys), held_out_sequences(**keys)
-    known = [s.sequence for s in others]
-    if unknown := [name for name in wanted if name not in known]:
-        found = f"has {', '.join(known)}" if known else "has none"
-        raise ConfigError(f"scene.also_train: expected other sequences of the scene, found {unknown[0]!r}; it {found}")
-    return scene, others
+    """The training sequence and the others of the same object. Errors: ConfigError, DataError."""
+    return load_sequences(plain(cfg.scene))
 
 
 def starts(
@@ -134,7 +126,7 @@ def train(cfg: DictConfig) -> float | None:
     use_backend(cfg.rendering.backend)
     with clock.measure("data"):
         scene, held_out = scenes(cfg)
-    taught = list(cfg.scene.get("also_train") or [])
+    taught = taught_names(plain(cfg.scene))
     parallel.check_share(len(device_names(cfg)), 1 + len(taught), min(cfg.fit.views, len(scene.training_cameras)))
     if scene.synthetic:
         print(f"scene {scene.name}: synthetic, made by this program; not a capture")
@@ -306,11 +298,11 @@ def comparison(body: Body, shown: Sequence, variants: dict) -> dict:
 
 
 def optimized(figures: dict[str, float], wanted: str) -> float | None:
-    """The figure a sweep minimises: `wanted`, or the first that exists of its fallbacks."""
+    """The figure a sweep minimises: `wanted`, or the first that exists of its fallbacks; of image figures the negative."""
     for key in (wanted, "test/rms_m", "train/rms_m"):
         if key in figures:
             return figures[key]
-    return -figures["train/psnr_crop"] if "train/psnr_crop" in figures else None
+    return next((-figures[key] for key in ("test/psnr_crop", "train/psnr_crop") if key in figures), None)
 
 
 def evaluate_checkpoint(cfg: DictConfig) -> float | None:
