@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 import time
@@ -13,23 +14,23 @@ from pathlib import Path
 import lightning as L
 import torch
 from hydra.core.hydra_config import HydraConfig
-from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.plugins.environments import LightningEnvironment
 from omegaconf import DictConfig, OmegaConf
-from tqdm import tqdm
 
-from mosa import parallel
+from mosa import __version__, parallel
 from mosa.analysis.figures import side_by_side, write_strip, write_video
 from mosa.analysis.tables import parameter_table, results_table
-from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLast
+from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLast, Pace, StageNotes
 from mosa.config import build_body, build_stages, build_world, plain, rehearse, run_config, world_config
 from mosa.data.datamodule import MultiViewDataModule, training_observations
 from mosa.data.sequences import load_sequences, taught_names
 from mosa.errors import ConfigError, MosaError
 from mosa.evaluation import Sequence, evaluate, floor_figures, identification, law_figures, render, true_motion
+from mosa.loggers import build_loggers, chosen, log_outcome
 from mosa.modules.body import Body, Start
 from mosa.modules.lit_mosa import LitMosa, Take
 from mosa.physics.memory import KEPT_ON_CPU
+from mosa.progress import tqdm
 from mosa.reconstruction.starts import first_contact, sequence_start, splats_of
 from mosa.rendering.cameras import crop_boxes, crop_images
 from mosa.rendering.covariance import covariance_from
@@ -40,7 +41,6 @@ from mosa.run import (
     device_names,
     device_of,
     finished,
-    log_outcome,
     named_device,
     shared_starts,
     write_figures,
@@ -48,6 +48,8 @@ from mosa.run import (
 from mosa.schema import EVALUATION, SIMULATION, TRAINING, check
 from mosa.twin import Twin, save_observed, save_rollout, save_truth
 from mosa.types import MotionCues, Reconstruction, Scene
+
+log = logging.getLogger(__name__)
 
 
 class Clock:
@@ -61,6 +63,7 @@ class Clock:
         began = time.perf_counter()
         yield
         self.figures[f"time/{stage}_s"] = self.figures.get(f"time/{stage}_s", 0.0) + time.perf_counter() - began
+        log.info("%s: done in %.1f s", stage, time.perf_counter() - began)
 
 
 def run_folder() -> Path:
@@ -116,10 +119,12 @@ def train(cfg: DictConfig) -> float | None:
     quiet()
     check(plain(cfg), TRAINING, EVALUATION)
     rehearse(plain(cfg))
+    chosen(plain(cfg.logger))
     L.seed_everything(cfg.seed, verbose=False)
     clock, folder = Clock(), run_folder()
+    log.info("mosa %s: %s", __version__, " ".join(HydraConfig.get().overrides.task))
     if (done := finished(cfg, folder)) is not None:
-        print(f"skipped: {folder} has its metrics.json (resume=auto)")
+        log.info("skipped: %s has its metrics.json (resume=auto)", folder)
         return optimized(done, cfg.optimized_metric)
     cfg.ckpt_path = begins_from(cfg, folder)
     device = device_of(cfg)
@@ -129,20 +134,24 @@ def train(cfg: DictConfig) -> float | None:
     taught = taught_names(plain(cfg.scene))
     parallel.check_share(len(device_names(cfg)), 1 + len(taught), min(cfg.fit.views, len(scene.training_cameras)))
     if scene.synthetic:
-        print(f"scene {scene.name}: synthetic, made by this program; not a capture")
+        log.info("scene %s: synthetic, made by this program; not a capture", scene.name)
     with clock.measure("reconstruction"):
         reconstruction, dx = reconstruct_scene(cfg, scene, device)
+    volume = reconstruction.volume
+    log.info("body: %d particles, %.4g cm^3, grid spacing %.4g m", len(volume), 1e6 * float(volume.sum()), dx)
     config = run_config(plain(cfg), scene, dx)
     body = body_of(reconstruction, config).to(device)
     with clock.measure("starts"):
         found = shared_starts(cfg, folder, lambda: starts(body, reconstruction, scene, held_out, taught), body)
+    for prefix, start in found.items():
+        log.info("start of %s: velocity (%s) m/s", prefix, ", ".join(f"{v:.3f}" for v in start.velocity.tolist()))
     config["starts"] = {k: s.written() for k, s in found.items()}
     world = build_world(config["world"])
     with clock.measure("fit"):
         more = [(s, found[f"train/{s.sequence}"]) for s in held_out if s.sequence in taught]
         module, data = assemble_fit(cfg, scene, reconstruction, body, found["train"], config, device, more)
         if parallel.launched_rank() == 0:
-            print(fit_estimate(module, len(device_names(cfg))))
+            log.info(fit_estimate(module, len(device_names(cfg))))
         fit(cfg, module, data, folder, device)
     if parallel.launched_rank() != 0:
         return None
@@ -156,8 +165,7 @@ def train(cfg: DictConfig) -> float | None:
         figures |= floor_figures(body, sequences(body, scene, held_out, found), world,
                                  samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
     figures |= clock.figures | cost(device) | {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
-    if cfg.logger.enabled:
-        log_outcome(folder, plain(cfg), figures)
+    log_outcome(plain(cfg.logger), folder, plain(cfg), figures)
     write_outputs(folder, cfg, body, sequences(body, scene, held_out, found), figures, kept)
     return optimized(figures, cfg.optimized_metric)
 
@@ -233,14 +241,15 @@ def fit(cfg, module: LitMosa, data: MultiViewDataModule, folder: Path, device: s
     """The staged optimisation under Lightning; resumes from cfg.ckpt_path. Errors: ConfigError for a missing checkpoint."""
     if cfg.ckpt_path is not None and not Path(cfg.ckpt_path).is_file():
         raise ConfigError(f"ckpt_path: no file {cfg.ckpt_path}; a run writes <run folder>/checkpoints/last.ckpt")
-    logger = TensorBoardLogger(folder, name="tensorboard", version="", default_hp_metric=False) if cfg.logger.enabled else False
-    callbacks = [KeepLast(folder / "checkpoints"), FitProgress()]
-    if cfg.logger.enabled and cfg.logger.images_every:
-        callbacks.append(ImageStrips(cfg.logger.images_every))
+    settings = plain(cfg.logger)
+    logger = build_loggers(settings, folder)
+    callbacks = [KeepLast(folder / "checkpoints"), FitProgress(), StageNotes(), *([Pace()] if logger else [])]
+    if logger and settings.get("images_every"):
+        callbacks.append(ImageStrips(settings["images_every"]))
     shared = {"strategy": parallel.SharedSteps()} if len(device_names(cfg)) > 1 else {}
-    trainer = L.Trainer(accelerator=cfg.trainer.accelerator, devices=plain(cfg.trainer)["devices"], max_epochs=-1, logger=logger,
-                        callbacks=callbacks, plugins=[AtomicCheckpointIO(), LightningEnvironment()], enable_checkpointing=False,
-                        enable_progress_bar=False, enable_model_summary=False, log_every_n_steps=1,
+    trainer = L.Trainer(accelerator=cfg.trainer.accelerator, devices=plain(cfg.trainer)["devices"], max_epochs=-1,
+                        logger=logger or False, callbacks=callbacks, plugins=[AtomicCheckpointIO(), LightningEnvironment()],
+                        enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False, log_every_n_steps=1,
                         reload_dataloaders_every_n_epochs=1, default_root_dir=folder, use_distributed_sampler=False, **shared)
     try:
         trainer.fit(module, datamodule=data, ckpt_path=cfg.ckpt_path, weights_only=True)
@@ -283,7 +292,7 @@ def write_outputs(folder: Path, cfg: DictConfig, body: Body, evaluated: list[Seq
     table = results_table(figures) + "\n\n" + parameter_table(figures)
     (folder / "results.md").write_text(table + "\n")
     write_figures(folder, figures)  # the last file: the run is complete
-    print(f"\n{table}\n\nrun folder: {folder}")
+    log.info("\n%s\n\nrun folder: %s", table, folder)
 
 
 def comparison(body: Body, shown: Sequence, variants: dict) -> dict:
@@ -317,7 +326,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     simulate = plain(cfg.simulate)
     if any(simulate[k] is not None for k in ("velocity", "rotation", "height", "angular_velocity", "colliders")):
         rollout = twin.simulate(**simulate, progress=True)
-        print(f"simulated {len(rollout.x)} frames into {twin.export(rollout, folder)}")
+        log.info("simulated %d frames into %s", len(rollout.x), twin.export(rollout, folder))
         return None
     run = OmegaConf.create(twin.config["cfg"])
     if cfg.get("scene"):
@@ -344,6 +353,6 @@ def quiet() -> None:
     """Keep library chatter off the screen; errors and our own output stay."""
     import logging
 
-    for name in ("lightning.pytorch", "lightning.fabric"):
+    for name in ("lightning.pytorch", "lightning.fabric", "matplotlib", "imageio_ffmpeg"):
         logging.getLogger(name).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", module="lightning.*")

@@ -129,7 +129,11 @@ TRAINING: dict[str, Kind] = {
     "reconstruction.dynamic.hidden": COUNT,
     "world.walls": or_null(SECTION),
     "world.colliders": or_null(ENTRIES),
-    "logger.enabled": FLAG,
+    "logger.tensorboard": or_null(SECTION),
+    "logger.csv": or_null(SECTION),
+    "logger.wandb": or_null(SECTION),
+    "logger.wandb.offline": FLAG,
+    "logger.wandb.tags": or_null(NAMES),
     "logger.images_every": whole(0),
 }
 EVALUATION: dict[str, Kind] = {

@@ -18,13 +18,13 @@ import torch
 from plyfile import PlyData, PlyElement
 from scipy.spatial.transform import Rotation
 from torch import Tensor
-from tqdm import tqdm
 
 from mosa.analysis.figures import side_by_side, write_video
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body import Body, Start, World
 from mosa.modules.observer import deformed_covariances, observe
 from mosa.physics.colliders import Collider, colliders_from_config
+from mosa.progress import tqdm
 from mosa.rendering.cameras import look_at
 from mosa.types import Cameras, MotionCues, Rollout
 

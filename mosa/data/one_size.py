@@ -9,10 +9,14 @@ look for objects that are cut.
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 
 from mosa.data.images import resize
 from mosa.errors import DataError
+
+log = logging.getLogger(__name__)
 
 FINER = 1.5
 """Times as many pixels as the smallest image above which one is reduced."""
@@ -45,7 +49,7 @@ def one_size(
             K[v, 0, 2] += right
             K[v, 1, 2] += down
         said = ", ".join(f"{name} {w}x{h}" for name, (h, w) in zip(names, sizes))
-        print(f"{where}: cameras of different image sizes (px: {said}), brought to {width}x{height} px")
+        log.info("%s: cameras of different image sizes (px: %s), brought to %dx%d px", where, said, width, height)
     return K, np.stack(images), np.stack(mattes)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from pathlib import Path
 
@@ -26,6 +27,8 @@ from mosa.data.matting import matte_from_plate
 from mosa.data.scene import assemble
 from mosa.errors import DataError
 from mosa.types import Scene
+
+log = logging.getLogger(__name__)
 
 NAME = re.compile(r"([a-z])_(-?\d+)_(-?\d+)\.png$")
 # a pixel of the m_ files belongs to the white background above this
@@ -63,7 +66,7 @@ def read_pacnerf(path: str | Path, *, frames=None, fps: float | None = None, sca
         remedy = "correct them, restrict scene.frames, or set scene.fps"
         even_times([times[f][0] for f in numbers], numbers, str(listing), remedy)
     if prefix == "r":
-        print(f"{folder}: raw images without mattes; matted from the background plates r_<camera>_-1.png")
+        log.info("%s: raw images without mattes; matted from the background plates r_<camera>_-1.png", folder)
     images, mattes, scaled_calibration = [], [], {}
     for camera, (K, w2c) in calibration.items():
         rows, full = [], None
