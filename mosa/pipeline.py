@@ -21,7 +21,7 @@ from mosa import __version__, parallel
 from mosa.analysis.figures import side_by_side, write_strip, write_video
 from mosa.analysis.tables import parameter_table, results_table
 from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLast, Pace, StageNotes
-from mosa.config import build_body, build_stages, build_world, plain, rehearse, run_config, world_config
+from mosa.config import build_body, build_fit, build_world, plain, rehearse, run_config, world_config
 from mosa.data.datamodule import MultiViewDataModule, training_observations
 from mosa.data.sequences import load_sequences, taught_names
 from mosa.errors import ConfigError, MosaError
@@ -114,6 +114,12 @@ def sequences(body: Body, training: Scene, others: list[Scene], found: dict[str,
     return [Sequence(p, s, start, first_contact(body, start, s)) for (p, start), s in zip(found.items(), [training, *others])]
 
 
+def run_sequences(config: dict, body: Body) -> list[Sequence]:
+    """The sequences that the run of a checkpoint's `config` was evaluated on, read again."""
+    scene, others = scenes(OmegaConf.create(config["cfg"]))
+    return sequences(body, scene, others, {k: Start.read(s, body.rest) for k, s in config["starts"].items()})
+
+
 def train(cfg: DictConfig) -> float | None:
     """Run everything `cfg` asks for; returns the figure a sweep optimises. Errors: MosaError of whatever was wrong."""
     quiet()
@@ -186,14 +192,9 @@ def assemble_fit(
     seen = [(scene, start, reconstruction)]
     seen += [(s, begun, follow_scene(cfg, s, scene, reconstruction, body, begun, device)) for s, begun in more]
     takes = [take_of(cfg, *each, body, device) for each in seen]
-    settings = plain(cfg.fit)
-    stages = build_stages(settings, heterogeneity=body.heterogeneity is not None, adapter=body.adapter is not None)
-    module = LitMosa(
-        body, takes=takes, world=build_world(config["world"]), background=scene.background.to(device),
-        stages=stages, weights=plain(cfg.losses), clip=settings["clip"], config=config,
-    )
-    data = MultiViewDataModule(takes[0].observations, views_per_step=settings["views"],
-                               steps=sum(s.iterations for s in stages), seed=cfg.seed)
+    module = build_fit(config, body, takes=takes, background=scene.background.to(device))
+    data = MultiViewDataModule(takes[0].observations, views_per_step=cfg.fit.views,
+                               steps=sum(s.iterations for s in module.stages), seed=cfg.seed)
     return module, data
 
 
@@ -353,6 +354,6 @@ def quiet() -> None:
     """Keep library chatter off the screen; errors and our own output stay."""
     import logging
 
-    for name in ("lightning.pytorch", "lightning.fabric", "matplotlib", "imageio_ffmpeg"):
+    for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", module="lightning.*")

@@ -54,7 +54,8 @@ class Viewer:
         try:
             import viser
         except ImportError as error:
-            raise ConfigError("viewer: expected the package viser, found none: pip install -e '.[viewer]'") from error
+            raise ConfigError("viewer: expected the package viser, found none: pip install -e '.[viewer]' in a clone, "
+                              "pip install viser elsewhere") from error
         try:  # viser's own server would try port after port and then wait for ever
             with socket.create_server((host, 0)):
                 pass
@@ -192,7 +193,7 @@ What a run saw, calibrated and learned, side by side in a browser.
   host          127.0.0.1: to be seen from this machine alone; 0.0.0.0: from everywhere
   port          the next free one where it is taken
 
-Needs the package viser: pip install 'mosa[viewer]', in a clone pip install -e '.[viewer]'."""
+Needs the package viser: pip install viser."""
 
 
 def options(arguments: Sequence[str]) -> dict[str, str]:

@@ -15,8 +15,10 @@ def configuration() -> str:
     return str(inside if inside.is_dir() else package.parent / "conf")
 
 
-def keep_warnings() -> None:
-    """Warnings become lines of the log: on the screen and in the run folder."""
+def begin_log() -> None:
+    """Warnings become lines of the log, on the screen and in the run folder; the chatter of libraries does not."""
+    for name in ("matplotlib", "imageio", "PIL", "fsspec"):
+        logging.getLogger(name).setLevel(logging.WARNING)
     warnings.formatwarning = one_line
     logging.captureWarnings(True)
 

@@ -10,15 +10,15 @@ import sys
 import hydra
 from omegaconf import DictConfig
 
-from mosa.commands import configuration, fail, keep_warnings
+from mosa.commands import begin_log, configuration, fail
 
 
 @hydra.main(version_base="1.3", config_path=configuration(), config_name="eval")
 def run(cfg: DictConfig) -> float | None:
+    begin_log()
     from mosa.errors import MosaError
     from mosa.pipeline import evaluate_checkpoint
 
-    keep_warnings()
     try:
         return evaluate_checkpoint(cfg)
     except MosaError as error:

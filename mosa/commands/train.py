@@ -8,7 +8,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from mosa.commands import configuration, fail, keep_warnings
+from mosa.commands import begin_log, configuration, fail
 
 failed: list[str] = []
 """What went wrong in the jobs of a sweep that run in this process."""
@@ -16,10 +16,10 @@ failed: list[str] = []
 
 @hydra.main(version_base="1.3", config_path=configuration(), config_name="train")
 def run(cfg: DictConfig) -> float | None:
+    begin_log()
     from mosa.errors import MosaError
     from mosa.pipeline import train
 
-    keep_warnings()
     try:
         return train(cfg)
     except MosaError as error:
