@@ -1,30 +1,10 @@
 """Figures, rollouts and video of a trained run from its checkpoint:  python eval.py ckpt_path=outputs/.../last.ckpt
 
 With any of simulate.velocity, simulate.rotation, simulate.height, simulate.angular_velocity it rolls the learned law out from a
-new start instead.
+new start instead. Where the package is installed, `mosa-eval` is the same command.
 """
 
-import os
-import sys
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
-import hydra
-from omegaconf import DictConfig
-
-from mosa.jobs import Failures, attempt
-
-
-@hydra.main(version_base="1.3", config_path="conf", config_name="eval")
-def main(cfg: DictConfig) -> float | None:
-    def job(cfg: DictConfig) -> float | None:
-        from mosa.pipeline import evaluate_checkpoint
-
-        return evaluate_checkpoint(cfg)
-
-    return attempt(job, cfg)
-
+from mosa.commands.eval import main
 
 if __name__ == "__main__":
     main()
-    sys.exit(1 if Failures.count else 0)

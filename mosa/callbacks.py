@@ -1,14 +1,22 @@
-"""What accompanies a fit: atomic checkpoints after every step, a progress bar over the stages, image strips."""
+"""What accompanies a fit: atomic checkpoints after every step, progress and notes on the stages, rates and times, image strips."""
 
 from __future__ import annotations
 
+import logging
+import math
 import os
+import time
 from pathlib import Path
 
 import lightning as L
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
-from tqdm import tqdm
+from torch import Tensor
+
+from mosa.loggers import add_picture
+from mosa.progress import tqdm
+
+log = logging.getLogger(__name__)
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -51,8 +59,7 @@ class FitProgress(L.Callback):
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
         if self.bar is not None:
-            values = {k.removeprefix("id/"): f"{v:.4g}" for k, v in module.last.items() if k.startswith("id/")}
-            self.bar.set_postfix({"loss": f"{module.last['loss/total']:.5f}", **values}, refresh=False)
+            self.bar.set_postfix(figures_of(module.last), refresh=False)
             self.bar.update()
 
     def on_train_end(self, trainer, module) -> None:
@@ -67,12 +74,65 @@ class FitProgress(L.Callback):
             self.bar = None
 
 
+def figures_of(last: dict[str, float]) -> dict[str, str]:
+    """Loss and parameters of the last step, as they are shown."""
+    found = {"loss": f"{last['loss/total']:.5f}"} if "loss/total" in last else {}
+    return found | {k.removeprefix("id/"): f"{v:.4g}" for k, v in last.items() if k.startswith("id/")}
+
+
+class StageNotes(L.Callback):
+    """A line in the run's log when a stage begins, and one with its figures when it ends."""
+
+    def __init__(self) -> None:
+        self.stage, self.began, self.steps = None, 0.0, 0
+
+    def on_train_batch_start(self, trainer, module, batch, batch_idx) -> None:
+        if module.stage is not None and self.stage is None:
+            self.stage, self.began, self.steps = module.stage, time.perf_counter(), 0
+            done = f", going on after {len(module.losses)}" if module.losses else ""
+            log.info("stage %s: at most %d steps%s", self.stage.name, self.stage.iterations, done)
+
+    def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
+        self.steps += 1
+        if self.stage is not None and module.stage is not self.stage:
+            figures = ", ".join(f"{name} {value}" for name, value in figures_of(module.last).items())
+            log.info("stage %s: ended after %d steps, %.1f s: %s", self.stage.name, self.steps, time.perf_counter() - self.began,
+                     figures)  # fmt: skip
+            self.stage = None
+
+
+class Pace(L.Callback):
+    """Logs what a step took (`time/step_s`) and the learning rate of each group of parameters in it (`lr/<group>`)."""
+
+    def __init__(self) -> None:
+        self.began, self.index = 0.0, 0
+
+    def on_train_batch_start(self, trainer, module, batch, batch_idx) -> None:
+        self.began, self.index = time.perf_counter(), module.stage_index  # the step may be its stage's last
+
+    def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
+        values = {"time/step_s": time.perf_counter() - self.began}
+        for optimizer in trainer.optimizers[self.index : self.index + 1]:
+            values |= {f"lr/{group.get('name', k)}": group["lr"] for k, group in enumerate(optimizer.param_groups)}
+        module.log_dict({k: torch.tensor(v, dtype=torch.float32) for k, v in values.items()}, on_step=True, on_epoch=False)
+
+
 class ImageStrips(L.Callback):
-    """Adds a strip of real (above) and rendered (below) frames to TensorBoard every `every` iterations."""
+    """Adds a strip of real (above) and rendered (below) frames to the loggers every `every` iterations."""
 
     def __init__(self, every: int) -> None:
         self.every = every
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
         if trainer.is_global_zero and self.every > 0 and module.steps_done % self.every == 0:
-            module.logger.experiment.add_image("real_above_rendered_below", module.strip(), module.steps_done)
+            add_picture(module.loggers, "real_above_rendered_below", enlarged(module.strip()), module.steps_done)
+
+
+LEGIBLE = 480
+"""Height [px] that a strip of two rows has at least: windows around an object are often 60 px high."""
+
+
+def enlarged(picture: Tensor) -> Tensor:
+    """A picture (3, H, W) in [0, 1] whose pixels are repeated until it is `LEGIBLE` high."""
+    times = max(1, math.ceil(LEGIBLE / picture.shape[1]))
+    return picture.repeat_interleave(times, 1).repeat_interleave(times, 2)

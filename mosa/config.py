@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -21,6 +21,9 @@ from mosa.physics.boundary import Plane
 from mosa.physics.collider_motion import Motion
 from mosa.physics.colliders import colliders_from_config, domain_walls
 from mosa.types import Ground, Scene
+
+if TYPE_CHECKING:
+    from mosa.modules.lit_mosa import LitMosa
 
 LAW_OPTIONS = ("yield_convention", "norm_eps", "rebuild", "on_inversion", "init_affine")
 """Arguments of `Simulator` that say how a law is taken."""
@@ -131,6 +134,16 @@ def build_adapter(config: Mapping[str, Any]) -> torch.nn.Module | None:
     if build is None:
         return None
     return known_keys("adapter", build, {k: v for k, v in config.items() if k not in ("name", "_target_")})
+
+
+def build_fit(config: Mapping[str, Any], body: Body, *, takes: Sequence, background: Tensor) -> LitMosa:
+    """The module that fits `body` in the stages of a run. takes: what it learns from (`LitMosa`), none where it is only used."""
+    from mosa.modules.lit_mosa import LitMosa
+
+    cfg = config["cfg"]
+    stages = build_stages(cfg["fit"], heterogeneity=body.heterogeneity is not None, adapter=body.adapter is not None)
+    return LitMosa(body, takes=takes, world=build_world(config["world"]), background=background, stages=stages,
+                   weights=cfg["losses"], clip=cfg["fit"]["clip"], config=config)
 
 
 def build_stages(fit: Mapping[str, Any], *, heterogeneity: bool, adapter: bool) -> list[Stage]:

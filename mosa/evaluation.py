@@ -5,11 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from warnings import warn
 
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from mosa import metrics
 from mosa.analysis.anisotropy import stiffest_axis
@@ -18,6 +18,7 @@ from mosa.errors import SimulationDiverged
 from mosa.modules.body import VARIANTS, Body, Start, World
 from mosa.modules.material import material_states
 from mosa.modules.observer import deformed_covariances, observe
+from mosa.progress import tqdm
 from mosa.rendering.cameras import crop_boxes
 from mosa.threads import threaded
 from mosa.types import Rollout, Scene
@@ -236,8 +237,8 @@ def law_figures(body: Body) -> dict[str, float]:
     if growth is not None:
         figures["id/growth_per_period"] = growth
         if growth > GROWTH_LIMIT:
-            print(f"warning: the learned law makes energy: a freely vibrating block grows by a factor of {growth:.3g} in a period; "
-                  "adapter.major_symmetry=true with adapter.state_dependence=constant gives it an energy")
+            warn(f"the learned law makes energy: a freely vibrating block grows by a factor of {growth:.3g} in a period; "
+                 "adapter.major_symmetry=true with adapter.state_dependence=constant gives it an energy", stacklevel=2)
     if "E" in material.physical():
         states = material_states(material.law, material.per_particle(), **body.law_options)
         try:

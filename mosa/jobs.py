@@ -20,6 +20,7 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from mosa.commands import fail
 from mosa.errors import MosaError
 
 FAILED = "failed"
@@ -88,7 +89,7 @@ def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float
         return job(cfg)
     except KeyboardInterrupt:
         if first:
-            print("\nstopped; resume with ckpt_path=<run folder>/checkpoints/last.ckpt, where the fit had begun", file=sys.stderr)
+            fail("stopped; resume with ckpt_path=<run folder>/checkpoints/last.ckpt, where the fit had begun")
         sys.exit(143 if signal.SIGTERM in signals else 130)
     except MosaError as error:
         message = f"{type(error).__name__}: {error}"
@@ -98,7 +99,7 @@ def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float
         if (reason := disk_message(error)) is None:
             raise
         message = f"DataError: {reason}"
-    print(f"\n{message}", file=sys.stderr)
+    fail(message)
     if HydraConfig.get().mode != RunMode.MULTIRUN:
         sys.exit(2)
     keep(message)

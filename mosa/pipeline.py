@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 import time
@@ -13,25 +14,26 @@ from pathlib import Path
 import lightning as L
 import torch
 from hydra.core.hydra_config import HydraConfig
-from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.plugins.environments import LightningEnvironment
 from omegaconf import DictConfig, OmegaConf
-from tqdm import tqdm
 
-from mosa import parallel
+from mosa import __version__, parallel
 from mosa.analysis.figures import side_by_side, write_strip, write_video
 from mosa.analysis.tables import parameter_table, results_table
-from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLast
-from mosa.config import build_body, build_stages, build_world, plain, rehearse, run_config, world_config
+from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLast, Pace, StageNotes
+from mosa.config import build_body, build_fit, build_world, plain, rehearse, run_config, world_config
 from mosa.data.agreement import seen_at
 from mosa.data.datamodule import MultiViewDataModule, training_observations
+from mosa.data.sequences import load_sequences, taught_names
 from mosa.errors import ConfigError, DataError, MosaError
 from mosa.evaluation import Sequence, evaluate, floor_figures, identification, law_figures, render, true_motion
+from mosa.loggers import build_loggers, chosen, log_outcome
 from mosa.modules.body import Body, Start, World
 from mosa.modules.lit_mosa import LitMosa, Take
 from mosa.physics.collider_overlap import check_clear
 from mosa.physics.colliders import colliders_from_config
 from mosa.physics.memory import KEPT_ON_CPU
+from mosa.progress import tqdm
 from mosa.reconstruction.starts import first_contact, sequence_start, splats_of
 from mosa.rendering.cameras import crop_boxes, crop_images
 from mosa.rendering.covariance import covariance_from
@@ -42,7 +44,6 @@ from mosa.run import (
     device_names,
     device_of,
     finished,
-    log_outcome,
     named_device,
     shared_starts,
     write_figures,
@@ -50,6 +51,8 @@ from mosa.run import (
 from mosa.schema import EVALUATION, SIMULATION, TRAINING, check
 from mosa.twin import Twin, save_observed, save_rollout, save_truth
 from mosa.types import MotionCues, Reconstruction, Scene
+
+log = logging.getLogger(__name__)
 
 
 class Clock:
@@ -63,6 +66,7 @@ class Clock:
         began = time.perf_counter()
         yield
         self.figures[f"time/{stage}_s"] = self.figures.get(f"time/{stage}_s", 0.0) + time.perf_counter() - began
+        log.info("%s: done in %.1f s", stage, time.perf_counter() - began)
 
 
 def run_folder() -> Path:
@@ -89,17 +93,8 @@ def cache_folder(cfg: DictConfig) -> Path:
 
 
 def scenes(cfg: DictConfig) -> tuple[Scene, list[Scene]]:
-    """The training sequence and the others of the same object. Errors: ConfigError where scene.also_train names none of these."""
-    from mosa.data.scene import held_out_sequences, load_scene
-
-    keys = plain(cfg.scene)
-    wanted = keys.pop("also_train", None) or []
-    scene, others = load_scene(**keys), held_out_sequences(**keys)
-    known = [s.sequence for s in others]
-    if unknown := [name for name in wanted if name not in known]:
-        found = f"has {', '.join(known)}" if known else "has none"
-        raise ConfigError(f"scene.also_train: expected other sequences of the scene, found {unknown[0]!r}; it {found}")
-    return scene, others
+    """The training sequence and the others of the same object. Errors: ConfigError, DataError."""
+    return load_sequences(plain(cfg.scene))
 
 
 def starts(
@@ -129,33 +124,45 @@ def sequences(body: Body, training: Scene, others: list[Scene], found: dict[str,
     return [Sequence(p, s, start, first_contact(body, start, s)) for (p, start), s in zip(found.items(), [training, *others])]
 
 
+def run_sequences(config: dict, body: Body) -> list[Sequence]:
+    """The sequences that the run of a checkpoint's `config` was evaluated on, read again."""
+    scene, others = scenes(OmegaConf.create(config["cfg"]))
+    return sequences(body, scene, others, {k: Start.read(s, body.rest) for k, s in config["starts"].items()})
+
+
 def train(cfg: DictConfig) -> float | None:
     """Run everything `cfg` asks for; returns the figure a sweep optimises. Errors: MosaError of whatever was wrong."""
     quiet()
     check(plain(cfg), TRAINING, EVALUATION)
     rehearse(plain(cfg))
+    chosen(plain(cfg.logger))
     L.seed_everything(cfg.seed, verbose=False)
     clock, folder = Clock(), run_folder()
+    log.info("mosa %s: %s", __version__, " ".join(HydraConfig.get().overrides.task))
     if (done := finished(cfg, folder)) is not None:
-        print(f"skipped: {folder} has its metrics.json (resume=auto)")
+        log.info("skipped: %s has its metrics.json (resume=auto)", folder)
         return optimized(done, cfg.optimized_metric)
     cfg.ckpt_path = begins_from(cfg, folder)
     device = device_of(cfg)
     use_backend(cfg.rendering.backend)
     with clock.measure("data"):
         scene, held_out = scenes(cfg)
-    taught = list(cfg.scene.get("also_train") or [])
+    taught = taught_names(plain(cfg.scene))
     parallel.check_share(len(device_names(cfg)), 1 + len(taught), min(cfg.fit.views, len(scene.training_cameras)))
     if (place := seen_at(scene)) is not None:  # before the reconstruction; the body itself is checked after it
         check_clear(colliders_from_config(plain(cfg.world)["colliders"] or ()), place[None], "the object, as frame 0 shows it,")
     if scene.synthetic:
-        print(f"scene {scene.name}: synthetic, made by this program; not a capture")
+        log.info("scene %s: synthetic, made by this program; not a capture", scene.name)
     with clock.measure("reconstruction"):
         reconstruction, dx = reconstruct_scene(cfg, scene, device)
+    volume = reconstruction.volume
+    log.info("body: %d particles, %.4g cm^3, grid spacing %.4g m", len(volume), 1e6 * float(volume.sum()), dx)
     config = run_config(plain(cfg), scene, dx)
     body = body_of(reconstruction, config).to(device)
     with clock.measure("starts"):
         found = shared_starts(cfg, folder, lambda: starts(body, reconstruction, scene, held_out, taught), body)
+    for prefix, start in found.items():
+        log.info("start of %s: velocity (%s) m/s", prefix, ", ".join(f"{v:.3f}" for v in start.velocity.tolist()))
     config["starts"] = {k: s.written() for k, s in found.items()}
     world = build_world(config["world"])
     check_starts(world, body, found)
@@ -163,7 +170,7 @@ def train(cfg: DictConfig) -> float | None:
         more = [(s, found[f"train/{s.sequence}"]) for s in held_out if s.sequence in taught]
         module, data = assemble_fit(cfg, scene, reconstruction, body, found["train"], config, device, more)
         if parallel.launched_rank() == 0:
-            print(fit_estimate(module, len(device_names(cfg))))
+            log.info(fit_estimate(module, len(device_names(cfg))))
         fit(cfg, module, data, folder, device)
     if parallel.launched_rank() != 0:
         return None
@@ -177,8 +184,7 @@ def train(cfg: DictConfig) -> float | None:
         figures |= floor_figures(body, sequences(body, scene, held_out, found), world,
                                  samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
     figures |= clock.figures | cost(device) | {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
-    if cfg.logger.enabled:
-        log_outcome(folder, plain(cfg), figures)
+    log_outcome(plain(cfg.logger), folder, plain(cfg), figures)
     write_outputs(folder, cfg, body, sequences(body, scene, held_out, found), figures, kept)
     return optimized(figures, cfg.optimized_metric)
 
@@ -199,14 +205,9 @@ def assemble_fit(
     seen = [(scene, start, reconstruction)]
     seen += [(s, begun, follow_scene(cfg, s, scene, reconstruction, body, begun, device)) for s, begun in more]
     takes = [take_of(cfg, *each, body, device) for each in seen]
-    settings = plain(cfg.fit)
-    stages = build_stages(settings, heterogeneity=body.heterogeneity is not None, adapter=body.adapter is not None)
-    module = LitMosa(
-        body, takes=takes, world=build_world(config["world"]), background=scene.background.to(device),
-        stages=stages, weights=plain(cfg.losses), clip=settings["clip"], config=config,
-    )
-    data = MultiViewDataModule(takes[0].observations, views_per_step=settings["views"],
-                               steps=sum(s.iterations for s in stages), seed=cfg.seed)
+    module = build_fit(config, body, takes=takes, background=scene.background.to(device))
+    data = MultiViewDataModule(takes[0].observations, views_per_step=cfg.fit.views,
+                               steps=sum(s.iterations for s in module.stages), seed=cfg.seed)
     return module, data
 
 
@@ -254,14 +255,15 @@ def fit(cfg, module: LitMosa, data: MultiViewDataModule, folder: Path, device: s
     """The staged optimisation under Lightning; resumes from cfg.ckpt_path. Errors: ConfigError for a missing checkpoint."""
     if cfg.ckpt_path is not None and not Path(cfg.ckpt_path).is_file():
         raise ConfigError(f"ckpt_path: no file {cfg.ckpt_path}; a run writes <run folder>/checkpoints/last.ckpt")
-    logger = TensorBoardLogger(folder, name="tensorboard", version="", default_hp_metric=False) if cfg.logger.enabled else False
-    callbacks = [KeepLast(folder / "checkpoints"), FitProgress()]
-    if cfg.logger.enabled and cfg.logger.images_every:
-        callbacks.append(ImageStrips(cfg.logger.images_every))
+    settings = plain(cfg.logger)
+    logger = build_loggers(settings, folder)
+    callbacks = [KeepLast(folder / "checkpoints"), FitProgress(), StageNotes(), *([Pace()] if logger else [])]
+    if logger and settings.get("images_every"):
+        callbacks.append(ImageStrips(settings["images_every"]))
     shared = {"strategy": parallel.SharedSteps()} if len(device_names(cfg)) > 1 else {}
-    trainer = L.Trainer(accelerator=cfg.trainer.accelerator, devices=plain(cfg.trainer)["devices"], max_epochs=-1, logger=logger,
-                        callbacks=callbacks, plugins=[AtomicCheckpointIO(), LightningEnvironment()], enable_checkpointing=False,
-                        enable_progress_bar=False, enable_model_summary=False, log_every_n_steps=1,
+    trainer = L.Trainer(accelerator=cfg.trainer.accelerator, devices=plain(cfg.trainer)["devices"], max_epochs=-1,
+                        logger=logger or False, callbacks=callbacks, plugins=[AtomicCheckpointIO(), LightningEnvironment()],
+                        enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False, log_every_n_steps=1,
                         reload_dataloaders_every_n_epochs=1, default_root_dir=folder, use_distributed_sampler=False, **shared)
     try:
         trainer.fit(module, datamodule=data, ckpt_path=cfg.ckpt_path, weights_only=True)
@@ -304,7 +306,7 @@ def write_outputs(folder: Path, cfg: DictConfig, body: Body, evaluated: list[Seq
     table = results_table(figures) + "\n\n" + parameter_table(figures)
     (folder / "results.md").write_text(table + "\n")
     write_figures(folder, figures)  # the last file: the run is complete
-    print(f"\n{table}\n\nrun folder: {folder}")
+    log.info("\n%s\n\nrun folder: %s", table, folder)
 
 
 def comparison(body: Body, shown: Sequence, variants: dict) -> dict:
@@ -319,11 +321,11 @@ def comparison(body: Body, shown: Sequence, variants: dict) -> dict:
 
 
 def optimized(figures: dict[str, float], wanted: str) -> float | None:
-    """The figure a sweep minimises: `wanted`, or the first that exists of its fallbacks."""
+    """The figure a sweep minimises: `wanted`, or the first that exists of its fallbacks; of image figures the negative."""
     for key in (wanted, "test/rms_m", "train/rms_m"):
         if key in figures:
             return figures[key]
-    return -figures["train/psnr_crop"] if "train/psnr_crop" in figures else None
+    return next((-figures[key] for key in ("test/psnr_crop", "train/psnr_crop") if key in figures), None)
 
 
 def evaluate_checkpoint(cfg: DictConfig) -> float | None:
@@ -338,7 +340,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     simulate = plain(cfg.simulate)
     if any(simulate[k] is not None for k in ("velocity", "rotation", "height", "angular_velocity", "colliders")):
         rollout = twin.simulate(**simulate, progress=True)
-        print(f"simulated {len(rollout.x)} frames into {twin.export(rollout, folder)}")
+        log.info("simulated %d frames into %s", len(rollout.x), twin.export(rollout, folder))
         return None
     scene, held_out = scenes(evaluated_scene(cfg, twin))
     body, world = twin.body, twin.world

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import platform
 import resource
@@ -12,13 +13,14 @@ from pathlib import Path
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import DictConfig
 
 from mosa import parallel
 from mosa.config import plain
 from mosa.errors import ConfigError
 from mosa.modules.body import Body, Start
+
+log = logging.getLogger(__name__)
 
 SPECIAL = {"Infinity": math.inf, "-Infinity": -math.inf, "NaN": math.nan}
 """Figures that JSON has no numbers for, as strings that float() and JavaScript's Number() read."""
@@ -56,7 +58,7 @@ def begins_from(cfg: DictConfig, folder: Path) -> str | None:
     last = folder / "checkpoints" / "last.ckpt"
     if cfg.resume != "auto" or not last.is_file():
         return cfg.ckpt_path
-    print(f"going on from {last} (resume=auto)")
+    log.info("going on from %s (resume=auto)", last)
     return str(last)
 
 
@@ -120,15 +122,3 @@ def shared_starts(cfg: DictConfig, folder: Path, find: Callable[[], dict[str, St
         path.write_text(json.dumps({k: s.written() for k, s in found.items()}))
     return found
 
-
-OUTCOME = ("train/rms_m", "test/rms_m", "prior/test/rms_m", "prior_eta/test/rms_m", "train/psnr_crop", "test/psnr_crop",
-           "camera/psnr_crop", "test/mean_abs_C")
-
-
-def log_outcome(folder: Path, cfg: dict, figures: dict) -> None:
-    """The run's configuration beside its final figures, for TensorBoard's table of hyper-parameters, as `final/...`."""
-    logger = TensorBoardLogger(folder, name="tensorboard", version="", default_hp_metric=False)
-    final = {f"final/{k}": v for k, v in figures.items() if k in OUTCOME or k.startswith(("id/", "id_prior/"))}
-    (Path(logger.log_dir) / "hparams.yaml").unlink(missing_ok=True)  # the fit's logger left an empty one, which would be kept
-    logger.log_hyperparams({k: v for k, v in cfg.items() if k not in ("evaluation", "logger", "hydra")}, final)
-    logger.finalize("success")

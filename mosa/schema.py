@@ -46,8 +46,15 @@ def or_null(kind: Kind) -> Kind:
     return Kind(f"{kind.described}, or null", lambda v: v is None or kind.fits(v))
 
 
+def is_sequence(value: Any) -> bool:
+    """A sequence as scene.also_train and scene.test name it (mosa/data/sequences.py)."""
+    return isinstance(value, str) or (isinstance(value, Mapping) and isinstance(value.get("path"), str))
+
+
 FLAG = Kind("true or false", lambda v: isinstance(v, bool))
 NAMES = Kind("a list of names like [a, b]", lambda v: isinstance(v, list) and all(isinstance(name, str) for name in v))
+SEQUENCES = Kind("a list of names or folders like [a, b], or of sections like {path: a, frames: [0, 9]}",
+                 lambda v: isinstance(v, list) and all(map(is_sequence, v)))
 SECTION = Kind("a section of keys", lambda v: isinstance(v, Mapping))
 ENTRIES = Kind("a list of sections", lambda v: isinstance(v, list) and all(isinstance(entry, Mapping) for entry in v))
 THREE = Kind("three numbers", lambda v: isinstance(v, list) and len(v) == 3 and all(map(is_number, v)))
@@ -63,7 +70,8 @@ SECTIONS = ("scene", "prior", "adapter", "reconstruction", "simulation", "fit", 
 TRAINING: dict[str, Kind] = {
     **{name: SECTION for name in SECTIONS},
     "seed": whole(0, 2**32 - 1),
-    "scene.also_train": or_null(NAMES),
+    "scene.also_train": or_null(SEQUENCES),
+    "scene.test": or_null(SEQUENCES),
     "fit.views": COUNT,
     "fit.clip": POSITIVE,
     "fit.*.iterations": whole(0),
@@ -128,7 +136,11 @@ TRAINING: dict[str, Kind] = {
     "reconstruction.dynamic.hidden": whole(1, WIDEST),
     "world.walls": or_null(SECTION),
     "world.colliders": or_null(ENTRIES),
-    "logger.enabled": FLAG,
+    "logger.tensorboard": or_null(SECTION),
+    "logger.csv": or_null(SECTION),
+    "logger.wandb": or_null(SECTION),
+    "logger.wandb.offline": FLAG,
+    "logger.wandb.tags": or_null(NAMES),
     "logger.images_every": whole(0),
 }
 BODY = {key: kind for key, kind in TRAINING.items()

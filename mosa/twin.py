@@ -18,7 +18,6 @@ import torch
 from plyfile import PlyData, PlyElement
 from scipy.spatial.transform import Rotation
 from torch import Tensor
-from tqdm import tqdm
 
 from mosa.analysis.figures import side_by_side, write_video
 from mosa.checkpoints import TENSORS, checked, read_checkpoint
@@ -29,6 +28,7 @@ from mosa.modules.observer import deformed_covariances, observe
 from mosa.npz import write_npz
 from mosa.physics.collider_overlap import check_clear
 from mosa.physics.colliders import Collider, colliders_from_config
+from mosa.progress import tqdm
 from mosa.rendering.cameras import look_at
 from mosa.schema import is_number
 from mosa.types import Cameras, MotionCues, Rollout

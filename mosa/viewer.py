@@ -12,6 +12,7 @@ import sys
 import threading
 from collections.abc import Sequence
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -53,7 +54,8 @@ class Viewer:
         try:
             import viser
         except ImportError as error:
-            raise ConfigError("viewer: expected the package viser, found none: pip install -e '.[viewer]'") from error
+            raise ConfigError("viewer: expected the package viser, found none: pip install -e '.[viewer]' in a clone, "
+                              "pip install viser elsewhere") from error
         try:  # viser's own server would try port after port and then wait for ever
             with socket.create_server((host, 0)):
                 pass
@@ -183,11 +185,24 @@ class Viewer:
         self.server.stop()
 
 
+USAGE = """usage: mosa-view <run folder> [host=127.0.0.1] [port=8080]     (or python -m mosa.viewer run=<run folder> ...)
+
+What a run saw, calibrated and learned, side by side in a browser.
+
+  <run folder>  of a finished run, as outputs/train/<date>/<time>; also as run=<run folder>
+  host          127.0.0.1: to be seen from this machine alone; 0.0.0.0: from everywhere
+  port          the next free one where it is taken
+
+Needs the package viser: pip install viser."""
+
+
 def options(arguments: Sequence[str]) -> dict[str, str]:
-    """run=, host=, port= of the command line. Errors: ConfigError naming what is wrong."""
+    """run= (or the folder alone), host=, port= of the command line. Errors: ConfigError naming what is wrong."""
     known = {"run": None, "host": "127.0.0.1", "port": "8080"}
     for argument in arguments:
         key, mark, value = argument.partition("=")
+        if key not in known and known["run"] is None and Path(argument).is_dir():
+            key, mark, value = "run", "=", argument
         if not mark or key not in known:
             raise ConfigError(f"viewer: expected run=<run folder>, host=<address>, port=<number>, found {argument!r}")
         known[key] = value
@@ -199,6 +214,9 @@ def options(arguments: Sequence[str]) -> dict[str, str]:
 
 
 def main(arguments: Sequence[str]) -> None:
+    if any(argument in ("--help", "-h") for argument in arguments):
+        print(USAGE)
+        return
     try:
         chosen = options(arguments)
         viewer = Viewer(read_run(chosen["run"]), host=chosen["host"], port=int(chosen["port"]))

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mosa.data.one_size import one_size
 from mosa.errors import ConfigError, DataError
 from mosa.types import Cameras
 
@@ -111,13 +112,15 @@ def frame_range(present: list[int], wanted, where: str) -> list[int]:
     return present
 
 
-def merge_time(times: dict[int, tuple[float, str]], frame: int, time: float, where: str) -> None:
-    """Note the time of a frame. Errors: DataError where another camera gave the same frame another time."""
+def merge_time(times: dict[int, tuple[float, str]], frame: int, time: float, where: str, fps: float | None = None) -> None:
+    """Note the time of a frame, the first that is given. Errors: DataError where another camera gave the same frame a time that
+    is another by more than a quarter of a frame, or, without frames per second, at all."""
     known, first = times.setdefault(frame, (time, where))
-    if abs(known - time) > 1e-6:
+    if abs(known - time) > (1e-6 if fps is None else 0.25 / fps):
+        remedy = "; where their clocks are a little apart, scene.fps=<frames per second> takes a frame as one moment"
         raise DataError(
             f"{where}: frame {frame} has time {time:.6f} s, but {known:.6f} s in {first}; "
-            "the cameras of a scene must be synchronous"
+            f"the cameras of a scene must be synchronous{remedy if fps is None else ''}"
         )
 
 
@@ -136,8 +139,21 @@ def even_times(times: list[float], frames: list[int], where: str, remedy: str) -
         )
 
 
-def stack_cameras(calibration: dict[str, tuple[np.ndarray, np.ndarray]], width: int, height: int) -> Cameras:
-    """Cameras from name -> (K, w2c)."""
-    K = torch.tensor(np.stack([k for k, _ in calibration.values()]), dtype=torch.float32)
-    w2c = torch.tensor(np.stack([w for _, w in calibration.values()]), dtype=torch.float32)
-    return Cameras(K, w2c, width, height, tuple(calibration))
+def scaled(K: np.ndarray, full: tuple[int, int], size: tuple[int, int]) -> np.ndarray:
+    """K (3, 3) [px] of images that were brought from `full` to `size`, (width, height) [px] each."""
+    return np.diag([size[0] / full[0], size[1] / full[1], 1.0]) @ K
+
+
+def footage_of(
+    calibration: dict[str, tuple[np.ndarray, np.ndarray]], images: list[np.ndarray], mattes: list[np.ndarray], frames: list[int],
+    times: list[float], where: str,
+) -> Footage:
+    """Footage from name -> (K, w2c) and, in the same order, (T, h, w, 3) images on white and (T, h, w) mattes, whose sizes may
+    differ between cameras. Errors: DataError beginning with `where` (`mosa.data.one_size`)."""
+    K, stack, coverage = one_size(np.stack([k for k, _ in calibration.values()]), images, mattes, background=WHITE,
+                                  names=list(calibration), where=where)
+    w2c = np.stack([w for _, w in calibration.values()])
+    cameras = Cameras(torch.tensor(K, dtype=torch.float32), torch.tensor(w2c, dtype=torch.float32), coverage.shape[3],
+                      coverage.shape[2], tuple(calibration))
+    return Footage(cameras, tuple(frames), torch.tensor(times, dtype=torch.float64).float(), torch.from_numpy(stack),
+                   torch.from_numpy(coverage), torch.ones(3))

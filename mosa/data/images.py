@@ -85,7 +85,7 @@ def expect_size(path: Path, pixels: np.ndarray, width: int, height: int, reason:
     if pixels.shape[:2] != (height, width):
         raise DataError(
             f"{path}: expected {width}x{height} px ({reason}), found {pixels.shape[1]}x{pixels.shape[0]}; "
-            "all images of a scene need one size"
+            "all images of a camera need one size"
         )
 
 

@@ -2,31 +2,33 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from mosa.data.footage import (
     WHITE,
     Footage,
     even_times,
+    footage_of,
     frame_range,
     matrix,
     merge_time,
     number,
     read_json,
     same_camera,
-    stack_cameras,
+    scaled,
     world_to_camera,
 )  # fmt: skip
 from mosa.data.images import composite, expect_size, fill_holes, read_image, resize, scaled_size
 from mosa.data.matting import matte_from_plate
 from mosa.data.scene import assemble
 from mosa.errors import DataError
-from mosa.rendering.cameras import scale_cameras
 from mosa.types import Scene
+
+log = logging.getLogger(__name__)
 
 NAME = re.compile(r"([a-z])_(-?\d+)_(-?\d+)\.png$")
 # a pixel of the m_ files belongs to the white background above this
@@ -57,17 +59,17 @@ def read_pacnerf(path: str | Path, *, frames=None, fps: float | None = None, sca
     if not folder.is_dir():
         raise DataError(f"{folder}: folder not found; set scene.path to a scene in PAC-NeRF's layout (all_data.json, data/)")
     listing = folder / "all_data.json"
-    calibration, times = read_listing(listing)
+    calibration, times = read_listing(listing, fps)
     prefix, present = usable_frames(folder, calibration)
     numbers = frame_range([f for f in present if f in times], frames, str(folder / "data"))
     if fps is None:
         remedy = "correct them, restrict scene.frames, or set scene.fps"
         even_times([times[f][0] for f in numbers], numbers, str(listing), remedy)
     if prefix == "r":
-        print(f"{folder}: raw images without mattes; matted from the background plates r_<camera>_-1.png")
-    images, mattes, full = [], [], None
-    for camera in calibration:
-        rows = []
+        log.info("%s: raw images without mattes; matted from the background plates r_<camera>_-1.png", folder)
+    images, mattes, scaled_calibration = [], [], {}
+    for camera, (K, w2c) in calibration.items():
+        rows, full = [], None
         plate = read_plate(folder / "data" / f"r_{camera}_-1.png") if prefix == "r" else None
         for frame in numbers:
             file = folder / "data" / f"{prefix}_{camera}_{frame}.png"
@@ -80,21 +82,19 @@ def read_pacnerf(path: str | Path, *, frames=None, fps: float | None = None, sca
             if full is None:
                 full, first = pixels.shape[1::-1], file.name
                 size = scaled_size(*full, scale)
-            expect_size(file, pixels, *full, reason=f"as {first}")
+                scaled_calibration[camera] = scaled(K, full, size), w2c
+            expect_size(file, pixels, *full, reason=f"as {first} of the same camera")
             color, matte = split(file, pixels, plate)
             matte = fill_holes(matte, fill)
             rows.append((resize(composite(color, matte, WHITE), *size), resize(matte, *size)))
         images.append(np.stack([r[0] for r in rows]))
         mattes.append(np.stack([r[1] for r in rows]))
-    cameras = stack_cameras(calibration, *full)
-    return Footage(
-        cameras if scale == 1 else scale_cameras(cameras, scale), tuple(numbers),
-        torch.tensor([times[f][0] for f in numbers], dtype=torch.float64).float(), torch.from_numpy(np.stack(images)),
-        torch.from_numpy(np.stack(mattes)), torch.ones(3),
-    )  # fmt: skip
+    return footage_of(scaled_calibration, images, mattes, numbers, [times[f][0] for f in numbers], str(listing))
 
 
-def read_listing(path: Path) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], dict[int, tuple[float, str]]]:
+def read_listing(
+    path: Path, fps: float | None = None
+) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], dict[int, tuple[float, str]]]:
     """Calibration (camera name -> K, w2c) in order of camera number, and frame -> (time, where it was read)."""
     entries = read_json(path)
     if not isinstance(entries, list) or not entries:
@@ -114,7 +114,7 @@ def read_listing(path: Path) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], 
         if not same_camera(calibration.setdefault(camera, (K, w2c)), K, w2c):
             raise DataError(f"{where}: camera {camera} has another pose or intrinsics than before; cameras must not move")
         if frame >= 0:
-            merge_time(times, frame, number(entry["time"], f"{where}, time"), where)
+            merge_time(times, frame, number(entry["time"], f"{where}, time"), where, fps)
     return dict(sorted(calibration.items(), key=lambda item: int(item[0]))), times
 
 

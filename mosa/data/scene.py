@@ -30,7 +30,8 @@ def load_scene(
 ) -> Scene:
     """The scene that the keys of conf/scene describe, validated.
 
-    root is put before a relative path; ground: {height [m], mode, friction} or None; cache: folder for made scenes.
+    root is put before a relative path; `particles` is looked for beside the images first; ground: {height [m], mode, friction} or
+    None; cache: folder for made scenes.
     Errors: ConfigError for keys (unknown, missing, out of range), DataError for files.
     """
     if format not in FORMATS:
@@ -47,13 +48,16 @@ def load_scene(
         )
     arguments = {k: v for k, v in keys.items() if v is not None}
     arguments["ground"] = ground_from(ground)
+    place = under(root, path)
     if keys.get("particles") is not None:
-        arguments["particles"] = under(root, keys["particles"])
-    return validate(call(loader, {"path": under(root, path), **arguments}))
+        found = beside(place, keys["particles"])
+        arguments["particles"] = under(root, keys["particles"]) if found is None else found
+    return validate(call(loader, {"path": place, **arguments}))
 
 
 def held_out_sequences(**keys) -> list[Scene]:
-    """The held-out sequences of the same object: all that a built-in scene has besides its training sequence, else none."""
+    """The held-out sequences that a built-in scene brings: all besides its training sequence. Those of folders are named by the
+    user (`mosa.data.sequences`)."""
     if keys.get("format") != "builtin" or keys.get("sequence", "train") != "train":
         return []
     from mosa.data.builtin import held_out_names
@@ -68,6 +72,12 @@ def under(root: str | None, path: str) -> Path:
     """`path` below `root` where it is relative and a root is given."""
     path = Path(path).expanduser()
     return path if path.is_absolute() or root is None else Path(root).expanduser() / path
+
+
+def beside(path: Path, name: str) -> Path | None:
+    """The folder `name` beside the images of a scene (its folder, or the file in it), None where there is none."""
+    folder = Path(path) if Path(path).is_dir() else Path(path).parent
+    return folder / name if (folder / name).is_dir() else None
 
 
 def call(loader: Callable, arguments: dict) -> Scene:

@@ -9,25 +9,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from mosa.data.footage import (
     WHITE,
     Footage,
     even_times,
+    footage_of,
     frame_range,
     matrix,
     number,
     read_json,
     same_camera,
-    stack_cameras,
+    scaled,
     world_to_camera,
 )  # fmt: skip
 from mosa.data.images import composite, expect_size, fill_holes, read_image, resize, scaled_size
 from mosa.data.lens import COEFFICIENTS, is_fisheye, lens_of
 from mosa.data.scene import assemble
 from mosa.errors import DataError
-from mosa.rendering.cameras import scale_cameras
 from mosa.types import Scene
 
 EXTENSIONS = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG")
@@ -71,20 +70,19 @@ def read_transforms(path: str | Path, *, frames=None, fps: float | None = None, 
         times = [i / fps for i in range(len(times))]
     remedy = "correct them, restrict scene.frames, or set scene.fps where every entry has a time"
     even_times([times[f] for f in wanted], wanted, str(file), remedy)
-    full, first, images, mattes, calibration = None, "", [], [], {}
+    images, mattes, calibration = [], [], {}
     for (name, shot), row in zip(cameras.items(), table):
-        pictures, lens, cut = [], None, 0.0
+        pictures, lens, cut, full = [], None, 0.0, None
         for frame in wanted:
             color, matte = read_shot(row[frame])
             matte = fill_holes(matte, fill)
             if full is None:
                 full, first = color.shape[1::-1], row[frame].image.name
                 size = scaled_size(*full, scale)
-            expect_size(row[frame].image, color, *full, reason=f"as {first}")
-            if name not in calibration:
                 K = camera_matrix(shot, *full)
                 lens = lens_of(K, shot.intrinsics, *full, fisheye=shot.fisheye, where=shot.where)
-                calibration[name] = (K if lens is None else lens.K, shot.w2c)
+                calibration[name] = scaled(K if lens is None else lens.K, full, size), shot.w2c
+            expect_size(row[frame].image, color, *full, reason=f"as {first} of the same camera")
             picture = composite(color, matte, WHITE)
             if lens is not None:
                 cut = max(cut, lens.lost(matte))
@@ -95,11 +93,7 @@ def read_transforms(path: str | Path, *, frames=None, fps: float | None = None, 
                           "to the border of the image", stacklevel=2)
         images.append(np.stack([p[0] for p in pictures]))
         mattes.append(np.stack([p[1] for p in pictures]))
-    rig = stack_cameras(calibration, *full)
-    return Footage(
-        scale_cameras(rig, scale) if scale != 1 else rig, tuple(wanted), torch.tensor([times[f] for f in wanted]).float(),
-        torch.from_numpy(np.stack(images)), torch.from_numpy(np.stack(mattes)), torch.ones(3),
-    )  # fmt: skip
+    return footage_of(calibration, images, mattes, wanted, [times[f] for f in wanted], str(file))
 
 
 def read_shots(file: Path, document, fps: float | None) -> list[Shot]:
@@ -197,10 +191,24 @@ def synchronise(by_camera: dict[str, list[Shot]], fps: float | None) -> tuple[li
         if missing:
             raise DataError(
                 f"{shots[0].where}: camera {name} has no image at {missing[:4]} s, where other cameras have one; "
-                f"cameras must be synchronous: {len(times)} frames expected, {len(shots)} found"
+                f"cameras must be synchronous: {len(times)} frames expected, {len(shots)} found; {clocks(by_camera, fps)}"
             )
         table.append(row)
     return times, table
+
+
+def clocks(by_camera: dict[str, list[Shot]], fps: float | None) -> str:
+    """What helps where the cameras' times do not meet: a frame rate, if their clocks are less than half a frame apart."""
+    rows = [sorted(shot.time for shot in shots) for shots in by_camera.values()]
+    count = len(rows[0])
+    if any(len(row) != count for row in rows) or count < 2:
+        return "add the missing images, or remove those of the other cameras at these times"
+    rate = (count - 1) / float(np.median([row[-1] - row[0] for row in rows]))
+    apart = max(max(moment) - min(moment) for moment in zip(*rows))
+    if fps is None and apart < 0.25 / rate:
+        return (f"their clocks are at most {1e3 * apart:.3g} ms apart: scene.fps={rate:.4g} takes images that belong together as "
+                "one frame, and evenly spaced times")
+    return f"their clocks are up to {1e3 * apart:.3g} ms apart, of a frame of {1e3 / rate:.3g} ms: shift the times of late cameras"
 
 
 def read_shot(shot: Shot) -> tuple[np.ndarray, np.ndarray]:

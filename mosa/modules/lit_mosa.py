@@ -16,6 +16,7 @@ from mosa.modules.adapter import pool
 from mosa.modules.body import Body, Start, World
 from mosa.modules.material import material_states
 from mosa.modules.observer import deformed_covariances, observe
+from mosa.modules.restorable import Restorable
 from mosa.modules.stages import Stage
 from mosa.modules.warm_start import warm_start
 from mosa.types import MotionCues, Rollout
@@ -37,7 +38,7 @@ class Take:
     first_contact: int
 
 
-class LitMosa(L.LightningModule):
+class LitMosa(Restorable, L.LightningModule):
     """Fits a body to one or more sequences in stages: the loss is the mean over them.
 
     weights: per loss term (`TERMS`; mosa/losses.py); config: plain containers from which `eval.py` rebuilds the run.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -15,6 +16,8 @@ import torch
 from torch import Tensor
 
 from mosa.reconstruction.observed import Windows
+
+log = logging.getLogger(__name__)
 
 
 class StageCache:
@@ -37,7 +40,7 @@ class StageCache:
             try:
                 return torch.load(path, map_location="cpu", weights_only=True)
             except Exception as error:
-                print(f"{path}: cannot be read ({error}); this stage is computed again")
+                log.warning("%s: cannot be read (%s); this stage is computed again", path, error)
         result = compute()
         partial = path.with_suffix(f".{os.getpid()}.tmp")
         torch.save(result, partial)

@@ -11,10 +11,10 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from mosa.data.splats import load_ply
 from mosa.errors import ConfigError, DataError
+from mosa.progress import tqdm
 from mosa.reconstruction.cache import StageCache
 from mosa.reconstruction.cues import gaussian_cues, neighbourhood, neighbourhood_cues
 from mosa.reconstruction.dynamic import DynamicSettings, Scaffold, fit_motion

@@ -111,12 +111,12 @@ def test_a_take_is_repeatable_and_comes_from_the_cache(training, cache, tmp_path
     assert tiny(cache).fingerprint == training.fingerprint
 
 
-def test_a_damaged_cache_is_made_again(training, cache, tmp_path, capsys):
+def test_a_damaged_cache_is_made_again(training, cache, tmp_path, caplog):
     shutil.copytree(cache / "builtin", tmp_path / "builtin")
     file = next((tmp_path / "builtin").glob("tiny-train-anisotropic-0-*"))
     file.write_bytes(file.read_bytes()[:5000])
     assert tiny(tmp_path).fingerprint == training.fingerprint
-    assert "damaged cache file" in capsys.readouterr().out
+    assert "damaged cache file" in caplog.text
     assert tiny(tmp_path).fingerprint == training.fingerprint
     assert not list((tmp_path / "builtin").glob("tmp*"))
 

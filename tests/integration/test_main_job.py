@@ -1,5 +1,6 @@
 """The commands of the README on a tiny scene: train, kill and resume, evaluate, simulate, and what they say on a mistake."""
 
+import csv
 import json
 import os
 import shutil
@@ -11,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import lightning as L
 import numpy as np
 import pytest
 import torch
@@ -20,10 +22,12 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from mosa import pipeline
 from mosa.clips import read_run
 from mosa.modules.body import ContactOffset, Start
+from mosa.modules.lit_mosa import LitMosa
 from mosa.twin import Twin
 from mosa.types import Ground
 
 ROOT = Path(__file__).parents[2]
+FIGURES = (ROOT / "docs" / "figures.md").read_text()
 
 
 @pytest.fixture(scope="module")
@@ -45,8 +49,9 @@ def call(script: str, folder: Path, cache: Path, *overrides: str) -> subprocess.
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, cache):
     folder = tmp_path_factory.mktemp("run")
-    result = call("train.py", folder, cache)
+    result = call("train.py", folder, cache, "logger=[tensorboard,csv]", "logger.images_every=2")
     assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
+    (folder / "screen").write_text(result.stderr)
     return folder
 
 
@@ -68,6 +73,53 @@ def test_a_run_leaves_its_outputs(run):
     assert figures["id/E_ratio"] == pytest.approx(figures["id/E"] / 2e5)
     assert 0 < figures["id/growth_per_period"] <= 1 and figures["id/stiffness_ratio"] > 1  # it has an energy, and learned something
     assert figures["time/device"] and figures["time/particle_substeps_per_s"] > 0
+
+
+def test_the_log_has_the_lines_that_matter(run):
+    log = (run / "train.log").read_text()
+    for line in ("] mosa 0.1.0: debug=default", "scene tiny: synthetic", "] reconstruction: done in ", "] body: 200 particles, ",
+                 "] start of test/test_60: velocity (", "] stage prior: at most 2 steps", "] stage joint: ended after 2 steps, ",
+                 "| rms [mm]  | adapted ", f"run folder: {run}"):
+        assert line in log, line
+    assert log.count("] stage ") == 6
+
+
+def test_progress_in_a_file_is_lines(run):
+    screen = (run / "screen").read_text()
+    assert "\r" not in screen and max(map(len, screen.splitlines())) < 250
+    assert screen.count("fit joint:   0% 0/2") == screen.count("fit joint: 100% 2/2") == 1
+
+
+def test_rates_times_and_pictures_are_logged(run):
+    events = EventAccumulator(str(run / "tensorboard"))
+    events.Reload()
+    seconds = [event.value for event in events.Scalars("time/step_s")]
+    assert len(seconds) == 5 and all(0 < s < 400 for s in seconds)
+    rates = [event.value for event in events.Scalars("lr/material")]  # conf/fit/tiny.yaml with the decay of mosa/modules/stages.py
+    assert rates == pytest.approx([0.1, 0.1, 0.02, 0.01, 0.01])
+    assert [event.value for event in events.Scalars("lr/adapter")] == pytest.approx([2e-3, 2e-3])
+    pictures = events.Images("real_above_rendered_below")
+    assert [p.step for p in pictures] == [2, 4] and all(p.height >= 480 for p in pictures)
+    with open(run / "csv" / "version_0" / "metrics.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["lr/material"]) for row in rows] == pytest.approx(rates)
+    for tag in (t for t in rows[0] if t not in ("epoch", "step")):
+        group = tag.split("/")[0]
+        assert f"`{tag}`" in FIGURES or f"`{group}/<" in FIGURES, f"docs/figures.md does not describe {tag}"
+
+
+def test_a_module_comes_back_from_its_checkpoint_and_is_tested(run):
+    module = LitMosa.load_from_checkpoint(run / "checkpoints" / "last.ckpt")
+    assert module.stage is None and module.steps_done == 5 and not module.training
+    saved = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+    for name, value in module.state_dict().items():
+        assert torch.equal(value, saved[name]), name
+    (found,) = L.Trainer(logger=False, accelerator="cpu", enable_checkpointing=False, enable_progress_bar=False).test(
+        module, verbose=False)
+    figures = json.loads((run / "metrics.json").read_text())
+    assert {"train/rms_m", "test/rms_m", "prior/test/test_40/psnr_crop", "test/mean_abs_C"} <= set(found)
+    for key, value in found.items():
+        assert value == pytest.approx(figures[key], rel=1e-5), key
 
 
 def test_a_run_can_be_looked_at(run):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import logging
 import os
 import tempfile
 import zipfile
@@ -12,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from mosa.data.builtin.drop import simulate
 from mosa.data.builtin.objects import OBJECTS, BuiltinObject, drop_named, object_named
@@ -22,8 +22,11 @@ from mosa.data.builtin.surface import Skin, Surface, bind, extract_surface, fill
 from mosa.data.footage import WHITE
 from mosa.data.images import composite, resize
 from mosa.errors import ConfigError
+from mosa.progress import tqdm
 from mosa.threads import threaded
 from mosa.types import Cameras
+
+log = logging.getLogger(__name__)
 
 # part of the key of a cached sequence: raise it whenever what is made changes
 VERSION = 1
@@ -134,7 +137,7 @@ def read_take(file: Path) -> Take | None:
         with np.load(file) as stored:
             return Take(*(stored[n] for n in ("pictures", "rest", "positions", "rotation", "velocity")))
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        print(f"{file}: damaged cache file ({error}); making it again")
+        log.warning("%s: damaged cache file (%s); making it again", file, error)
         return None
 
 

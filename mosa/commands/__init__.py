@@ -1,0 +1,37 @@
+"""The commands of the package: mosa-train and mosa-eval, which are train.py and eval.py of a clone, and mosa-view."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import warnings
+from pathlib import Path
+
+
+def configuration() -> str:
+    """Folder of the configuration: inside of an installed package, beside it in a clone."""
+    package = Path(__file__).parents[1]
+    inside = package / "conf"
+    return str(inside if inside.is_dir() else package.parent / "conf")
+
+
+def begin_log() -> None:
+    """Warnings become lines of the log, on the screen and in the run folder; the chatter of libraries does not."""
+    for name in ("matplotlib", "imageio", "PIL", "fsspec"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    warnings.formatwarning = one_line
+    logging.captureWarnings(True)
+
+
+def one_line(message, category, filename, lineno, line=None) -> str:
+    """Our own warnings say themselves what they are about, others where they come from."""
+    return f"warning: {message}" if category is UserWarning else f"{filename}:{lineno}: {category.__name__}: {message}"
+
+
+def fail(message: str) -> None:
+    """Say on the screen what ended the run, and note it in the run folder's log."""
+    print(f"\n{message}", file=sys.stderr)
+    record = logging.LogRecord("mosa", logging.ERROR, __file__, 0, message, None, None)
+    for handler in logging.getLogger().handlers:
+        if isinstance(handler, logging.FileHandler):
+            handler.handle(record)

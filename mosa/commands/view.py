@@ -1,0 +1,11 @@
+"""What a run saw, calibrated and learned, side by side in a browser:  mosa-view outputs/train/<date>/<time>"""
+
+import os
+import sys
+
+
+def main() -> None:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    from mosa.viewer import main as view
+
+    view(sys.argv[1:])

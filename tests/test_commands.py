@@ -1,0 +1,100 @@
+"""The package away from its repository: configuration inside, commands, version; and what the commands do around a run."""
+
+import logging
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+import warnings
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+import mosa
+from mosa import commands, viewer
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """What a wheel holds, from a copy of the sources."""
+    source, library = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("library")
+    for name in ("mosa", "conf"):
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE", "MANIFEST.in"):
+        shutil.copy(ROOT / name, source / name)
+    built = subprocess.run([sys.executable, "setup.py", "-q", "build_py", "-d", str(library)], cwd=source, capture_output=True,
+                           text=True)
+    assert built.returncode == 0, built.stderr[-2000:]
+    shutil.rmtree(source)
+    return library
+
+
+def test_a_wheel_holds_the_whole_configuration(built):
+    inside = {p.relative_to(built / "mosa" / "conf") for p in (built / "mosa" / "conf").rglob("*.yaml")}
+    assert inside == {p.relative_to(ROOT / "conf") for p in (ROOT / "conf").rglob("*.yaml")} and len(inside) > 50
+    assert (built / "mosa" / "py.typed").is_file()
+
+
+def call(built, tmp_path, module, *arguments):
+    """The command as an installed script runs it, with nothing of the repository in reach."""
+    start = f"import sys; sys.argv[0] = 'mosa'; from mosa.commands.{module} import main; sys.exit(main())"
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"PYTHONPATH": str(built)}
+    return subprocess.run([sys.executable, "-c", start, *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True)
+
+
+@pytest.mark.parametrize("module, arguments", [("train", ["debug=default", "scene.seed=3"]), ("eval", ["ckpt_path=x.ckpt"])])
+def test_the_commands_find_their_configuration(built, tmp_path, module, arguments):
+    result = call(built, tmp_path, module, *arguments, "--cfg", "all")
+    assert result.returncode == 0, result.stderr[-2000:]
+    cfg = OmegaConf.create(result.stdout)
+    sources = [source.path for source in cfg.hydra.runtime.config_sources if source.provider == "main"]
+    assert sources == [str(built / "mosa" / "conf")] and cfg.hydra.job.name == module  # the folder's name: outputs/train/...
+    assert cfg.ckpt_path == "x.ckpt" if module == "eval" else (cfg.simulation.particles, cfg.scene.seed) == (200, 3)
+
+
+def test_in_a_clone_the_configuration_is_where_it_is_edited():
+    assert Path(commands.configuration()) == ROOT / "conf"
+
+
+def test_there_is_one_version_and_every_command_has_its_function():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert project["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "mosa.__version__"} and mosa.__version__.count(".") == 2
+    for target in project["project"]["scripts"].values():
+        module, function = target.split(":")
+        assert callable(getattr(__import__(module, fromlist=[function]), function))
+    assert set(project["project"]["scripts"]) == {"mosa-train", "mosa-eval", "mosa-view"}
+
+
+@pytest.mark.parametrize("flag", ["--help", "-h"])
+def test_the_viewer_explains_itself(capsys, flag):
+    viewer.main([flag])
+    said = capsys.readouterr().out
+    assert said.startswith("usage: mosa-view") and "port" in said
+
+
+def test_a_folder_alone_is_the_run(tmp_path):
+    assert viewer.options([str(tmp_path), "port=9000"]) == {"run": str(tmp_path), "host": "127.0.0.1", "port": "9000"}
+
+
+def test_a_warning_and_what_ended_a_run_are_in_the_log(tmp_path, capsys, monkeypatch):
+    root, file = logging.getLogger(), logging.FileHandler(tmp_path / "train.log")
+    monkeypatch.setattr(root, "handlers", [file])
+    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        commands.begin_log()
+        try:
+            warnings.warn("three holes in a matte", stacklevel=1)
+            warnings.warn("of a library", DeprecationWarning, stacklevel=1)
+        finally:
+            logging.captureWarnings(False)
+    commands.fail("DataError: no image")
+    file.close()
+    first, second, last = (tmp_path / "train.log").read_text().splitlines()
+    assert first == "warning: three holes in a matte" and last == "DataError: no image"
+    assert second.endswith("DeprecationWarning: of a library") and "test_commands.py" in second
+    assert capsys.readouterr().err == "\nDataError: no image\n"
