@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
@@ -14,10 +15,14 @@ from torch import Tensor
 from mosa.errors import ConfigError
 from mosa.modules.adapters import adapter_class
 from mosa.modules.body import Body, SimulationSettings, World
+from mosa.modules.criteria import Criterion
 from mosa.modules.heterogeneity import HeterogeneityField
+from mosa.modules.identification import IdentificationSettings, few_numbers
 from mosa.modules.material import Material
 from mosa.modules.stages import Stage
+from mosa.modules.stiffness_modes import StiffnessModes
 from mosa.physics.boundary import Plane
+from mosa.physics.laws import law_named
 from mosa.physics.collider_motion import Motion
 from mosa.physics.colliders import colliders_from_config, domain_walls
 from mosa.types import Ground, Scene
@@ -27,6 +32,10 @@ if TYPE_CHECKING:
 
 LAW_OPTIONS = ("yield_convention", "norm_eps", "rebuild", "on_inversion", "init_affine")
 """Arguments of `Simulator` that say how a law is taken."""
+
+
+HETEROGENEITY = {"modes": StiffnessModes, "network": HeterogeneityField}
+"""heterogeneity.kind."""
 
 
 def plain(cfg: DictConfig) -> dict[str, Any]:
@@ -73,9 +82,19 @@ def build_body(config: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Body
     settings = build_simulation(cfg["simulation"], config["dx"])
     material, options = build_prior(cfg["prior"])
     heterogeneity = build_heterogeneity(cfg["heterogeneity"], tensors["rest"].amin(0), tensors["rest"].amax(0))
-    adapter = build_adapter(cfg["adapter"])
+    adapter = fitting(build_adapter(cfg["adapter"]), material.law)
     return Body(**tensors, density=config["density"], material=material, heterogeneity=heterogeneity, adapter=adapter,
                 settings=settings, law_options=options)
+
+
+def fitting(adapter: torch.nn.Module | None, law: str) -> torch.nn.Module | None:
+    """The adapter, or None with a warning where it adds stiffness and the law is a fluid's."""
+    known = law_named(law)
+    if getattr(adapter, "strain", None) is None or ("mu" in known.offsets and known.viscosity is None):
+        return adapter
+    warnings.warn(f"adapter: {law} has no shear stiffness that could be anisotropic; the run learns its parameters and stiffness modes "
+                  "alone (adapter=mosa corrects its stress by networks)", stacklevel=2)
+    return None
 
 
 def build_simulation(config: Mapping[str, Any], dx: float) -> SimulationSettings:
@@ -95,12 +114,19 @@ def build_prior(config: Mapping[str, Any]) -> tuple[Material, dict[str, Any]]:
     return known_keys("prior", Material, keys), options
 
 
-def build_heterogeneity(config: Mapping[str, Any], low: Tensor, high: Tensor) -> HeterogeneityField | None:
+def build_heterogeneity(config: Mapping[str, Any], low: Tensor, high: Tensor) -> torch.nn.Module | None:
     """The field on the box (3,) to (3,) [m], None where it is switched off. Errors: ConfigError naming the key."""
     if not config["enabled"]:
         return None
-    return known_keys("heterogeneity", HeterogeneityField, {k: v for k, v in config.items() if k != "enabled"} |
-                      {"low": low, "high": high})
+    kind = config.get("kind", "network")  # checkpoints from before there were modes
+    if kind not in HETEROGENEITY:
+        raise ConfigError(f"heterogeneity.kind: expected {' or '.join(HETEROGENEITY)}, found {kind!r}")
+    build, others = HETEROGENEITY[kind], set()
+    for other in HETEROGENEITY.values():
+        others |= set(inspect.signature(other).parameters)
+    foreign = others - set(inspect.signature(build).parameters)
+    keys = {k: v for k, v in config.items() if k not in ("enabled", "kind") and k not in foreign}
+    return known_keys("heterogeneity", build, keys | {"low": low, "high": high})
 
 
 def rehearse(cfg: Mapping[str, Any]) -> None:
@@ -110,10 +136,15 @@ def rehearse(cfg: Mapping[str, Any]) -> None:
     build_settings(**cfg["reconstruction"])
     low, high = torch.zeros(3), torch.ones(3)
     with torch.random.fork_rng(devices=[]):
-        build_prior(cfg["prior"])
-        heterogeneity, adapter = build_heterogeneity(cfg["heterogeneity"], low, high), build_adapter(cfg["adapter"])
+        material, _ = build_prior(cfg["prior"])
+        heterogeneity = build_heterogeneity(cfg["heterogeneity"], low, high)
+        with warnings.catch_warnings():  # said again where the body is built
+            warnings.simplefilter("ignore")
+            adapter = fitting(build_adapter(cfg["adapter"]), material.law)
     build_simulation(cfg["simulation"], 1.0)
-    build_stages(cfg["fit"], heterogeneity=heterogeneity is not None, adapter=adapter is not None)
+    build_stages(cfg["fit"], heterogeneity, adapter)
+    build_criterion(cfg)
+    build_identification(cfg)
     build_walls(cfg["world"]["walls"], torch.stack([low, high]))
     for collider in colliders_from_config(cfg["world"]["colliders"] or ()):
         if isinstance(collider.motion, Motion) and collider.motion.times is not None:
@@ -141,16 +172,30 @@ def build_fit(config: Mapping[str, Any], body: Body, *, takes: Sequence, backgro
     from mosa.modules.lit_mosa import LitMosa
 
     cfg = config["cfg"]
-    stages = build_stages(cfg["fit"], heterogeneity=body.heterogeneity is not None, adapter=body.adapter is not None)
+    stages = build_stages(cfg["fit"], body.heterogeneity, body.adapter)
     return LitMosa(body, takes=takes, world=build_world(config["world"]), background=background, stages=stages,
-                   weights=cfg["losses"], clip=cfg["fit"]["clip"], config=config)
+                   weights=cfg["losses"], clip=cfg["fit"]["clip"], config=config, criterion=build_criterion(cfg),
+                   settings=build_identification(cfg))
 
 
-def build_stages(fit: Mapping[str, Any], *, heterogeneity: bool, adapter: bool) -> list[Stage]:
-    """The stages of a run, without those that have nothing to optimise or no iterations."""
+def build_criterion(cfg: Mapping[str, Any]) -> Criterion:
+    """Free rollouts where a checkpoint is older than the group. Errors: ConfigError naming the key."""
+    return known_keys("criterion", Criterion, cfg.get("criterion") or {"name": "free"})
+
+
+def build_identification(cfg: Mapping[str, Any]) -> IdentificationSettings:
+    """Errors: ConfigError naming the key."""
+    return known_keys("identification", IdentificationSettings, cfg.get("identification") or {})
+
+
+def build_stages(
+    fit: Mapping[str, Any], heterogeneity: torch.nn.Module | None, adapter: torch.nn.Module | None
+) -> list[Stage]:
+    """The stages of a run, without those that have nothing to optimise or no iterations, each with the optimiser that it runs."""
     stages = [known_keys(f"fit.{name}", Stage, fit[name], name) for name in ("prior", "prior_eta", "joint")]
-    wanted = {"prior": True, "prior_eta": heterogeneity, "joint": adapter or heterogeneity}
-    stages = [s for s in stages if wanted[s.name] and s.iterations > 0]
+    parts = {"prior": (), "prior_eta": (heterogeneity,), "joint": (heterogeneity, adapter)}
+    wanted = {"prior": True, "prior_eta": heterogeneity is not None, "joint": adapter is not None or heterogeneity is not None}
+    stages = [s.resolved(all(map(few_numbers, parts[s.name]))) for s in stages if wanted[s.name] and s.iterations > 0]
     if not stages or stages[0].name != "prior":
         raise ConfigError("fit.prior.iterations: expected at least 1: every later figure is compared with the calibrated prior")
     return stages

@@ -13,9 +13,11 @@ from torch import Tensor
 
 from mosa import metrics
 from mosa.analysis.anisotropy import stiffest_axis
+from mosa.analysis.stiffness import stiffest
 from mosa.analysis.vibration import GROWTH_LIMIT, vibration_growth
 from mosa.errors import SimulationDiverged
 from mosa.modules.body import VARIANTS, Body, Start, World
+from mosa.modules.hyperelastic import HyperelasticAdapter
 from mosa.modules.material import material_states
 from mosa.modules.observer import deformed_covariances, observe
 from mosa.progress import tqdm
@@ -233,12 +235,16 @@ def law_figures(body: Body) -> dict[str, float]:
     if adapter is None or not adapter.is_on:
         return {}
     figures = {}
+    adapter.follow(material.poisson())
     growth = vibration_growth(material, adapter, density=body.density, stride=body.settings.stride, law_options=body.law_options)
-    if growth is not None:
-        figures["id/growth_per_period"] = growth
-        if growth > GROWTH_LIMIT:
-            warn(f"the learned law makes energy: a freely vibrating block grows by a factor of {growth:.3g} in a period; "
-                 "adapter.major_symmetry=true with adapter.state_dependence=constant gives it an energy", stacklevel=2)
+    figures["id/growth_per_period"] = growth
+    if growth > GROWTH_LIMIT:
+        warn(f"the learned law makes energy: a freely vibrating block grows by a factor of {growth:.3g} in a period; the law of "
+             "adapter=operator has an energy and cannot", stacklevel=2)
+    if isinstance(adapter, HyperelasticAdapter):
+        axis, ratio = stiffest(adapter.stiffness().detach().cpu())
+        figures["id/stiffness_ratio"] = float(ratio)
+        return figures | {f"id/stiffest_{name}": float(value) for name, value in zip("xyz", axis)}
     if "E" in material.physical():
         states = material_states(material.law, material.per_particle(), **body.law_options)
         try:

@@ -241,9 +241,13 @@ def fit_estimate(module: LitMosa, processes: int = 1) -> str:
     began = time.perf_counter()
     with torch.no_grad():
         module.terms(stages[0], [0, min(1, len(first.observations.cameras) - 1)], frames)
-    step = BACKWARD * (time.perf_counter() - began) * -(-len(module.takes) // processes)
+        again = time.perf_counter()
+        body.simulate(first.start, module.world, frames, first.frame_dt, with_adapter=False)
+    rollout = time.perf_counter() - again
+    step = BACKWARD * (again - began) * -(-len(module.takes) // processes)
     networks = body.adapter is not None and not body.adapter.steady
-    seconds = sum(s.iterations * step * (ADAPTER_COST if s.name == "joint" and networks else 1) for s in stages)
+    seconds = sum(s.iterations * step * (ADAPTER_COST if s.name == "joint" and networks else 1) for s in stages if not s.newton)
+    seconds += sum(module.rollouts(s) * rollout for s in stages if s.newton)
     evaluations = (frames - 1) * body.last_substeps / body.settings.stride
     memory = evaluations * len(body.rest) * ADAPTER_BYTES if networks else 0
     kept = 0 if body.rest.is_cuda else min(KEPT_ON_CPU, (frames - 1) * body.last_substeps * len(body.rest) * STATE_BYTES)

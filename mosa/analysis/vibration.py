@@ -13,6 +13,7 @@ from mosa.modules.adapter import Adapter
 from mosa.modules.material import Material
 from mosa.modules.stiffening import ADAPTER_MARGIN
 from mosa.physics.rollout import Simulator
+from mosa.physics.time_step import step_rate
 from mosa.types import ParticleState
 
 GROWTH_LIMIT = 1.05
@@ -23,13 +24,13 @@ NEGLIGIBLE = 1e-3
 """Share of the first period's kinetic maximum below which a vibration has ended."""
 
 
-def youngs_modulus(material: Material) -> float | None:
-    """E [Pa] of the small-strain response; None for a fluid, which does not vibrate freely in shear."""
+def longitudinal_modulus(material: Material) -> float:
+    """E [Pa] of the small-strain response, kappa of a fluid: what a block swings with along its length."""
     p = {name: float(value) for name, value in material.physical().items()}
     if "E" in p:
         return p["E"]
     if float(material.max_viscosity()) > 0:
-        return None
+        return p["kappa"]
     return 9 * p["kappa"] * p["mu"] / (3 * p["kappa"] + p["mu"])
 
 
@@ -44,16 +45,15 @@ def vibration_growth(
     periods: int = 10,
     cells: int = 4,
     amplitude: float = 0.02,
-) -> float | None:
-    """Largest ratio of the kinetic maxima of two periods in a row, of a block of a law that vibrates freely; None for a fluid.
+) -> float:
+    """Largest ratio of the kinetic maxima of two periods in a row, of a block of a law that vibrates freely, the start counting as
+    the first maximum.
 
     The block, 2 cells x 1 x 1 times `cells`, is given the velocity of its first longitudinal mode, at most `amplitude` times the
     speed of sound in a bar, about the strain; float64 on the CPU. adapter: switched on, or None for the prior; stride: substeps
     between its evaluations; density [kg/m^3]. At most 1 where the law has an energy, infinite where the block bursts.
     """
-    E = youngs_modulus(material)
-    if E is None:
-        return None
+    E = longitudinal_modulus(material)
     dx, spacing = 1.0, 0.5
     axes = [torch.arange(n, dtype=torch.float64) * spacing + spacing / 2 for n in (4 * cells, 2 * cells, 2 * cells)]
     x = torch.cartesian_prod(*axes)
@@ -64,11 +64,13 @@ def vibration_growth(
     F = torch.eye(3).double().expand(n, 3, 3).contiguous()
     frame_dt = 2 * length / speed / FRAMES
     margin = ADAPTER_MARGIN if adapter is None else adapter.stiffening(material.poisson())
-    needed = math.ceil(frame_dt * math.sqrt(margin * float(material.max_modulus()) / density) / (0.5 * dx))
+    rate = step_rate(math.sqrt(margin * float(material.max_modulus()) / density), float(material.max_viscosity()), density, dx,
+                     amplitude * speed, 0.5)
+    needed = math.ceil(frame_dt * rate)
     steady = adapter is None or adapter.steady
     substeps = needed if steady else -(-needed // stride) * stride
     simulator = Simulator(material.law, dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=(0, 0, 0), dtype=torch.float64,
-                          **(law_options or {}))
+                          strain=getattr(adapter, "strain", None), **(law_options or {}))
     parameters = {name: value.detach().double().cpu() for name, value in material.per_particle().items()}
     held = None if adapter is None else in_double(adapter)
     try:
@@ -78,6 +80,7 @@ def vibration_growth(
         )  # fmt: skip
     except SimulationDiverged:
         return math.inf
-    maxima = rollout.v[1:].square().sum((1, 2)).reshape(periods, FRAMES).amax(1).tolist()
+    energy = rollout.v.square().sum((1, 2))
+    maxima = [float(energy[0]), *energy[1:].reshape(periods, FRAMES).amax(1).tolist()]
     ratios = [later / earlier for earlier, later in itertools.pairwise(maxima) if earlier > NEGLIGIBLE * maxima[0]]
     return max(ratios, default=0.0)

@@ -11,6 +11,7 @@ from torch import nn
 from mosa.errors import ConfigError
 
 ADAPTERS = {
+    "hyperelastic": "mosa.modules.hyperelastic:HyperelasticAdapter",
     "stress": "mosa.modules.adapter:StressAdapter",
     "direct": "mosa.modules.direct:DirectAdapter",
 }

@@ -17,6 +17,7 @@ from mosa.errors import ConfigError
 from mosa.modules.criteria import corrected_rollout
 from mosa.modules.heterogeneity import HeterogeneityField
 from mosa.modules.material import Material
+from mosa.modules.stiffness_modes import StiffnessModes
 from mosa.physics.adaptive import StepControl
 from mosa.physics.boundary import Plane
 from mosa.physics.colliders import Collider, reach
@@ -150,6 +151,8 @@ class Body(nn.Module):
             self.register_buffer(name, value.detach().clone())
         self.density, self.settings, self.law_options = float(density), settings, law_options or {}
         self.material, self.heterogeneity, self.adapter = material, heterogeneity, adapter
+        if isinstance(heterogeneity, StiffnessModes):
+            heterogeneity.settle(self.rest)
         # the calibrated backbones that every later figure is compared with; filled when their stage ends
         self.contact = ContactOffset(settings.dx, settings.contact_offset)
         backbone = nn.ModuleDict({"material": material, "contact": self.contact})
@@ -158,6 +161,10 @@ class Body(nn.Module):
             for variant in self.frozen.values():
                 variant["heterogeneity"] = copy.deepcopy(heterogeneity)
         self.frozen.requires_grad_(False)
+
+    def __getstate__(self) -> dict:
+        """Without the simulator, whose buffers are no part of a body: a copy makes its own."""
+        return {k: v for k, v in self.__dict__.items() if not k.startswith("_simulator")}
 
     @property
     def center(self) -> Tensor:

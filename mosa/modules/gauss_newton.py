@@ -70,6 +70,14 @@ class Posterior:
     covariance: Tensor
     determined: Tensor
 
+    def written(self) -> dict:
+        """Plain containers, fit for a checkpoint; `read` gives the same numbers."""
+        return {"names": list(self.names), "mean": self.mean, "covariance": self.covariance, "determined": self.determined}
+
+    @classmethod
+    def read(cls, written: dict) -> Posterior:
+        return cls(list(written["names"]), *(written[name].double() for name in ("mean", "covariance", "determined")))
+
     def draws(self, count: int, generator: torch.Generator) -> Tensor:
         """(count, D) float64."""
         L = torch.linalg.cholesky(self.covariance)

@@ -107,12 +107,14 @@ class Identification:
     """One stage's. takes: with start, cues, frame_dt; kinds: which of position, rotation, stretch are compared.
 
     The stage `prior` learns the backbone alone from positions in free rollouts, `prior_eta` also the stiffness modes, `joint` the
-    adapter too; both under the criterion. progress: called after every column of a Jacobian.
+    adapter too; both under the criterion. progress: called after every column of a Jacobian. seats: rollouts side by side; None: as
+    many as the machine has room for.
     """
 
     def __init__(
         self, body: Body, takes: Sequence, world: World, stage: Stage, criterion: Criterion, settings: IdentificationSettings,
         kinds: tuple[bool, bool, bool] = (True, True, True), progress: Callable[[], None] | None = None,
+        seats: int | None = None,
     ) -> None:  # fmt: skip
         self.body, self.takes, self.world, self.settings = body, list(takes), world, settings
         self.calibrating = stage.name == "prior"
@@ -126,12 +128,14 @@ class Identification:
         self.chosen = residuals.sampled(len(body.rest), body.rest.device)
         blocks = blocks_of(body, adapter=self.adapter, heterogeneity=self.heterogeneity, settings=settings,
                            calibrating=self.calibrating)
-        bodies = [body] + [copy.deepcopy(body) for _ in range(self._threads(sum(b.size for b in blocks)) - 1)]
+        seats = self.threads(sum(b.size for b in blocks)) if seats is None else seats
+        bodies = [body][:seats] + [copy.deepcopy(body) for _ in range(seats - 1)]
         self.iteration, self.noise, self.substeps = 0, None, None
         self.newton = GaussNewton(blocks, [self._seat(each) for each in bodies], progress=progress)
         self.converged = False
 
-    def _threads(self, numbers: int) -> int:
+    def threads(self, numbers: int) -> int:
+        """Rollouts side by side, of as many numbers."""
         if self.body.rest.is_cuda:
             return 1
         affinity = getattr(os, "sched_getaffinity", None)  # not on every system

@@ -14,6 +14,9 @@ from mosa.data.datamodule import Observations
 from mosa.errors import ConfigError, MosaError, SimulationDiverged
 from mosa.modules.adapter import pool
 from mosa.modules.body import Body, Start, World
+from mosa.modules.criteria import Criterion
+from mosa.modules.gauss_newton import Posterior
+from mosa.modules.identification import Identification, IdentificationSettings
 from mosa.modules.material import material_states
 from mosa.modules.observer import deformed_covariances, observe
 from mosa.modules.restorable import Restorable
@@ -55,6 +58,8 @@ class LitMosa(Restorable, L.LightningModule):
         weights: Mapping[str, float],
         clip: float = 1.0,
         config: dict | None = None,
+        criterion: Criterion | None = None,
+        settings: IdentificationSettings | None = None,
     ) -> None:
         super().__init__()
         unknown = sorted(set(weights) - set(TERMS))
@@ -67,6 +72,12 @@ class LitMosa(Restorable, L.LightningModule):
         self.stage_index, self.losses, self.steps_done = 0, [], 0
         self.misfit = MISFIT  # of the model the joint stage starts from, measured when it begins
         self.last: dict[str, float] = {}
+        self.criterion, self.settings = criterion or Criterion("free"), settings or IdentificationSettings()
+        self.identification: Identification | None = None  # of the running stage, where it is Gauss-Newton's
+        self.saved_identification: dict | None = None  # its state in the checkpoint that the fit goes on from
+        self.posterior: Posterior | None = None
+        self.column = lambda: None
+        """Called after each column of a Jacobian: these are what takes long."""
 
     # ---------------------------------------------------------------- state
     @property
@@ -77,7 +88,9 @@ class LitMosa(Restorable, L.LightningModule):
     def on_save_checkpoint(self, checkpoint: dict) -> None:
         checkpoint["mosa"] = {"config": self.config, "stage": self.stage_index, "losses": list(self.losses),
                               "steps_done": self.steps_done, "particles": len(self.body.rest), "misfit": self.misfit,
-                              "start": self.takes[0].start.written()}
+                              "start": self.takes[0].start.written(),
+                              "identification": self.identification.state() if self.identification else None,
+                              "posterior": self.posterior.written() if self.posterior else None}
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
         if "mosa" not in checkpoint:
@@ -88,6 +101,8 @@ class LitMosa(Restorable, L.LightningModule):
                               "checkpoint belongs to another scene, reconstruction or simulation.particles")
         self.stage_index, self.losses, self.steps_done = saved["stage"], list(saved["losses"]), saved["steps_done"]
         self.misfit = saved.get("misfit", MISFIT)
+        self.saved_identification = saved.get("identification")
+        self.posterior = Posterior.read(saved["posterior"]) if saved.get("posterior") else None
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
         return [torch.optim.Adam(self.groups(stage), betas=(0.9, 0.95)) for stage in self.stages]
@@ -112,6 +127,9 @@ class LitMosa(Restorable, L.LightningModule):
         iteration = len(self.losses)
         if iteration == 0:
             self.begin(stage)
+        if stage.newton:
+            self.newton_step(stage, iteration)
+            return
         optimizer = self.optimizers()
         optimizer = optimizer[self.stage_index] if isinstance(optimizer, list) else optimizer
         for group in optimizer.param_groups:
@@ -136,13 +154,64 @@ class LitMosa(Restorable, L.LightningModule):
         if stage.ended(self.losses):
             self.finish(stage)
 
+    def newton_step(self, stage: Stage, iteration: int) -> None:
+        """One iteration of Gauss-Newton: of all numbers on all takes, without images."""
+        failure, found = None, {}
+        try:
+            if self.identification is None:
+                kinds = tuple(self.weights.get(name, 0.0) != 0 for name in ("position", "rotation", "stretch"))
+                self.identification = Identification(self.body, self.takes, self.world, stage, self.criterion, self.settings, kinds,
+                                                     progress=lambda: self.column())
+                if iteration > 0 and self.saved_identification is not None:
+                    self.identification.restore(self.saved_identification)
+                elif stage.name == "prior":
+                    self.identification.search()
+            found = self.identification.iterate()
+        except MosaError as error:
+            failure = error
+        parallel.agree(failure)
+        parallel.synchronise(self.body)  # ranks do the same work, and on a GPU come to slightly different numbers
+        self.losses.append(found["after"])
+        self.steps_done += 1
+        self.report_newton(found)
+        if self.identification.converged or stage.ended(self.losses):
+            if stage.name == "joint":
+                self.posterior = self.identification.posterior()
+            self.finish(stage)
+
+    def rollouts(self, stage: Stage) -> float:
+        """About how many rollouts, one after another, a stage of Gauss-Newton takes at most."""
+        planned = Identification(self.body, self.takes, self.world, stage, self.criterion, self.settings, seats=0)
+        columns = sum(b.size for b in planned.newton.blocks)
+        each = columns / planned.threads(columns) + 5  # the residuals, the noise, one or two steps that are tried, the distance
+        return len(planned.pairs) * (stage.iterations * each + (24 if planned.calibrating else 0))
+
+    def report_newton(self, found: dict[str, float]) -> None:
+        """Scalars of one iteration: cost, step, what the evidence found, parameters."""
+        values = {"loss/total": found["after"], "fit/stage": float(self.stage_index), "newton/share": found["share"],
+                  "newton/length": found["length"]}
+        values |= {f"newton/{name}": value for name, value in found.items() if name.startswith("sd/")}
+        values["fit/distance_m"] = self.identification.distance()
+        self.log_values(values)
+
     def descend(self, stage: Stage, iteration: int, take: Take, views: list[int], weight: float) -> dict[str, Tensor]:
         """Add the gradient of one take's loss, times `weight`; the loss, its terms and what else is logged, not weighted.
 
         One graph at a time: memory is that of one sequence.
         """
         frames = self.active_frames(stage, iteration, take)
-        terms, rollout = self.terms(stage, views, frames, take)
+        gains = (0.0,) if stage.name == "prior" else self.criterion.gains
+        figures: dict[str, Tensor] = {}
+        for gain in gains:
+            for name, value in self._descend(stage, iteration, take, views, weight / len(gains), frames, gain).items():
+                figures[name] = figures.get(name, 0.0) + value / len(gains)
+        return figures
+
+    def _descend(
+        self, stage: Stage, iteration: int, take: Take, views: list[int], weight: float, frames: int, gain: float
+    ) -> dict[str, Tensor]:
+        """`descend` for one of the criterion's rollouts."""
+        terms, rollout = self.terms(stage, views, frames, take, gain)
         loss = sum(self.weights.get(name, 0.0) * value for name, value in terms.items())
         if not torch.isfinite(loss):
             bad = [name for name, value in terms.items() if not torch.isfinite(value)]
@@ -160,16 +229,18 @@ class LitMosa(Restorable, L.LightningModule):
         return stage.active_frames(iteration, min(take.first_contact + 3, length), length)
 
     def terms(
-        self, stage: Stage, views: list[int], frames: int, take: Take | None = None
+        self, stage: Stage, views: list[int], frames: int, take: Take | None = None, gain: float = 0.0
     ) -> tuple[dict[str, Tensor], Rollout]:
-        """Every loss term that has a weight (raw), and the rollout of `take` (the first where None) they were computed on."""
+        """Every loss term that has a weight (raw), and the rollout of `take` (the first where None) they were computed on.
+
+        gain: of the criterion's rollout, 0 for a free one."""
         take = self.takes[0] if take is None else take
         body, weights, cues = self.body, self.weights, take.cues
         adapted = stage.name == "joint" and body.adapter is not None
         collected: list = []
         rollout = body.simulate(
             take.start, self.world, frames, take.frame_dt, with_adapter=adapted, with_heterogeneity=stage.name != "prior",
-            collect=collected.append if adapted else None,
+            collect=collected.append if adapted else None, observed=cues.positions if gain else None, gain=gain,
         )
         def on(name: str) -> bool:
             return weights.get(name, 0.0) != 0
@@ -247,7 +318,7 @@ class LitMosa(Restorable, L.LightningModule):
             self.body.freeze("prior_eta")
         if stage.name != "joint":
             self.body.freeze(stage.name)
-        self.stage_index, self.losses = self.stage_index + 1, []
+        self.stage_index, self.losses, self.identification = self.stage_index + 1, [], None
         if self.stage is None:
             self.trainer.should_stop = True
 
@@ -265,11 +336,15 @@ class LitMosa(Restorable, L.LightningModule):
         for name, value in terms.items():
             values[f"loss_raw/{name}"] = value
             values[f"loss_weighted/{name}"] = self.weights[name] * value
+        for name, value in norms.items():
+            values[f"gradient_norm/{name}"] = value
+        self.log_values(values)
+
+    def log_values(self, values: dict[str, Tensor | float]) -> None:
+        """These scalars and the parameters, into the logs and `last`."""
         for name, value in self.body.material.physical().items():
             values[f"id/{name}"] = value.detach()
         values["id/contact_offset"] = self.body.contact().detach()
-        for name, value in norms.items():
-            values[f"gradient_norm/{name}"] = value
         self.log_dict({k: torch.as_tensor(v, dtype=torch.float32) for k, v in values.items()}, on_step=True, on_epoch=False)
         self.last |= {k: float(v) for k, v in values.items()}
 
