@@ -37,12 +37,13 @@ ROUNDED = 8
 
 @dataclass(frozen=True)
 class IdentificationSettings:
-    """count: independent data in a frame; operator_sd, stiffness_sd: prior standard deviations of the operator's numbers and of the
+    """count: independent data in a frame; model_error: of grid and contact, in cells; operator_sd, stiffness_sd: prior standard deviations of the operator's numbers and of the
     stiffness modes before the evidence finds their factor; smoothness: power with which that of the modes falls with their wave
     number; evidence: whether it is found; tolerance: of the last step, in posterior standard deviations; threads: rollouts side by
     side on a CPU, 0 for one a core. Errors: ConfigError naming the key."""
 
     count: float = 30.0
+    model_error: float = 0.1
     operator_sd: float = 0.1
     stiffness_sd: float = 0.3
     smoothness: float = 1.0
@@ -55,6 +56,8 @@ class IdentificationSettings:
             value = getattr(self, name)
             if isinstance(value, bool) or not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0):
                 raise ConfigError(f"identification.{name}: expected a positive number, found {value!r}")
+        if isinstance(self.model_error, bool) or not (isinstance(self.model_error, (int, float)) and 0 <= self.model_error <= 1):
+            raise ConfigError(f"identification.model_error: expected a number from 0 to 1, found {self.model_error!r}")
         if isinstance(self.threads, bool) or not (isinstance(self.threads, int) and self.threads >= 0):
             raise ConfigError(f"identification.threads: expected a whole number of at least 0, found {self.threads!r}")
 
@@ -220,7 +223,8 @@ class Identification:
             self.substeps.append(-(-int(1.05 * self.body.last_substeps) // ROUNDED) * ROUNDED)
         if self.iteration < NOISE_ITERATIONS or self.noise is None:
             with torch.no_grad():
-                self.noise = residuals.spread(self._fields(self.body))
+                least = residuals.floors(self.body.settings.dx, 0.0 if self.calibrating else self.settings.model_error)
+                self.noise = residuals.spread(self._fields(self.body), least)
         report = self.newton.iterate(learn=self.iteration >= 1)
         self.iteration += 1
         small = self.iteration > NOISE_ITERATIONS and report["length"] * report["share"] < self.settings.tolerance

@@ -15,8 +15,10 @@ from torch import Tensor
 from mosa.physics.factorisation import singular_value_decomposition
 from mosa.types import MotionCues, Rollout
 
-FLOORS = (1e-3, 0.02, 0.01)
-"""Errors of the cues per component: positions [m], rotations [rad], singular values (docs/cues.md)."""
+CUE_ERRORS = (1e-3, 0.02, 0.01)
+"""Per component: positions [m], rotations [rad], singular values (docs/cues.md)."""
+MODEL_ERRORS = (1.0, 0.3, 0.15)
+"""Rotations and singular values that a grid gets wrong where it gets positions wrong by a cell."""
 SAMPLES = 2000
 """Particles compared at most: far more than a frame has independent data."""
 
@@ -52,10 +54,17 @@ def fields(rollout: Rollout, cues: MotionCues, start_rotation: Tensor, chosen: T
                   (S - cues.stretch[1:frames, chosen]) * weight)
 
 
-def spread(found: list[Fields]) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """Root mean square (T - 1,) over particles of each frame's vectors, floored: the noise of the three kinds."""
+def floors(dx: float, cells: float) -> tuple[float, float, float]:
+    """Noise per component that no frame gets below: that of the cues, and what a simulation on a grid of dx [m] gets wrong whatever
+    its law is, `cells` of it in positions."""
+    return tuple((cue**2 + (model * cells * (dx if i == 0 else 1.0)) ** 2) ** 0.5
+                 for i, (cue, model) in enumerate(zip(CUE_ERRORS, MODEL_ERRORS)))
+
+
+def spread(found: list[Fields], least: tuple[float, float, float]) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """Root mean square (T - 1,) over particles of each frame's vectors: the noise of the three kinds, at least as `floors` says."""
     return [
-        tuple(field.square().sum(-1).mean(-1).sqrt().clamp(min=floor * 3**0.5) for field, floor in zip(each, FLOORS))
+        tuple(field.square().sum(-1).mean(-1).sqrt().clamp(min=floor * 3**0.5) for field, floor in zip(each, least))
         for each in found
     ]
 
