@@ -153,6 +153,31 @@ def checked(checkpoint: Mapping[str, Any], path: str | Path) -> tuple[dict, dict
     return config, saved["start"], tensors
 
 
+def checked_posterior(checkpoint: Mapping[str, Any], numbers: int, path: str | Path) -> dict | None:
+    """What `Posterior.read` takes, of a body with so many learned numbers; None where the run kept none. Errors: DataError."""
+    found = checkpoint["mosa"].get("posterior")
+    if found is None:
+        return None
+    where = f"ckpt_path: {path}: mosa.posterior"
+    shapes = {"mean": (numbers,), "covariance": (numbers, numbers), "determined": (numbers,)}
+    try:
+        parts(found, ("names", "model_error", *shapes), "mosa.posterior")
+    except ConfigError as error:
+        raise DataError(f"ckpt_path: {path}: {error}") from error
+    for name, shape in shapes.items():
+        value = found[name]
+        if not isinstance(value, Tensor) or tuple(value.shape) != shape or not bool(torch.isfinite(value).all()):
+            raise DataError(f"{where}.{name}: expected {' x '.join(map(str, shape))} finite numbers")
+    names = found["names"]
+    if not isinstance(names, list) or len(names) != numbers or not all(isinstance(n, str) for n in names):
+        raise DataError(f"{where}.names: expected {numbers} names")
+    if not is_number(found["model_error"]) or found["model_error"] < 0:
+        raise DataError(f"{where}.model_error: expected a distance in m, found {found['model_error']!r}")
+    if not float(torch.linalg.eigvalsh(found["covariance"].double()).min()) > 0:
+        raise DataError(f"{where}.covariance: expected a positive definite matrix")
+    return found
+
+
 def parts(found: Any, wanted: Iterable[str], where: str) -> None:
     """Errors: ConfigError naming the parts that are missing."""
     if not isinstance(found, Mapping):

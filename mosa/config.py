@@ -110,7 +110,7 @@ def build_prior(config: Mapping[str, Any]) -> tuple[Material, dict[str, Any]]:
     options = keys.pop("options", None) or {}
     if unknown := [name for name in options if name not in LAW_OPTIONS]:
         raise ConfigError(f"prior.options.{unknown[0]}: unknown key; expected one of {', '.join(LAW_OPTIONS)}")
-    keys["frozen"] = keys.get("frozen") or ()
+    keys["frozen"], keys["candidates"] = keys.get("frozen") or (), keys.get("candidates") or ()
     return known_keys("prior", Material, keys), options
 
 
@@ -142,7 +142,7 @@ def rehearse(cfg: Mapping[str, Any]) -> None:
             warnings.simplefilter("ignore")
             adapter = fitting(build_adapter(cfg["adapter"]), material.law)
     build_simulation(cfg["simulation"], 1.0)
-    build_stages(cfg["fit"], heterogeneity, adapter)
+    build_stages(cfg["fit"], heterogeneity, adapter, bool(material.candidates))
     build_criterion(cfg)
     build_identification(cfg)
     build_walls(cfg["world"]["walls"], torch.stack([low, high]))
@@ -189,13 +189,17 @@ def build_identification(cfg: Mapping[str, Any]) -> IdentificationSettings:
 
 
 def build_stages(
-    fit: Mapping[str, Any], heterogeneity: torch.nn.Module | None, adapter: torch.nn.Module | None
+    fit: Mapping[str, Any], heterogeneity: torch.nn.Module | None, adapter: torch.nn.Module | None, searching: bool = False
 ) -> list[Stage]:
-    """The stages of a run, without those that have nothing to optimise or no iterations, each with the optimiser that it runs."""
+    """The stages of a run, without those that have nothing to optimise or no iterations, each with the optimiser that it runs.
+
+    searching: whether the calibration chooses the law too."""
     stages = [known_keys(f"fit.{name}", Stage, fit[name], name) for name in ("prior", "prior_eta", "joint")]
     parts = {"prior": (), "prior_eta": (heterogeneity,), "joint": (heterogeneity, adapter)}
     wanted = {"prior": True, "prior_eta": heterogeneity is not None, "joint": adapter is not None or heterogeneity is not None}
     stages = [s.resolved(all(map(few_numbers, parts[s.name]))) for s in stages if wanted[s.name] and s.iterations > 0]
+    if searching and stages and not stages[0].newton:
+        raise ConfigError("prior=auto: expected fit.prior.optimizer auto or gauss_newton, whose search compares the candidates; found adam")
     if not stages or stages[0].name != "prior":
         raise ConfigError("fit.prior.iterations: expected at least 1: every later figure is compared with the calibrated prior")
     return stages

@@ -19,19 +19,31 @@ from omegaconf import DictConfig, OmegaConf
 
 from mosa import __version__, parallel
 from mosa.analysis.figures import side_by_side, write_strip, write_video
-from mosa.analysis.tables import parameter_table, results_table
+from mosa.analysis.tables import determined_text, parameter_table, results_table
 from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLast, Pace, StageNotes
 from mosa.config import build_body, build_fit, build_world, plain, rehearse, run_config, world_config
 from mosa.data.agreement import seen_at
 from mosa.data.datamodule import MultiViewDataModule, training_observations
 from mosa.data.sequences import load_sequences, taught_names
 from mosa.errors import ConfigError, DataError, MosaError
-from mosa.evaluation import Sequence, evaluate, floor_figures, identification, law_figures, render, true_motion
+from mosa.evaluation import (
+    Sequence,
+    evaluate,
+    floor_figures,
+    hidden_figures,
+    identification,
+    law_figures,
+    render,
+    test_means,
+    true_motion,
+)
 from mosa.loggers import build_loggers, chosen, log_outcome
 from mosa.modules.body import Body, Start, World
+from mosa.modules.gauss_newton import Posterior
 from mosa.modules.lit_mosa import LitMosa, Take
 from mosa.physics.collider_overlap import check_clear
 from mosa.physics.colliders import colliders_from_config
+from mosa.prediction import determined, predicted_spread
 from mosa.physics.memory import KEPT_ON_CPU
 from mosa.progress import tqdm
 from mosa.reconstruction.starts import first_contact, sequence_start, splats_of
@@ -49,7 +61,7 @@ from mosa.run import (
     write_figures,
 )  # fmt: skip
 from mosa.schema import EVALUATION, SIMULATION, TRAINING, check
-from mosa.twin import Twin, save_observed, save_rollout, save_truth
+from mosa.twin import Twin, save_observed, save_rollout, save_spread, save_truth
 from mosa.types import MotionCues, Reconstruction, Scene
 
 log = logging.getLogger(__name__)
@@ -177,16 +189,27 @@ def train(cfg: DictConfig) -> float | None:
     learned_from = [prefix for prefix in found if prefix.startswith("train")]
     save_observed(folder / "observed.npz", {prefix: take.cues for prefix, take in zip(learned_from, module.takes)})
     with clock.measure("evaluation"):
-        figures, kept = evaluate(body, sequences(body, scene, held_out, found), world,
-                                 samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
+        evaluated = sequences(body, scene, held_out, found)
+        figures, kept = evaluate(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
     figures |= identification(body, scene) | law_figures(body) | start_figures(found["train"])
+    figures |= hidden_figures(body, scene, figures) | posterior_figures(body, module.posterior, evaluated, world, folder)
+    figures |= {f"id_prior/compared/{law}_m": distance for law, distance in module.compared.items()}
     if cfg.evaluation.floor:
-        figures |= floor_figures(body, sequences(body, scene, held_out, found), world,
-                                 samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
+        figures |= floor_figures(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
     figures |= clock.figures | cost(device) | {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
     log_outcome(plain(cfg.logger), folder, plain(cfg), figures)
-    write_outputs(folder, cfg, body, sequences(body, scene, held_out, found), figures, kept)
+    write_outputs(folder, cfg, body, evaluated, figures, kept)
     return optimized(figures, cfg.optimized_metric)
+
+
+def posterior_figures(body: Body, posterior: Posterior | None, evaluated: list[Sequence], world: World, folder: Path) -> dict:
+    """What the data determined and how sure predictions are; uncertainty.npz with the latter. Nothing where there is no posterior."""
+    if posterior is None:
+        return {}
+    figures, spreads = predicted_spread(body, posterior, evaluated, world)
+    if spreads:
+        save_spread(folder / "uncertainty.npz", spreads)
+    return figures | test_means(figures) | determined(body, posterior)
 
 
 def body_of(reconstruction: Reconstruction, config: dict) -> Body:
@@ -307,7 +330,7 @@ def write_outputs(folder: Path, cfg: DictConfig, body: Body, evaluated: list[Seq
         write_video(folder / "video.mp4", side_by_side(columns, enlarge), fps=6)
         rows = {f"{prefix}: {title}": images for prefix, each in pictures.items() for title, images in each.items()}
         write_strip(folder / "strip.png", rows, enlarge=max(1, enlarge - 1))
-    table = results_table(figures) + "\n\n" + parameter_table(figures)
+    table = "\n\n".join(filter(None, (results_table(figures), parameter_table(figures), determined_text(figures))))
     (folder / "results.md").write_text(table + "\n")
     write_figures(folder, figures)  # the last file: the run is complete
     log.info("\n%s\n\nrun folder: %s", table, folder)
@@ -362,6 +385,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     evaluated = sequences(body, scene, held_out, found)
     figures, kept = evaluate(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
     figures |= identification(body, scene) | law_figures(body)
+    figures |= hidden_figures(body, scene, figures) | posterior_figures(body, twin.posterior, evaluated, world, folder)
     if cfg.evaluation.floor:
         figures |= floor_figures(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
     write_outputs(folder, cfg, body, evaluated, figures, kept)

@@ -10,7 +10,7 @@ import copy
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -102,8 +102,45 @@ def write_numbers(body: Body, numbers: Tensor) -> None:
     Seat(tensors, lambda: numbers).write(numbers)
 
 
+def read_numbers(body: Body) -> Tensor:
+    """What `write_numbers` sets, (D,)."""
+    return Seat(tensors_of(body, adapter=_learned(body.adapter), heterogeneity=_learned(body.heterogeneity)), torch.empty).read()
+
+
 def _learned(module) -> bool:
     return module is not None and few_numbers(module)
+
+
+TRIED = 4
+"""Iterations after which candidates for the backbone are compared: from the best start of the grid they hardly move later."""
+
+
+def choose_law(body: Body, candidates: Sequence[str], build: Callable[[], Identification]) -> dict[str, float]:
+    """Calibrate every candidate and leave `body` at the one with the smallest mean distance from the cues, which is returned for
+    each [m], infinite where a law cannot be simulated. build: a calibration of `body`. Errors: SimulationDiverged where none can.
+    """
+    found: dict[str, float] = {}
+    best: tuple[float, dict, str] | None = None
+    for law in candidates:
+        body.material.law = law
+        calibration = build()
+        try:
+            calibration.search()
+            for _ in range(TRIED):
+                calibration.iterate()
+            found[law] = calibration.distance()
+        except SimulationDiverged:
+            found[law] = math.inf
+            continue
+        if best is None or found[law] < best[0]:
+            best = (found[law], {part: copy.deepcopy(getattr(body, part).state_dict()) for part in ("material", "contact")}, law)
+    if best is None:
+        raise SimulationDiverged(f"prior=auto: none of {', '.join(candidates)} can be calibrated; set prior.parameters nearer to the body's")
+    for part, state in best[1].items():
+        getattr(body, part).load_state_dict(state)
+    for material in (body.material, *(variant["material"] for variant in body.frozen.values())):
+        material.choose(best[2])
+    return found
 
 
 class Identification:
@@ -245,5 +282,10 @@ class Identification:
         self.noise = None if state["noise"] is None else [tuple(t.to(device) for t in each) for each in state["noise"]]
 
     def posterior(self) -> Posterior:
-        """Laplace's approximation at what was found."""
-        return self.newton.posterior()
+        """Laplace's approximation at what was found, with the root mean square distance of free rollouts from the cues after first
+        contact as the model's error."""
+        found = []
+        for i, take in enumerate(self.takes):
+            away = self.rollout(self.body, i).x - take.cues.positions
+            found.append(float(away[take.first_contact :].square().sum(-1).mean()))
+        return replace(self.newton.posterior(), model_error=(sum(found) / len(found)) ** 0.5)
