@@ -25,7 +25,7 @@ KINDS = (0, 0, 3, 2, 1, 0)
 
 
 def launch(F, parameters, G, strain, seed=None):
-    """tau (N, 3, 3) of the stress kernel, or the gradients of sum(seed tau) in F, parameters and G. strain: None for an operator."""
+    """tau (N, 3, 3) of the stress kernel, or gradients of sum(seed tau) in F, parameters and G. strain: None for an operator."""
     law, kinds = law_named(LAW), field_types(wp.float64)
     kernel = stress_kernel(law.stress, law.uses_rotation, wp.float64, True, strain, law.offsets["mu"])
     tensors = [F, torch.zeros_like(F), parameters, G, F.new_zeros(len(F), 6), torch.empty_like(F)]
@@ -249,11 +249,11 @@ def simulator(law, **options):
 def test_unknown_measures_and_laws_without_a_shear_modulus_are_refused():
     with pytest.raises(ConfigError, match="strain: expected one of hencky, biot, green or None, found 'almansi'"):
         simulator(LAW, strain="almansi")
-    with pytest.raises(ConfigError, match="adapter.strain: expected one of hencky, biot, green, found 'almansi'"):
+    with pytest.raises(ConfigError, match=r"adapter\.strain: expected one of hencky, biot, green, found 'almansi'"):
         HyperelasticAdapter(strain="almansi")
     with pytest.raises(ConfigError, match="shear modulus mu, found 'newtonian'"):  # whose mu is a viscosity
         simulator("newtonian", strain="green")
-    with pytest.raises(ConfigError, match="shear modulus mu, found 'corotated.newtonian'"):
+    with pytest.raises(ConfigError, match=r"shear modulus mu, found .corotated\+newtonian."):
         simulator("corotated+newtonian", strain="green")
     register_law("without shear", law_named(LAW).stress, ("kappa", "lam"))
     with pytest.raises(ConfigError, match="shear modulus mu, found 'without shear'"):
