@@ -80,29 +80,37 @@ class HyperelasticAdapter(Adapter):
     def _poisson(self) -> Tensor:
         return self.poisson if self._live is None else self._live.to(self.numbers.device)
 
+    def _exponential(self) -> Tensor:
+        """exp(A) (6, 6) float64."""
+        A = torch.einsum("k,kij->ij", self.numbers.double(), anisotropic_basis(torch.float64, self.numbers.device))
+        return torch.linalg.matrix_exp(A)
+
     def stiffness(self) -> Tensor:
         """C0 + S (6, 6) float64 in Mandel scaling and units of 2 mu, with its graph; positive definite."""
         root = root_stiffness(self._poisson().double())
-        A = torch.einsum("k,kij->ij", self.numbers.double(), anisotropic_basis(torch.float64, self.numbers.device))
-        return root @ torch.linalg.matrix_exp(A) @ root
+        return root @ self._exponential() @ root
 
-    def correction(self) -> Tensor:
-        """S (6, 6) float64, see `stiffness`."""
-        return self.stiffness() - isotropic_stiffness(self._poisson().double())
+    def correction(self, poisson: Tensor | None = None) -> Tensor:
+        """S (6, 6) float64, see `stiffness`; exactly 0 where the numbers are. poisson: of C0, () float64, None for the prior's now."""
+        root = root_stiffness(self._poisson().double() if poisson is None else poisson)
+        change = self._exponential() - torch.eye(6, dtype=torch.float64, device=root.device)
+        return root @ change @ root
 
     @torch.no_grad()
     def stiffening(self, poisson: Tensor | float) -> float:
         """Largest acoustic modulus of C0 + S over the prior's, `ADAPTER_MARGIN` at least."""
         if not self.is_on:
             return ADAPTER_MARGIN
-        relative = self.relative().cpu()
-        return max(ADAPTER_MARGIN, acoustic_stiffening(relative, self._poisson().double().cpu()))
+        # the prior's number that is asked for, not the one of the last rollout, which may have been another variant's
+        poisson = torch.as_tensor(poisson).detach().to(self.numbers.device, torch.float64)
+        return max(ADAPTER_MARGIN, acoustic_stiffening(self.relative(poisson).cpu(), poisson.cpu()))
 
-    def relative(self) -> Tensor:
-        """(6, 6) float64 S C0^-1 on vech components: what is added to the prior's stress at small strain."""
-        C0 = isotropic_stiffness(self._poisson().double())
+    def relative(self, poisson: Tensor | None = None) -> Tensor:
+        """(6, 6) float64 S C0^-1 on vech components: what is added to the prior's stress at small strain. poisson: as `correction`."""
+        poisson = self._poisson().double() if poisson is None else poisson
+        C0 = isotropic_stiffness(poisson)
         scale = torch.tensor([1.0, 1, 1, 2**0.5, 2**0.5, 2**0.5], dtype=torch.float64, device=C0.device)
-        return (self.correction() @ torch.linalg.inv(C0)) * scale / scale[:, None]
+        return (self.correction(poisson) @ torch.linalg.inv(C0)) * scale / scale[:, None]
 
     def forward(self, state: MaterialState) -> AdapterOperator:
         """G: S for every particle, (N, 6, 6) in Mandel scaling and units of 2 mu; h: zeros. Errors: ConfigError before `switch_on`."""

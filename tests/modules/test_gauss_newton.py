@@ -1,0 +1,236 @@
+"""Gauss-Newton against linear algebra: the regularised solution in one step, bounds, evidence, seats, failures, draws."""
+
+import math
+import threading
+from dataclasses import fields
+
+import pytest
+import torch
+
+from mosa.errors import ConfigError, SimulationDiverged
+from mosa.modules.gauss_newton import Block, GaussNewton, Posterior, Seat
+
+
+def drawn(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def linear(blocks, A, b, seats=1, start=None, watch=None):
+    """A problem with residuals A x - b. watch: called with every x that is asked for."""
+
+    def seat():
+        tensors = [torch.zeros(block.size, dtype=torch.float64) for block in blocks]
+
+        def residuals():
+            x = torch.cat(tensors)
+            if watch is not None:
+                watch(x)
+            return A @ x - b
+
+        return Seat(tensors, residuals)
+
+    newton = GaussNewton(blocks, [seat() for _ in range(seats)])
+    newton.seats[0].write(newton.mean() if start is None else start)
+    return newton
+
+
+def two_blocks(**options):
+    return [Block("a", drawn(3, seed=1), 0.5 + drawn(3, seed=2).abs(), 0.02, **options),
+            Block("b", torch.tensor([0.3]), torch.tensor([2.0]), 0.1)]  # fmt: skip
+
+
+def test_one_iteration_solves_a_linear_problem_and_knows_its_covariance():
+    """The textbook: x = (A^T A + P)^-1 (A^T b + P m), covariance (A^T A + P)^-1; fewer data than unknowns are no trouble."""
+    for rows in (40, 2):
+        A, b, blocks = drawn(rows, 4, seed=3), drawn(rows, seed=4), two_blocks()
+        newton = linear(blocks, A, b, start=drawn(4, seed=5))
+        report = newton.iterate(learn=False)
+        mean = torch.cat([block.mean for block in blocks])
+        P = torch.diag(1 / torch.cat([block.sd for block in blocks]).square())
+        expected = torch.linalg.solve(A.T @ A + P, A.T @ b + P @ mean)
+        posterior = newton.posterior()
+        assert report["share"] == 1.0 and report["after"] < report["before"]
+        # one-sided differences of a linear function are wrong by its rounding over the step, 1e-15/0.02, times the condition
+        assert torch.allclose(newton.seats[0].read(), expected, rtol=0, atol=1e-11)
+        assert torch.equal(posterior.mean, newton.seats[0].read()) and posterior.names == ["a[0]", "a[1]", "a[2]", "b"]
+        covariance = torch.linalg.inv(A.T @ A + P)
+        assert torch.allclose(posterior.covariance, covariance, rtol=0, atol=1e-11)
+        assert torch.allclose(posterior.determined, 1 - covariance.diagonal() * P.diagonal(), rtol=0, atol=1e-11)
+        r = A @ expected - b
+        cost = 0.5 * (r @ r + (expected - mean) @ P @ (expected - mean))
+        assert report["after"] == pytest.approx(float(cost), rel=1e-12)
+        again = newton.iterate(learn=False)
+        assert again["length"] < 1e-9 and again["after"] <= report["after"] * (1 + 1e-14)
+
+
+def test_what_the_data_do_not_see_stays_where_the_prior_has_it():
+    A = drawn(30, 4, seed=3)
+    A[:, 2] = 0
+    newton = linear(two_blocks(), A, drawn(30, seed=4), start=drawn(4, seed=5))
+    newton.iterate(learn=False)
+    posterior = newton.posterior()
+    assert float(posterior.mean[2] - newton.mean()[2]) == pytest.approx(0, abs=1e-12)
+    assert float(posterior.determined[2]) == pytest.approx(0, abs=1e-12) and float(posterior.determined[0]) > 0.9
+    assert float(posterior.covariance[2, 2]) == pytest.approx(float(newton.blocks[0].sd[2]) ** 2, rel=1e-12)
+
+
+def test_a_curved_problem_ends_at_its_minimum():
+    """a exp(-k t) and priors: the gradient of the cost, by central differences of a formula of its own, vanishes there."""
+    t = torch.linspace(0, 3, 40, dtype=torch.float64)
+    data = 2 * torch.exp(-1.3 * t) + 0.01 * drawn(40, seed=1)
+    blocks = [Block("a", torch.tensor([1.0]), torch.tensor([1.0]), 1e-6), Block("k", torch.tensor([0.3]), torch.tensor([0.5]), 1e-6)]
+    tensors = [torch.ones(1).double(), torch.tensor([0.3]).double()]
+    newton = GaussNewton(blocks, [Seat(tensors, lambda: (tensors[0] * torch.exp(-tensors[1] * t) - data) / 0.01)])
+    costs = [newton.iterate(learn=False) for _ in range(12)]
+    assert all(c["after"] <= c["before"] for c in costs) and costs[-1]["length"] < 1e-3
+
+    def cost(a, k):
+        r = (a * torch.exp(-k * t) - data) / 0.01
+        return 0.5 * float(r @ r) + 0.5 * (a - 1) ** 2 + 0.5 * ((k - float(torch.tensor(0.3))) / 0.5) ** 2
+
+    a, k = newton.seats[0].read().tolist()
+    curvature, h = newton.matrix.diagonal().sqrt().tolist(), 1e-6
+    # in units of the posterior's deviations
+    assert abs(cost(a + h, k) - cost(a - h, k)) / (2 * h) / curvature[0] < 1e-2
+    assert abs(cost(a, k + h) - cost(a, k - h)) / (2 * h) / curvature[1] < 1e-2
+    assert k == pytest.approx(1.3, abs=0.03)
+
+
+def test_bounds_hold_for_what_is_found_and_for_all_that_is_asked():
+    """Without coupling the bounded minimum is the free one, clamped; differences step inwards at the upper bound."""
+    asked = []
+    blocks = [Block("a", torch.zeros(4), 10 * torch.ones(4), 0.05, bounds=(-1.0, 0.5))]
+    b = torch.tensor([0.2, 3.0, -3.0, 0.49])
+    newton = linear(blocks, torch.eye(4).double(), b.double(), watch=lambda x: asked.append(x.clone()))
+    for _ in range(3):
+        newton.iterate(learn=False)
+    free = b.double() / (1 + 0.01)
+    assert torch.allclose(newton.seats[0].read(), free.clamp(-1.0, 0.5), rtol=0, atol=1e-12)
+    assert torch.stack(asked).max() <= 0.5 and torch.stack(asked).min() >= -1.0
+    assert len(asked) >= 3 * 6
+
+
+def test_evidence_finds_the_size_of_a_block_and_that_another_is_nothing():
+    """60 numbers of size 0.25 where the prior says 0.1, and 60 that are zero. The noise is half of what it is said to be: noise
+    alone then explains what is seen of them, and the factor ends at its lower limit. A block that is not learned stays."""
+    A = 20 * torch.linalg.qr(drawn(400, 130, seed=7)).Q
+    truth = torch.cat([0.25 * drawn(60, seed=8), torch.zeros(60).double(), drawn(10, seed=9)])
+    b = A @ truth + 0.5 * drawn(400, seed=10)
+    blocks = [Block(name, torch.zeros(n), sd * torch.ones(n), 0.02, learned=learned)
+              for name, n, sd, learned in (("sized", 60, 0.1, True), ("nothing", 60, 0.1, True), ("plain", 10, 0.1, False))]
+    newton = linear(blocks, A, b)
+    for _ in range(40):
+        report = newton.iterate()
+    size = float(truth[:60].square().mean().sqrt())
+    # found from estimates with a deviation of 0.5/20 each
+    assert report["sd/sized"] == pytest.approx(size, rel=0.03)
+    assert blocks[1].factor == blocks[1].limits[0] and report["sd/nothing"] == pytest.approx(0.003)
+    assert blocks[2].factor == 1.0 and "sd/plain" not in report
+    posterior = newton.posterior()
+    assert posterior.determined[:60].min() > 0.9 and posterior.determined[60:120].max() < 0.01
+    assert posterior.mean[60:120].abs().max() < 1e-3
+
+
+def test_evidence_stops_at_the_upper_limit():
+    blocks = [Block("a", torch.zeros(20), 0.1 * torch.ones(20), 0.02, learned=True)]
+    newton = linear(blocks, 20 * torch.eye(20).double(), 20 * 30 * torch.ones(20).double())
+    for _ in range(5):
+        newton.iterate()
+    assert blocks[0].factor == blocks[0].limits[1] == 5.0
+
+
+@pytest.mark.parametrize("seats", [2, 3, 7])
+def test_several_seats_give_the_jacobian_of_one(seats):
+    A, b, counted = drawn(50, 4, seed=3), drawn(50, seed=4), []
+    one, many = (linear(two_blocks(), A, b, count, start=drawn(4, seed=5)) for count in (1, seats))
+    many.progress = lambda: counted.append(threading.get_ident())
+    for newton in (one, many):
+        newton.iterate(learn=False)
+    assert torch.equal(one.seats[0].read(), many.seats[0].read()) and torch.equal(one.data, many.data)
+    assert len(counted) == 4
+    assert all(torch.equal(seat.read(), many.seats[1].read()) for seat in many.seats[1:])
+
+
+class Limited:
+    """Residuals 10 (x - 1) that cannot be had above `limit`, or at the numbered calls."""
+
+    def __init__(self, limit=math.inf, fails=(), error=SimulationDiverged):
+        self.limit, self.fails, self.error, self.calls = limit, fails, error, 0
+        self.x = torch.zeros(2, dtype=torch.float64)
+        self.newton = GaussNewton([Block("x", torch.zeros(2), 1e3 * torch.ones(2), 0.01)], [Seat([self.x], self.residuals)])
+
+    def residuals(self):
+        self.calls += 1
+        if self.calls in self.fails or bool((self.x > self.limit).any()):
+            raise self.error("burst")
+        return 10 * (self.x - 1)
+
+
+def test_a_step_that_cannot_be_simulated_is_shortened():
+    problem = Limited(limit=0.5)
+    report = problem.newton.iterate(learn=False)
+    assert report["share"] == 0.4 and torch.allclose(problem.x, torch.full((2,), 0.4).double(), atol=1e-5)
+    short = Limited(limit=0.05)
+    report = short.newton.iterate(learn=False)
+    assert report["share"] == 0.0 and report["after"] == report["before"] and (short.x == 0).all()
+    refused = Limited(fails=(4,), error=ConfigError)  # the time step is bounded
+    assert refused.newton.iterate(learn=False)["share"] == 0.4
+
+
+def test_a_column_that_cannot_be_simulated_ends_the_fit_and_leaves_the_numbers():
+    problem = Limited(fails=(3,))
+    with pytest.raises(SimulationDiverged, match="burst"):
+        problem.newton.iterate(learn=False)
+    assert (problem.x == 0).all()
+    mistake = Limited(fails=(4,), error=ZeroDivisionError)
+    with pytest.raises(ZeroDivisionError):  # no simulation's failure: it is not hidden in a shorter step
+        mistake.newton.iterate(learn=False)
+    several = [Limited(), Limited(limit=0.0)]
+    newton = GaussNewton(several[0].newton.blocks, [p.newton.seats[0] for p in several])
+    gate = threading.Barrier(2)
+    for problem in several:  # each takes one of the two columns
+        own = problem.residuals
+        newton.seats[several.index(problem)].residuals = lambda own=own: (threading.current_thread() is not main and gate.wait(30), own())[1]
+    main = threading.current_thread()
+    with pytest.raises(SimulationDiverged, match="burst"):
+        newton.iterate(learn=False)
+    assert all((p.x == 0).all() for p in several)
+
+
+def test_a_column_that_is_not_finite_is_named():
+    x = torch.zeros(2, dtype=torch.float64)
+    newton = GaussNewton([Block("x", torch.zeros(2), torch.ones(2), 0.01)], [Seat([x], lambda: x / (x.abs() < 0.005))])
+    with pytest.raises(SimulationDiverged, match="not finite"):
+        newton.iterate()
+    assert (x == 0).all()
+
+
+def test_no_posterior_before_an_iteration():
+    with pytest.raises(ValueError, match="expected an iteration"):
+        linear(two_blocks(), drawn(5, 4), drawn(5)).posterior()
+
+
+def test_a_posterior_survives_a_checkpoint(tmp_path):
+    newton = linear(two_blocks(), drawn(50, 4, seed=3), drawn(50, seed=4))
+    newton.iterate(learn=False)
+    posterior = newton.posterior()
+    torch.save(posterior.written(), tmp_path / "posterior.pt")
+    found = Posterior.read(torch.load(tmp_path / "posterior.pt", weights_only=True))
+    for field in fields(Posterior):
+        mine, its = getattr(posterior, field.name), getattr(found, field.name)
+        assert torch.equal(mine, its) if isinstance(mine, torch.Tensor) else mine == its
+
+
+def test_draws_have_the_moments_of_the_posterior():
+    """Of n draws a mean is off by sd/sqrt(n) and a covariance by sqrt((c_ii c_jj + c_ij^2)/n); five of either."""
+    newton = linear(two_blocks(), drawn(6, 4, seed=3), drawn(6, seed=4))
+    newton.iterate(learn=False)
+    posterior, n = newton.posterior(), 40_000
+    found = posterior.draws(n, torch.Generator().manual_seed(1))
+    C = posterior.covariance
+    assert found.shape == (n, 4)
+    assert ((found.mean(0) - posterior.mean).abs() < 5 * (C.diagonal() / n).sqrt()).all()
+    allowed = 5 * ((C.diagonal()[:, None] * C.diagonal() + C.square()) / n).sqrt()
+    assert ((torch.cov(found.T) - C).abs() < allowed).all()
+    assert (C - torch.diag(C.diagonal())).abs().max() > 0.05 * C.diagonal().min()
+    assert torch.equal(found, posterior.draws(n, torch.Generator().manual_seed(1)))
