@@ -6,13 +6,14 @@ new start instead.
 
 import os
 import sys
+from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import hydra
 from omegaconf import DictConfig
 
-from mosa.jobs import Failures, attempt
+from mosa.jobs import Failures, attempt, check_arguments
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="eval")
@@ -26,5 +27,6 @@ def main(cfg: DictConfig) -> float | None:
 
 
 if __name__ == "__main__":
+    check_arguments(sys.argv[1:], Path(__file__).parent / "conf")
     main()
     sys.exit(1 if Failures.count else 0)

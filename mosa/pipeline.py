@@ -27,6 +27,7 @@ from mosa.data.agreement import seen_at
 from mosa.data.datamodule import MultiViewDataModule, training_observations
 from mosa.errors import ConfigError, DataError, MosaError
 from mosa.evaluation import Sequence, evaluate, floor_figures, identification, law_figures, render, true_motion
+from mosa.known import check_known, conf_folder
 from mosa.modules.body import Body, Start, World
 from mosa.modules.lit_mosa import LitMosa, Take
 from mosa.physics.collider_overlap import check_clear
@@ -132,6 +133,8 @@ def sequences(body: Body, training: Scene, others: list[Scene], found: dict[str,
 def train(cfg: DictConfig) -> float | None:
     """Run everything `cfg` asks for; returns the figure a sweep optimises. Errors: MosaError of whatever was wrong."""
     quiet()
+    if (conf := conf_folder()) is not None:
+        check_known(plain(cfg), conf, "train", TRAINING, EVALUATION)
     check(plain(cfg), TRAINING, EVALUATION)
     rehearse(plain(cfg))
     L.seed_everything(cfg.seed, verbose=False)
@@ -332,6 +335,8 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     if OmegaConf.is_missing(cfg, "ckpt_path"):
         raise ConfigError("ckpt_path: expected the checkpoint of a run, found none; "
                           "python eval.py ckpt_path=<run folder>/checkpoints/last.ckpt")
+    if (conf := conf_folder()) is not None and cfg.get("simulate") is not None:
+        check_known({k: v for k, v in plain(cfg).items() if k != "scene"}, conf, "eval", EVALUATION, SIMULATION)
     check(plain(cfg), EVALUATION, SIMULATION)
     folder = run_folder()
     twin = Twin.load(cfg.ckpt_path, named_device(cfg.device))

@@ -33,7 +33,7 @@ WIDEST = 1e5
 
 
 def load_scene(
-    *, format: str, root: str | None = None, path: str | None = None, ground=None, cache=None, **keys
+    *, format: str | None = None, root: str | None = None, path: str | None = None, ground=None, cache=None, **keys
 ) -> Scene:
     """The scene that the keys of conf/scene describe, validated.
 
@@ -45,6 +45,8 @@ def load_scene(
     module, function = FORMATS[format].split(":")
     loader = getattr(importlib.import_module(module), function)
     if format == "builtin":
+        if given := [key for key, value in (("path", path), ("ground", ground)) if value is not None]:
+            raise ConfigError(f"scene.{given[0]}: not a key of built-in scenes, which have their own; scene=transforms reads one")
         return validate(call(loader, {"cache": cache, **{k: v for k, v in keys.items() if v is not None}}))
     if keys.get("fps") is not None:
         check_fps(keys["fps"])
