@@ -22,16 +22,14 @@ from mosa import parallel
 from mosa.analysis.figures import side_by_side, write_strip, write_video
 from mosa.analysis.tables import parameter_table, results_table
 from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLast
-from mosa.config import build_body, build_stages, build_world, plain, rehearse, run_config, world_config
-from mosa.data.agreement import seen_at
+from mosa.checkpoints import check_same, read_checkpoint
+from mosa.config import build_body, build_stages, build_world, plain, run_config, world_config
 from mosa.data.datamodule import MultiViewDataModule, training_observations
 from mosa.errors import ConfigError, DataError, MosaError
 from mosa.evaluation import Sequence, evaluate, floor_figures, identification, law_figures, render, true_motion
-from mosa.known import check_known, conf_folder
-from mosa.modules.body import Body, Start, World
+from mosa.guards import check_begin, check_configuration, check_evaluation, check_seen, check_starts, evaluated_scene
+from mosa.modules.body import Body, Start
 from mosa.modules.lit_mosa import LitMosa, Take
-from mosa.physics.collider_overlap import check_clear
-from mosa.physics.colliders import colliders_from_config
 from mosa.physics.memory import KEPT_ON_CPU
 from mosa.reconstruction.starts import first_contact, sequence_start, splats_of
 from mosa.rendering.cameras import crop_boxes, crop_images
@@ -48,7 +46,6 @@ from mosa.run import (
     shared_starts,
     write_figures,
 )  # fmt: skip
-from mosa.schema import EVALUATION, SIMULATION, TRAINING, check
 from mosa.twin import Twin, save_observed, save_rollout, save_truth
 from mosa.types import MotionCues, Reconstruction, Scene
 
@@ -118,13 +115,6 @@ def starts(
     return found
 
 
-def check_starts(world: World, body: Body, found: dict[str, Start]) -> None:
-    """No sequence starts inside of a solid. Errors: ConfigError naming the collider."""
-    for prefix, start in found.items():
-        x = (body.rest - body.center) @ start.rotation.to(body.rest).T + start.center.to(body.rest)
-        check_clear(world.colliders, x, f"the body of {prefix}")
-
-
 def sequences(body: Body, training: Scene, others: list[Scene], found: dict[str, Start]) -> list[Sequence]:
     """found: start by prefix, in the order of the sequences (`starts`)."""
     return [Sequence(p, s, start, first_contact(body, start, s)) for (p, start), s in zip(found.items(), [training, *others])]
@@ -133,24 +123,21 @@ def sequences(body: Body, training: Scene, others: list[Scene], found: dict[str,
 def train(cfg: DictConfig) -> float | None:
     """Run everything `cfg` asks for; returns the figure a sweep optimises. Errors: MosaError of whatever was wrong."""
     quiet()
-    if (conf := conf_folder()) is not None:
-        check_known(plain(cfg), conf, "train", TRAINING, EVALUATION)
-    check(plain(cfg), TRAINING, EVALUATION)
-    rehearse(plain(cfg))
+    check_configuration(plain(cfg))
     L.seed_everything(cfg.seed, verbose=False)
     clock, folder = Clock(), run_folder()
     if (done := finished(cfg, folder)) is not None:
         print(f"skipped: {folder} has its metrics.json (resume=auto)")
         return optimized(done, cfg.optimized_metric)
     cfg.ckpt_path = begins_from(cfg, folder)
+    check_begin(cfg)
     device = device_of(cfg)
     use_backend(cfg.rendering.backend)
     with clock.measure("data"):
         scene, held_out = scenes(cfg)
     taught = list(cfg.scene.get("also_train") or [])
     parallel.check_share(len(device_names(cfg)), 1 + len(taught), min(cfg.fit.views, len(scene.training_cameras)))
-    if (place := seen_at(scene)) is not None:  # before the reconstruction; the body itself is checked after it
-        check_clear(colliders_from_config(plain(cfg.world)["colliders"] or ()), place[None], "the object, as frame 0 shows it,")
+    check_seen(cfg, scene)
     if scene.synthetic:
         print(f"scene {scene.name}: synthetic, made by this program; not a capture")
     with clock.measure("reconstruction"):
@@ -254,9 +241,9 @@ def fit_estimate(module: LitMosa, processes: int = 1) -> str:
 
 
 def fit(cfg, module: LitMosa, data: MultiViewDataModule, folder: Path, device: str) -> None:
-    """The staged optimisation under Lightning; resumes from cfg.ckpt_path. Errors: ConfigError for a missing checkpoint."""
-    if cfg.ckpt_path is not None and not Path(cfg.ckpt_path).is_file():
-        raise ConfigError(f"ckpt_path: no file {cfg.ckpt_path}; a run writes <run folder>/checkpoints/last.ckpt")
+    """The staged optimisation under Lightning; resumes from cfg.ckpt_path. Errors: DataError for a checkpoint of another run."""
+    if cfg.ckpt_path is not None:
+        check_same(read_checkpoint(cfg.ckpt_path), module, cfg.ckpt_path)
     logger = TensorBoardLogger(folder, name="tensorboard", version="", default_hp_metric=False) if cfg.logger.enabled else False
     callbacks = [KeepLast(folder / "checkpoints"), FitProgress()]
     if cfg.logger.enabled and cfg.logger.images_every:
@@ -335,9 +322,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     if OmegaConf.is_missing(cfg, "ckpt_path"):
         raise ConfigError("ckpt_path: expected the checkpoint of a run, found none; "
                           "python eval.py ckpt_path=<run folder>/checkpoints/last.ckpt")
-    if (conf := conf_folder()) is not None and cfg.get("simulate") is not None:
-        check_known({k: v for k, v in plain(cfg).items() if k != "scene"}, conf, "eval", EVALUATION, SIMULATION)
-    check(plain(cfg), EVALUATION, SIMULATION)
+    check_evaluation(plain(cfg))
     folder = run_folder()
     twin = Twin.load(cfg.ckpt_path, named_device(cfg.device))
     simulate = plain(cfg.simulate)
@@ -365,18 +350,6 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         figures |= floor_figures(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
     write_outputs(folder, cfg, body, evaluated, figures, kept)
     return optimized(figures, "test/rms_m")
-
-
-def evaluated_scene(cfg: DictConfig, twin: Twin) -> DictConfig:
-    """The keys of the scene to evaluate on: eval.py's own, else what the run stored, which is read as data. Stored paths are read
-    from, and never written to: what is made goes to eval.py's own cache. Errors: DataError."""
-    stored = twin.config["cfg"].get("scene")
-    if not cfg.get("scene") and not isinstance(stored, dict):
-        raise DataError(f"ckpt_path: {cfg.ckpt_path}: expected the stored configuration's scene, found none; set scene=<option>")
-    keys = plain(cfg.scene) if cfg.get("scene") else {**stored, "also_train": None, "cache": None}
-    if not cfg.get("scene") and keys.get("path") is not None:
-        print(f"scene: reads {keys['path']} below {keys.get('root')}, as the checkpoint says (scene=... reads another)")
-    return OmegaConf.create({"scene": keys | {"cache": keys.get("cache") or cfg.get("cache")}})
 
 
 def quiet() -> None:
