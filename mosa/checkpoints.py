@@ -172,8 +172,10 @@ def check_tensors(tensors: Mapping[str, Any], path: str | Path) -> None:
             raise DataError(f"ckpt_path: {path}: body.{name}: expected floating point numbers of shape "
                             f"({', '.join(('N', *map(str, each)))}), N particles, found {found.dtype} {tuple(found.shape)}")
     for name, value in tensors.items():
+        if not isinstance(value, Tensor):
+            raise DataError(f"ckpt_path: {path}: body.{name}: expected a tensor, found {type(value).__name__}")
         unset = name.startswith("adapter.") and value.ndim == 0  # an adapter that was not switched on yet has no unit
-        if not isinstance(value, Tensor) or (value.is_floating_point() and not unset and not bool(torch.isfinite(value).all())):
+        if value.is_floating_point() and not unset and not bool(torch.isfinite(value).all()):
             raise DataError(f"ckpt_path: {path}: body.{name}: expected finite numbers")
     if not float(tensors["volume"].min()) > 0 or not math.isfinite(float(tensors["rest"].abs().max())):
         raise DataError(f"ckpt_path: {path}: body.volume: expected volumes above 0 m^3, found {float(tensors['volume'].min()):g}")

@@ -130,6 +130,9 @@ def known_keys(where: str, build: Callable, keys: Mapping[str, Any], *positional
     known = inspect.signature(build).parameters
     if unknown := [k for k in keys if k not in known]:
         raise ConfigError(f"{where}.{unknown[0]}: unknown key; expected one of {', '.join(list(known)[len(positional):])}")
+    needed = [k for k, parameter in list(known.items())[len(positional):] if parameter.default is parameter.empty]
+    if missing := [k for k in needed if k not in keys]:
+        raise ConfigError(f"{where}.{missing[0]}: expected this key, found none")
     return build(*positional, **keys)
 
 

@@ -6,6 +6,7 @@ nearest that is known.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Iterator, Mapping
 from difflib import SequenceMatcher
 from fnmatch import fnmatchcase
@@ -24,6 +25,7 @@ LOOSE = ("losses", "reconstruction", "heterogeneity", "prior", "adapter")
 """Sections of which any key may be left out: each has a default where it is read."""
 
 
+@functools.cache
 def tree_of(conf: Path, name: str) -> dict[str, Any]:
     """Every key of conf/<name>.yaml and of all options of all groups, nested, as a section or None; conf: the folder."""
     tree: dict[str, Any] = {}
@@ -74,17 +76,24 @@ def refuse_unknown(values: Mapping[str, Any], tree: Mapping[str, Any], schemas: 
 
 def refuse_missing(values: Mapping[str, Any], conf: Path, name: str) -> None:
     """Errors: ConfigError naming the first key that conf/<name>.yaml or every option of a group has, and the values have not."""
-    needed = tree_of_main(conf, name)
-    for group in sorted({file.parent.name for file in conf.glob("*/*.yaml")} & set(values_of_groups(conf, name))):
-        options = [yaml.safe_load(file.read_text()) or {} for file in (conf / group).glob("*.yaml")]
-        shared = set.intersection(*(set(paths(option)) for option in options)) - {"defaults"}
-        needed |= {group: None} | {f"{group}.{key}": None for key in shared}
     have = set(paths(values))
-    for path in needed:
-        section = path.split(".")[0]
-        if path not in have and not (section in LOOSE and "." in path) and not any(path.startswith(f"{e}.") for e in ELSEWHERE):
-            way = f"; choose an option, {path}=<name>" if path in values_of_groups(conf, name) else " (deleted with ~?)"
+    for path in needed(conf, name):
+        if path not in have:
+            way = f"; choose an option, {path}=<name>" if path in groups_of(conf, name) else " (deleted with ~?)"
             raise ConfigError(f"{path}: expected this key, found none{way}")
+
+
+@functools.cache
+def needed(conf: Path, name: str) -> tuple[str, ...]:
+    """The keys that may not be left out."""
+    main = yaml.safe_load((conf / f"{name}.yaml").read_text())
+    found = list(paths({key: value for key, value in main.items() if key != "defaults"}))
+    for group in groups_of(conf, name):
+        options = [yaml.safe_load(file.read_text()) or {} for file in sorted((conf / group).glob("*.yaml"))]
+        shared = set.intersection(*(set(paths(option)) for option in options)) - {"defaults"}
+        found += [group, *(f"{group}.{key}" for key in sorted(shared))]
+    loose = tuple(f"{section}." for section in (*LOOSE, *ELSEWHERE))
+    return tuple(path for path in found if not path.startswith(loose))
 
 
 def check_known(values: Mapping[str, Any], conf: Path, name: str, *schemas: Mapping[str, Any]) -> None:
@@ -100,14 +109,9 @@ def conf_folder() -> Path | None:
     return found if found is not None and found.is_dir() else None
 
 
-def tree_of_main(conf: Path, name: str) -> dict[str, Any]:
-    """The keys of conf/<name>.yaml alone, as paths."""
-    found = yaml.safe_load((conf / f"{name}.yaml").read_text())
-    return dict.fromkeys(paths({key: value for key, value in found.items() if key != "defaults"}))
-
-
-def values_of_groups(conf: Path, name: str) -> list[str]:
+@functools.cache
+def groups_of(conf: Path, name: str) -> tuple[str, ...]:
     """The groups that conf/<name>.yaml takes an option of by default, and that fill a section of their own."""
     defaults = (yaml.safe_load((conf / f"{name}.yaml").read_text()) or {}).get("defaults", [])
     chosen = {group: option for entry in defaults if isinstance(entry, Mapping) for group, option in entry.items()}
-    return [group for group, option in chosen.items() if option is not None and group not in ("hydra", "ablation", "debug")]
+    return tuple(group for group, option in chosen.items() if option is not None and group not in ("hydra", "ablation", "debug"))
