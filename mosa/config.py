@@ -64,8 +64,8 @@ def build_walls(walls: Mapping[str, Any] | None, box: Tensor) -> tuple[Plane, ..
     """The six sides of the box, none where `walls` is None. Errors: ConfigError naming the key."""
     if walls is None:
         return ()
-    if "mode" not in walls:
-        raise ConfigError("world.walls: expected null, or {mode: separate, friction: 0.1}, found no mode")
+    if not walls:
+        raise ConfigError("world.walls: expected null, or keys as in {mode: separate, friction: 0.1}, found none")
     return tuple(known_keys("world.walls", domain_walls, walls, box))
 
 
@@ -99,6 +99,11 @@ def fitting(adapter: torch.nn.Module | None, law: str) -> torch.nn.Module | None
 
 def build_simulation(config: Mapping[str, Any], dx: float) -> SimulationSettings:
     """Settings of the rollouts on a grid of spacing dx [m]."""
+    if missing := [k for k in ("stride", "max_substeps", "courant", "precision", "contact_offset") if k not in config]:
+        raise ConfigError(f"simulation.{missing[0]}: expected this key, found none")
+    if config["stride"] > config["max_substeps"]:
+        raise ConfigError(f"simulation.stride: expected at most simulation.max_substeps={config['max_substeps']}, as a frame has "
+                          f"whole strides, found {config['stride']}")
     names = ("stride", "max_substeps", "courant", "precision", "contact_offset")
     newer = (name for name in ("adaptive", "min_substeps") if name in config)  # than some checkpoints
     return SimulationSettings(dx=dx, **{name: config[name] for name in (*names, *newer)})
@@ -145,6 +150,9 @@ def rehearse(cfg: Mapping[str, Any]) -> None:
     build_stages(cfg["fit"], heterogeneity, adapter, bool(material.candidates))
     build_criterion(cfg)
     build_identification(cfg)
+    if not any(cfg["losses"].get(name) for name in ("image", "mask", "flow", "rotation", "stretch", "position")):
+        raise ConfigError("losses: expected a weight above 0 for image, mask, flow, rotation, stretch or position: nothing else "
+                          "tells the prior anything")
     build_walls(cfg["world"]["walls"], torch.stack([low, high]))
     for collider in colliders_from_config(cfg["world"]["colliders"] or ()):
         if isinstance(collider.motion, Motion) and collider.motion.times is not None:
@@ -156,6 +164,9 @@ def known_keys(where: str, build: Callable, keys: Mapping[str, Any], *positional
     known = inspect.signature(build).parameters
     if unknown := [k for k in keys if k not in known]:
         raise ConfigError(f"{where}.{unknown[0]}: unknown key; expected one of {', '.join(list(known)[len(positional):])}")
+    needed = [k for k, parameter in list(known.items())[len(positional):] if parameter.default is parameter.empty]
+    if missing := [k for k in needed if k not in keys]:
+        raise ConfigError(f"{where}.{missing[0]}: expected this key, found none")
     return build(*positional, **keys)
 
 

@@ -21,8 +21,8 @@ from mosa import __version__, parallel
 from mosa.analysis.figures import side_by_side, write_strip, write_video
 from mosa.analysis.tables import determined_text, parameter_table, results_table
 from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLast, Pace, StageNotes
-from mosa.config import build_body, build_fit, build_world, plain, rehearse, run_config, world_config
-from mosa.data.agreement import seen_at
+from mosa.checkpoints import check_same, read_checkpoint
+from mosa.config import build_body, build_fit, build_world, plain, run_config, world_config
 from mosa.data.datamodule import MultiViewDataModule, training_observations
 from mosa.data.sequences import load_sequences, taught_names
 from mosa.errors import ConfigError, DataError, MosaError
@@ -38,11 +38,10 @@ from mosa.evaluation import (
     true_motion,
 )
 from mosa.loggers import build_loggers, chosen, log_outcome
+from mosa.guards import check_begin, check_configuration, check_evaluation, check_seen, check_starts, evaluated_scene
 from mosa.modules.body import Body, Start, World
 from mosa.modules.gauss_newton import Posterior
 from mosa.modules.lit_mosa import LitMosa, Take
-from mosa.physics.collider_overlap import check_clear
-from mosa.physics.colliders import colliders_from_config
 from mosa.prediction import determined, predicted_spread
 from mosa.physics.memory import KEPT_ON_CPU
 from mosa.progress import tqdm
@@ -60,7 +59,6 @@ from mosa.run import (
     shared_starts,
     write_figures,
 )  # fmt: skip
-from mosa.schema import EVALUATION, SIMULATION, TRAINING, check
 from mosa.twin import Twin, save_observed, save_rollout, save_spread, save_truth
 from mosa.types import MotionCues, Reconstruction, Scene
 
@@ -124,13 +122,6 @@ def starts(
     return found
 
 
-def check_starts(world: World, body: Body, found: dict[str, Start]) -> None:
-    """No sequence starts inside of a solid. Errors: ConfigError naming the collider."""
-    for prefix, start in found.items():
-        x = (body.rest - body.center) @ start.rotation.to(body.rest).T + start.center.to(body.rest)
-        check_clear(world.colliders, x, f"the body of {prefix}")
-
-
 def sequences(body: Body, training: Scene, others: list[Scene], found: dict[str, Start]) -> list[Sequence]:
     """found: start by prefix, in the order of the sequences (`starts`)."""
     return [Sequence(p, s, start, first_contact(body, start, s)) for (p, start), s in zip(found.items(), [training, *others])]
@@ -145,8 +136,7 @@ def run_sequences(config: dict, body: Body) -> list[Sequence]:
 def train(cfg: DictConfig) -> float | None:
     """Run everything `cfg` asks for; returns the figure a sweep optimises. Errors: MosaError of whatever was wrong."""
     quiet()
-    check(plain(cfg), TRAINING, EVALUATION)
-    rehearse(plain(cfg))
+    check_configuration(plain(cfg))
     chosen(plain(cfg.logger))
     L.seed_everything(cfg.seed, verbose=False)
     clock, folder = Clock(), run_folder()
@@ -155,14 +145,14 @@ def train(cfg: DictConfig) -> float | None:
         log.info("skipped: %s has its metrics.json (resume=auto)", folder)
         return optimized(done, cfg.optimized_metric)
     cfg.ckpt_path = begins_from(cfg, folder)
+    check_begin(cfg)
     device = device_of(cfg)
     use_backend(cfg.rendering.backend)
     with clock.measure("data"):
         scene, held_out = scenes(cfg)
     taught = taught_names(plain(cfg.scene))
     parallel.check_share(len(device_names(cfg)), 1 + len(taught), min(cfg.fit.views, len(scene.training_cameras)))
-    if (place := seen_at(scene)) is not None:  # before the reconstruction; the body itself is checked after it
-        check_clear(colliders_from_config(plain(cfg.world)["colliders"] or ()), place[None], "the object, as frame 0 shows it,")
+    check_seen(cfg, scene)
     if scene.synthetic:
         log.info("scene %s: synthetic, made by this program; not a capture", scene.name)
     with clock.measure("reconstruction"):
@@ -279,9 +269,9 @@ def fit_estimate(module: LitMosa, processes: int = 1) -> str:
 
 
 def fit(cfg, module: LitMosa, data: MultiViewDataModule, folder: Path, device: str) -> None:
-    """The staged optimisation under Lightning; resumes from cfg.ckpt_path. Errors: ConfigError for a missing checkpoint."""
-    if cfg.ckpt_path is not None and not Path(cfg.ckpt_path).is_file():
-        raise ConfigError(f"ckpt_path: no file {cfg.ckpt_path}; a run writes <run folder>/checkpoints/last.ckpt")
+    """The staged optimisation under Lightning; resumes from cfg.ckpt_path. Errors: DataError for a checkpoint of another run."""
+    if cfg.ckpt_path is not None:
+        check_same(read_checkpoint(cfg.ckpt_path), module, cfg.ckpt_path)
     settings = plain(cfg.logger)
     logger = build_loggers(settings, folder)
     callbacks = [KeepLast(folder / "checkpoints"), FitProgress(), StageNotes(), *([Pace()] if logger else [])]
@@ -361,7 +351,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     if OmegaConf.is_missing(cfg, "ckpt_path"):
         raise ConfigError("ckpt_path: expected the checkpoint of a run, found none; "
                           "python eval.py ckpt_path=<run folder>/checkpoints/last.ckpt")
-    check(plain(cfg), EVALUATION, SIMULATION)
+    check_evaluation(plain(cfg))
     folder = run_folder()
     twin = Twin.load(cfg.ckpt_path, named_device(cfg.device))
     simulate = plain(cfg.simulate)
@@ -390,18 +380,6 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         figures |= floor_figures(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
     write_outputs(folder, cfg, body, evaluated, figures, kept)
     return optimized(figures, "test/rms_m")
-
-
-def evaluated_scene(cfg: DictConfig, twin: Twin) -> DictConfig:
-    """The keys of the scene to evaluate on: eval.py's own, else what the run stored, which is read as data. Stored paths are read
-    from, and never written to: what is made goes to eval.py's own cache. Errors: DataError."""
-    stored = twin.config["cfg"].get("scene")
-    if not cfg.get("scene") and not isinstance(stored, dict):
-        raise DataError(f"ckpt_path: {cfg.ckpt_path}: expected the stored configuration's scene, found none; set scene=<option>")
-    keys = plain(cfg.scene) if cfg.get("scene") else {**stored, "also_train": None, "cache": None}
-    if not cfg.get("scene") and keys.get("path") is not None:
-        print(f"scene: reads {keys['path']} below {keys.get('root')}, as the checkpoint says (scene=... reads another)")
-    return OmegaConf.create({"scene": keys | {"cache": keys.get("cache") or cfg.get("cache")}})
 
 
 def quiet() -> None:

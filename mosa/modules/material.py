@@ -95,6 +95,10 @@ class Material(nn.Module):
         known = law_named(law)
         takes = {name for name in known.parameters if name != known.reference}
         gives = {taken for name in parameters for taken in GIVES.get(name, (name,))}
+        listed = [taken for name in parameters for taken in GIVES.get(name, (name,))]
+        if twice := sorted({name for name in listed if listed.count(name) > 1}):
+            raise ConfigError(f"prior.parameters: expected each of {', '.join(sorted(takes))} once, found {', '.join(twice)} twice "
+                              f"by {', '.join(parameters)} (mu, lam come from E, nu)")
         if takes != gives:
             raise ConfigError(
                 f"prior.parameters: law {law} takes {', '.join(sorted(takes))}; {', '.join(parameters)} give "
