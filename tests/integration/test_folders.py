@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
 
+from mosa import pipeline
 from mosa.data.export import export_particles, export_transforms
 from mosa.data.scene import load_scene
-from mosa.pipeline import run_sequences
 from mosa.twin import Twin
 
 ROOT = Path(__file__).parents[2]
@@ -62,30 +63,44 @@ def run(tmp_path_factory, cache):
             export_particles(scene.truth.positions, folder / "data" / sequence / "ply")
     export_particles(scene.truth.positions, folder / "data" / "ply")  # of the training sequence, for this test as good as its own
     result = call("train.py", folder / "run", *QUICK, f"scene.root={folder}/data", "scene.path=train", "scene.particles=ply",
-                  "scene.test=[test_60,{path: test_40, name: second}]", f"scene.cache={cache}")
+                  "scene.also_train=[test_60]", "scene.test=[{path: test_40, name: second}]", f"scene.cache={cache}")
     assert result.returncode == 0, result.stderr[-3000:]
     return folder / "run"
 
 
 def test_a_folder_that_is_held_out_has_figures(run):
     figures = json.loads((run / "metrics.json").read_text())
-    for part in ("test/test_60", "test/second"):
+    for part in ("train", "train/test_60", "test/second"):
         for model in ("", "prior/"):
             assert 15 < figures[f"{model}{part}/psnr_crop"] < 50 and 0.5 < figures[f"{model}{part}/ssim_crop"] <= 1
-    assert figures["test/psnr_crop"] == pytest.approx(np.mean([figures[f"test/{s}/psnr_crop"] for s in ("test_60", "second")]))
-    assert figures["test/second/cd_m"] > 0 and "test/test_60/cd_m" not in figures  # known particles, beside these images alone
+    assert figures["test/psnr_crop"] == figures["test/second/psnr_crop"]
+    assert figures["test/second/cd_m"] > 0 and "train/test_60/cd_m" not in figures  # known particles, beside those images alone
     assert not [key for key in figures if key.endswith("rms_m")]
-    assert set(np.load(run / "rollout.npz")) >= {"train/x", "test/test_60/x", "test/second/x"}
+    assert set(np.load(run / "rollout.npz")) >= {"train/x", "train/test_60/x", "test/second/x"}
+    assert set(np.load(run / "observed.npz")) >= {"train/x", "train/test_60/x"}
     log = (run / "train.log").read_text()
     assert "cameras of different image sizes" in log and "start of test/second: velocity (" in log
 
 
-def test_eval_finds_the_folders_again(run):
-    twin = Twin.load(run / "checkpoints" / "last.ckpt")
-    stored = np.load(run / "rollout.npz")
-    found = run_sequences(twin.config, twin.body)
-    named = [("train", "train"), ("test/test_60", "test_60"), ("test/second", "second")]
-    assert [(s.prefix, s.scene.sequence) for s in found] == named
-    for each in found:  # a start belongs to its images: the rollout begins there
-        rest = (twin.body.rest - twin.body.center) @ each.start.rotation.T + each.start.center
-        assert np.abs(stored[f"{each.prefix}/x"][0] - rest.numpy()).max() < 1e-5
+def test_eval_finds_the_folders_again(run, tmp_path, monkeypatch):
+    """All of them, each with its own start: a rollout begins where its images do."""
+    seen = {}
+
+    def stop(body, sequences, world, **_):
+        seen.update(body=body, sequences=sequences)
+        raise InterruptedError
+
+    monkeypatch.setattr(pipeline, "evaluate", stop)
+    monkeypatch.setattr(pipeline, "run_folder", lambda: tmp_path)
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        cfg = compose("eval", [f"ckpt_path={run}/checkpoints/last.ckpt"])
+    with pytest.raises(InterruptedError):
+        pipeline.evaluate_checkpoint(cfg)
+    body, stored = seen["body"], np.load(run / "rollout.npz")
+    named = [("train", "train"), ("train/test_60", "test_60"), ("test/second", "second")]
+    found = pipeline.run_sequences(Twin.load(run / "checkpoints" / "last.ckpt").config, body)
+    for sequences in (seen["sequences"], found):
+        assert [(s.prefix, s.scene.sequence) for s in sequences] == named
+        for each in sequences:
+            rest = (body.rest - body.center) @ each.start.rotation.T + each.start.center
+            assert np.abs(stored[f"{each.prefix}/x"][0] - rest.numpy()).max() < 1e-5
