@@ -1,6 +1,8 @@
 """Every combination of the config groups composes, and a switch changes what it names and nothing else."""
 
 import itertools
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -33,7 +35,7 @@ def test_every_scene_with_every_prior_composes(scene):
         assert config["prior"] and config["scene"]
 
 
-@pytest.mark.parametrize("name", ["reconstruction", "simulation", "fit", "trainer", "logger", "ablation"])
+@pytest.mark.parametrize("name", ["reconstruction", "simulation", "fit", "trainer", "logger", "ablation", "experiment"])
 def test_every_option_of_a_group_composes(name):
     for option in group(name):
         assert composed(f"{name}={option}")
@@ -70,8 +72,8 @@ def test_a_mistake_in_a_stage_names_its_key():
         build_stages(fit | {"joint": {"iterations": 2, "lr": 1, "start": "foo"}}, heterogeneity=True, adapter=True)
 
 
-@pytest.mark.parametrize("group_name", ["adapter", "ablation", "debug", "fit", "logger", "prior", "reconstruction", "rendering",
-                                        "scene", "simulation", "trainer"])  # fmt: skip
+@pytest.mark.parametrize("group_name", ["adapter", "ablation", "debug", "experiment", "fit", "logger", "prior", "reconstruction",
+                                        "rendering", "scene", "simulation", "trainer"])  # fmt: skip
 def test_every_option_passes_the_checks_before_a_run(group_name):
     for option in group(group_name):
         config = composed(f"{group_name}={option}")
@@ -157,3 +159,23 @@ def test_an_ablation_changes_the_switch_it_names_and_nothing_else(name):
     whole = "paper" if any(key.startswith("adapter.") for key in EXPECTED[name]) else "full"
     full, ablated = flat(composed(f"ablation={whole}")), flat(composed(f"ablation={name}"))
     assert {k for k in full.keys() | ablated.keys() if full.get(k) != ablated.get(k)} == EXPECTED[name]
+
+
+@pytest.mark.parametrize("name, overrides", [
+    ("bird", ["scene=pacnerf_bird", "prior=neo_hookean", "scene.holdout_cameras=[5]"]),
+    ("paper_size", ["simulation=paper", "trainer=gpu", "scene.scale=1"]),
+])  # fmt: skip
+def test_an_experiment_is_what_its_overrides_are(name, overrides):
+    assert composed(f"experiment={name}") == composed(*overrides) != composed()
+    assert composed(f"experiment={name}", "seed=3", "prior=stvk")["prior"]["law"] == composed("prior=stvk")["prior"]["law"]
+
+
+def test_an_experiment_of_ones_own(tmp_path):
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_text(
+        "# @package _global_\ndefaults:\n  - override /scene: transforms\nsimulation: {particles: 77}\n")
+    found = subprocess.run([sys.executable, "train.py", "--config-dir", str(tmp_path), "experiment=mine", "--cfg", "job"], cwd=ROOT,
+                           capture_output=True, text=True)
+    assert found.returncode == 0, found.stderr[-2000:]
+    cfg = OmegaConf.create(found.stdout)
+    assert (cfg.simulation.particles, cfg.scene.format) == (77, "transforms")
