@@ -128,7 +128,7 @@ class ImageStrips(L.Callback):
             add_picture(module.loggers, "real_above_rendered_below", enlarged(module.strip()), module.steps_done)
 
 
-LEGIBLE = 480
+LEGIBLE = 320
 """Height [px] that a strip of two rows has at least: windows around an object are often 60 px high."""
 
 

@@ -1,8 +1,6 @@
 """Every combination of the config groups composes, and a switch changes what it names and nothing else."""
 
 import itertools
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -168,14 +166,3 @@ def test_an_ablation_changes_the_switch_it_names_and_nothing_else(name):
 def test_an_experiment_is_what_its_overrides_are(name, overrides):
     assert composed(f"experiment={name}") == composed(*overrides) != composed()
     assert composed(f"experiment={name}", "seed=3", "prior=stvk")["prior"]["law"] == composed("prior=stvk")["prior"]["law"]
-
-
-def test_an_experiment_of_ones_own(tmp_path):
-    (tmp_path / "experiment").mkdir()
-    (tmp_path / "experiment" / "mine.yaml").write_text(
-        "# @package _global_\ndefaults:\n  - override /scene: transforms\nsimulation: {particles: 77}\n")
-    found = subprocess.run([sys.executable, "train.py", "--config-dir", str(tmp_path), "experiment=mine", "--cfg", "job"], cwd=ROOT,
-                           capture_output=True, text=True)
-    assert found.returncode == 0, found.stderr[-2000:]
-    cfg = OmegaConf.create(found.stdout)
-    assert (cfg.simulation.particles, cfg.scene.format) == (77, "transforms")
