@@ -19,7 +19,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from mosa import pipeline
+from mosa import __version__, pipeline
 from mosa.clips import read_run
 from mosa.modules.body import ContactOffset, Start
 from mosa.modules.lit_mosa import LitMosa
@@ -78,7 +78,7 @@ def test_a_run_leaves_its_outputs(run):
 
 def test_the_log_has_the_lines_that_matter(run):
     log = (run / "train.log").read_text()
-    for line in ("] mosa 0.1.0: debug=default", "scene tiny: synthetic", "] reconstruction took ", "] body: 200 particles, ",
+    for line in (f"] mosa {__version__}: debug=default", "scene tiny: synthetic", "] reconstruction took ", "] body: 200 particles, ",
                  "] start of test/test_60: velocity (", "] stage prior: at most 2 steps", "] stage joint: ended after 2 steps, ",
                  "| rms [mm]  | adapted ", f"run folder: {run}"):
         assert line in log, line
