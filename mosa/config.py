@@ -22,9 +22,9 @@ from mosa.modules.material import Material
 from mosa.modules.stages import Stage
 from mosa.modules.stiffness_modes import StiffnessModes
 from mosa.physics.boundary import Plane
-from mosa.physics.laws import law_named
 from mosa.physics.collider_motion import Motion
 from mosa.physics.colliders import colliders_from_config, domain_walls
+from mosa.physics.laws import law_named
 from mosa.types import Ground, Scene
 
 if TYPE_CHECKING:

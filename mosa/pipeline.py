@@ -18,7 +18,7 @@ from lightning.pytorch.plugins.environments import LightningEnvironment
 from omegaconf import DictConfig, OmegaConf
 
 from mosa import __version__, parallel
-from mosa.analysis.figures import side_by_side, write_strip, write_video
+from mosa.analysis.comparison import compare, write_comparisons
 from mosa.analysis.tables import determined_text, parameter_table, results_table
 from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLast, Pace, StageNotes
 from mosa.checkpoints import check_same, read_checkpoint
@@ -33,20 +33,18 @@ from mosa.evaluation import (
     hidden_figures,
     identification,
     law_figures,
-    render,
     test_means,
     true_motion,
 )
-from mosa.loggers import build_loggers, chosen, log_outcome
 from mosa.guards import check_begin, check_configuration, check_evaluation, check_seen, check_starts, evaluated_scene
+from mosa.loggers import build_loggers, chosen, log_outcome
 from mosa.modules.body import Body, Start, World
 from mosa.modules.gauss_newton import Posterior
 from mosa.modules.lit_mosa import LitMosa, Take
-from mosa.prediction import determined, predicted_spread
 from mosa.physics.memory import KEPT_ON_CPU
+from mosa.prediction import determined, predicted_spread
 from mosa.progress import tqdm
 from mosa.reconstruction.starts import first_contact, sequence_start, splats_of
-from mosa.rendering.cameras import crop_boxes, crop_images
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import use_backend
 from mosa.run import (
@@ -76,7 +74,7 @@ class Clock:
         began = time.perf_counter()
         yield
         self.figures[f"time/{stage}_s"] = self.figures.get(f"time/{stage}_s", 0.0) + time.perf_counter() - began
-        log.info("%s: done in %.1f s", stage, time.perf_counter() - began)
+        log.info("%s took %.1f s", stage, time.perf_counter() - began)
 
 
 def run_folder() -> Path:
@@ -314,27 +312,11 @@ def write_outputs(folder: Path, cfg: DictConfig, body: Body, evaluated: list[Seq
         save_truth(folder / "truth.npz", known)
     if cfg.evaluation.video:
         shown = [s for s in evaluated if s.prefix.startswith("test")] or evaluated[-1:]
-        pictures = {s.prefix: comparison(body, s, kept[s.prefix]) for s in shown}
-        columns = pictures[shown[-1].prefix]
-        enlarge = max(1, round(320 / max(columns["real"].shape[1:3])))
-        write_video(folder / "video.mp4", side_by_side(columns, enlarge), fps=6)
-        rows = {f"{prefix}: {title}": images for prefix, each in pictures.items() for title, images in each.items()}
-        write_strip(folder / "strip.png", rows, enlarge=max(1, enlarge - 1))
+        write_comparisons(folder, {s.prefix: compare(body, s, kept[s.prefix]) for s in shown})
     table = "\n\n".join(filter(None, (results_table(figures), parameter_table(figures), determined_text(figures))))
     (folder / "results.md").write_text(table + "\n")
     write_figures(folder, figures)  # the last file: the run is complete
     log.info("\n%s\n\nrun folder: %s", table, folder)
-
-
-def comparison(body: Body, shown: Sequence, variants: dict) -> dict:
-    """Images (T, h, w, 3) of real, prior and adapted from the first camera, cut to where the object goes."""
-    scene = shown.scene
-    camera = [(scene.training_cameras or [0])[0]]
-    x0, y0, width, height = crop_boxes(scene.mattes[camera], margin=16)
-    columns = {"real": scene.images[camera]}
-    for variant, title in (("prior", "prior"), ("adapted", "adapted (MoSA)")):
-        columns[title] = render(body, variants[variant], scene, camera).cpu()
-    return {title: crop_images(images, x0, y0, width, height, axis=2)[0] for title, images in columns.items()}
 
 
 def optimized(figures: dict[str, float], wanted: str) -> float | None:

@@ -155,7 +155,9 @@ class Twin:
         for t, x in enumerate(rollout.x.cpu().numpy()):
             write_ply(folder / "ply" / f"{t:03d}.ply", x, self.body.colors.cpu().numpy())
         if video:
-            write_video(folder / "simulation.mp4", side_by_side({title: self.render(rollout)}), fps=max(5.0, 0.3 / self.frame_dt))
+            moments = [f"frame {t}, {time:.3f} s" for t, time in enumerate(rollout.times.tolist())]
+            frames = side_by_side({title: self.render(rollout)}, footer=moments)
+            write_video(folder / "simulation.mp4", frames, fps=max(5.0, 0.3 / self.frame_dt))
         return folder
 
 

@@ -33,7 +33,7 @@ def test_every_scene_with_every_prior_composes(scene):
         assert config["prior"] and config["scene"]
 
 
-@pytest.mark.parametrize("name", ["reconstruction", "simulation", "fit", "trainer", "logger", "ablation"])
+@pytest.mark.parametrize("name", ["reconstruction", "simulation", "fit", "trainer", "logger", "ablation", "experiment"])
 def test_every_option_of_a_group_composes(name):
     for option in group(name):
         assert composed(f"{name}={option}")
@@ -75,8 +75,8 @@ def test_a_mistake_in_a_stage_names_its_key():
         build_stages(fit | {"joint": {"iterations": 2, "lr": 1, "start": "foo"}}, heterogeneity=True, adapter=True)
 
 
-@pytest.mark.parametrize("group_name", ["adapter", "ablation", "debug", "fit", "logger", "prior", "reconstruction", "rendering",
-                                        "scene", "simulation", "trainer"])  # fmt: skip
+@pytest.mark.parametrize("group_name", ["adapter", "ablation", "debug", "experiment", "fit", "logger", "prior", "reconstruction",
+                                        "rendering", "scene", "simulation", "trainer"])  # fmt: skip
 def test_every_option_passes_the_checks_before_a_run(group_name):
     for option in group(group_name):
         config = composed(f"{group_name}={option}")
@@ -162,3 +162,12 @@ def test_an_ablation_changes_the_switch_it_names_and_nothing_else(name):
     whole = "paper" if any(key.startswith("adapter.") for key in EXPECTED[name]) else "full"
     full, ablated = flat(composed(f"ablation={whole}")), flat(composed(f"ablation={name}"))
     assert {k for k in full.keys() | ablated.keys() if full.get(k) != ablated.get(k)} == EXPECTED[name]
+
+
+@pytest.mark.parametrize("name, overrides", [
+    ("bird", ["scene=pacnerf_bird", "prior=neo_hookean", "scene.holdout_cameras=[5]"]),
+    ("paper_size", ["simulation=paper", "trainer=gpu", "scene.scale=1"]),
+])  # fmt: skip
+def test_an_experiment_is_what_its_overrides_are(name, overrides):
+    assert composed(f"experiment={name}") == composed(*overrides) != composed()
+    assert composed(f"experiment={name}", "seed=3", "prior=stvk")["prior"]["law"] == composed("prior=stvk")["prior"]["law"]

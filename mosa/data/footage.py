@@ -153,7 +153,10 @@ def even_times(times: list[float], frames: list[int], where: str, remedy: str) -
 
 def scaled(K: np.ndarray, full: tuple[int, int], size: tuple[int, int]) -> np.ndarray:
     """K (3, 3) [px] of images that were brought from `full` to `size`, (width, height) [px] each."""
-    return np.diag([size[0] / full[0], size[1] / full[1], 1.0]) @ K
+    K = K.astype(np.float32)  # as a scene keeps it: what was read before has the same bits, and so the same place in the cache
+    K[0] *= size[0] / full[0]
+    K[1] *= size[1] / full[1]
+    return K
 
 
 def footage_of(
