@@ -191,7 +191,8 @@ def train(cfg: DictConfig) -> float | None:
 
 
 def posterior_figures(body: Body, posterior: Posterior | None, evaluated: list[Sequence], world: World, folder: Path) -> dict:
-    """What the data determined and how sure predictions are; uncertainty.npz with the latter. Nothing where there is no posterior."""
+    """What the data determined and how sure predictions are; uncertainty.npz with the latter. Nothing where there is no
+    posterior."""
     if posterior is None:
         return {}
     figures, spreads = predicted_spread(body, posterior, evaluated, world)

@@ -18,7 +18,8 @@ from mosa.progress import tqdm
 
 DRAWS = 16
 INFLATION = 1.5
-"""Factor of the draws' standard deviation. Frames of a motion are less independent than the likelihood takes them to be; chosen on the
+"""Factor of the draws' standard deviation. Frames of a motion are less independent than the likelihood takes them to be; chosen
+on the
 held-out drops of rabbit, chick1, mandarin and peanut, so that 80 to 99 % of the errors lie within two standard deviations."""
 LEAST_DRAWS = 4
 """Of those that could be simulated: fewer say nothing about a spread."""
@@ -76,7 +77,8 @@ def _positions(body: Body, s: Sequence, world: World) -> Tensor:
 
 @torch.no_grad()
 def determined(body: Body, posterior: Posterior, *, draws: int = 400, seed: int = 1) -> dict[str, float]:
-    """What the data say about the law: standard deviations of the global parameters (`posterior/<name>_sd`, relative for moduli), how
+    """What the data say about the law: standard deviations of the global parameters (`posterior/<name>_sd`, relative for moduli),
+    how
     many of the operator's numbers and of the stiffness modes they determine, and the 95 % cone about the stiffest direction."""
     figures: dict[str, float] = {}
     blocks: dict[str, list[int]] = {}

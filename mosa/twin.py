@@ -62,16 +62,17 @@ class Twin:
             reason = str(error) if isinstance(error, MosaError) else f"{type(error).__name__}: {error}"
             raise DataError(f"ckpt_path: {path}: no body can be built from it ({' '.join(reason.split())[:300]})") from error
         known = checked_posterior(checkpoint, len(read_numbers(body)), path)
-        return cls(body.to(device).eval(), world, config["frame_dt"], config, start, None if known is None else Posterior.read(known))
+        posterior = None if known is None else Posterior.read(known)
+        return cls(body.to(device).eval(), world, config["frame_dt"], config, start, posterior)
 
     def predict(self, *, draws: int = 16, seed: int = 0, **start) -> tuple[Rollout, Tensor]:
         """(rollout of the learned law, standard deviation (T, N) [m] of every particle's position) from a new start.
 
-        start: as `simulate` takes it; draws: laws drawn from the posterior. Errors: ConfigError where the run kept no posterior (a fit
-        by Adam), or where fewer than two of the draws can be simulated.
+        start: as `simulate` takes it; draws: laws drawn from the posterior. Errors: ConfigError where the run kept no posterior
+        (a fit by Adam), or where fewer than two of the draws can be simulated.
         """
         if self.posterior is None:
-            raise ConfigError("predict: this run kept no posterior; a fit by Gauss-Newton does (adapter=operator, fit.joint.optimizer=auto)")
+            raise ConfigError("predict: this run kept no posterior; a fit by Gauss-Newton does (fit.joint.optimizer=auto)")
         rollout, found, kept = self.simulate(**start), [], read_numbers(self.body)
         try:
             for numbers in self.posterior.draws(draws, torch.Generator().manual_seed(seed)):
@@ -83,7 +84,8 @@ class Twin:
         finally:
             write_numbers(self.body, kept)
         if len(found) < 2:
-            raise ConfigError(f"predict: {len(found)} of {draws} draws of the law can be simulated from this start; expected at least two")
+            raise ConfigError(f"predict: expected at least two of {draws} draws of the law that can be simulated from this start, found "
+                              f"{len(found)}")
         return rollout, total_spread(torch.stack(found), self.posterior.model_error)
 
     @torch.no_grad()

@@ -37,7 +37,8 @@ ROUNDED = 8
 
 @dataclass(frozen=True)
 class IdentificationSettings:
-    """count: independent data in a frame; model_error: of grid and contact, in cells; operator_sd, stiffness_sd: prior standard deviations of the operator's numbers and of the
+    """count: independent data in a frame; model_error: of grid and contact, in cells; operator_sd, stiffness_sd: prior standard
+    deviations of the operator's numbers and of the
     stiffness modes before the evidence finds their factor; smoothness: power with which that of the modes falls with their wave
     number; evidence: whether it is found; tolerance: of the last step, in posterior standard deviations; threads: rollouts side by
     side on a CPU, 0 for one a core. Errors: ConfigError naming the key."""
@@ -135,7 +136,8 @@ def choose_law(body: Body, candidates: Sequence[str], build: Callable[[], Identi
         if best is None or found[law] < best[0]:
             best = (found[law], {part: copy.deepcopy(getattr(body, part).state_dict()) for part in ("material", "contact")}, law)
     if best is None:
-        raise SimulationDiverged(f"prior=auto: none of {', '.join(candidates)} can be calibrated; set prior.parameters nearer to the body's")
+        raise SimulationDiverged(f"prior=auto: none of {', '.join(candidates)} can be calibrated; set prior.parameters nearer to the "
+                                 "body's")
     for part, state in best[1].items():
         getattr(body, part).load_state_dict(state)
     for material in (body.material, *(variant["material"] for variant in body.frozen.values())):
@@ -163,8 +165,8 @@ class Identification:
         self.gains = (0.0,) if self.calibrating else criterion.gains
         self.kinds = (True, False, False) if self.calibrating and kinds[0] else kinds
         if not any(self.kinds):
-            raise ConfigError("losses: identification compares motion cues, and the weights of position, rotation and stretch are all "
-                              "0; use fit=adam, which learns from images too")
+            raise ConfigError("losses: identification compares motion cues, and the weights of position, rotation and stretch are "
+                              "all 0; use fit=adam, which learns from images too")
         self.chosen = residuals.sampled(len(body.rest), body.rest.device)
         blocks = blocks_of(body, adapter=self.adapter, heterogeneity=self.heterogeneity, settings=settings,
                            calibrating=self.calibrating)
@@ -201,7 +203,8 @@ class Identification:
 
     def _fields(self, body: Body) -> list[residuals.Fields]:
         return [
-            residuals.fields(self.rollout(body, i, gain, self.substeps[i]), self.takes[i].cues, self.takes[i].start.rotation, self.chosen)
+            residuals.fields(self.rollout(body, i, gain, self.substeps[i]), self.takes[i].cues, self.takes[i].start.rotation,
+                             self.chosen)
             for i, gain in self.pairs
         ]
 
@@ -236,8 +239,8 @@ class Identification:
             if distance < best[0]:
                 best = (distance, row)
         if not math.isfinite(best[0]):
-            raise SimulationDiverged("fit.prior: none of the starts of the coarse grid can be simulated; set prior.parameters nearer to "
-                                     "the body's, or raise simulation.max_substeps")
+            raise SimulationDiverged("fit.prior: none of the starts of the coarse grid can be simulated; set prior.parameters nearer "
+                                     "to the body's, or raise simulation.max_substeps")
         self._set(best[1])
         return best[0]
 
