@@ -42,6 +42,7 @@ from mosa.modules.body import Body, Start, World
 from mosa.modules.gauss_newton import Posterior
 from mosa.modules.lit_mosa import LitMosa, Take
 from mosa.physics.memory import KEPT_ON_CPU
+from mosa.plan import plan, plan_text
 from mosa.prediction import determined, predicted_spread
 from mosa.progress import tqdm
 from mosa.reconstruction.starts import first_contact, sequence_start, splats_of
@@ -337,6 +338,11 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     check_evaluation(plain(cfg))
     folder = run_folder()
     twin = Twin.load(cfg.ckpt_path, named_device(cfg.device))
+    if cfg.plan is not None:
+        ranked = plan(twin, count=cfg.plan)
+        log.info("\n%s", plan_text(ranked))
+        (folder / "plan.md").write_text(plan_text(ranked) + "\n")
+        return -ranked[0].gain
     simulate = plain(cfg.simulate)
     if any(simulate[k] is not None for k in ("velocity", "rotation", "height", "angular_velocity", "colliders")):
         rollout = twin.simulate(**simulate, progress=True)

@@ -175,6 +175,7 @@ SIMULATION: dict[str, Kind] = {
     **{name: SECTION for name in ("simulate", "evaluation")},
     "ckpt_path": TEXT,
     "cache": or_null(TEXT),
+    "plan": or_null(whole(2)),
     "simulate.variant": one_of("adapted", "prior_eta", "prior"),
     "simulate.velocity": or_null(THREE),
     "simulate.angular_velocity": or_null(THREE),
