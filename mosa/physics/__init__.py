@@ -4,3 +4,5 @@ import warp as wp
 
 wp.config.log_level = wp.LOG_WARNING  # lines on every small module compiled would drown the program's own
 wp.init()
+
+from mosa.physics import elasticity, mixture, plasticity, viscosity  # noqa: E402, F401  the built-in laws register themselves

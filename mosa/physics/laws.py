@@ -1,7 +1,7 @@
 """Registry of constitutive laws: a law is one Warp function for the stress and, where it yields, one for the return mapping.
 
-Elastic laws are in `elasticity`, yielding ones in `plasticity`, those that flow at a rate in `viscosity`; another module adds its
-own with `register_law`. Bodies of different laws in one grid: `mixture`.
+Elastic laws are in `elasticity`, yielding ones in `plasticity`, those that flow at a rate in `viscosity`, bodies of different laws in
+one grid in `mixture`; the package imports these, and they register themselves. Another module adds its own with `register_law`.
 """
 
 from collections.abc import Callable
@@ -84,6 +84,13 @@ class Law:
 
 
 _LAWS: dict[str, Law] = {}
+_COMPOSED: dict[str, Callable[[str, list[Law]], Law]] = {}
+"""What makes a law of several whose names are joined by a sign, by that sign."""
+
+
+def register_composition(sign: str, make: Callable[[str, list[Law]], Law]) -> None:
+    """make(name, laws) registers the law called `a<sign>b<sign>...`."""
+    _COMPOSED[sign] = make
 
 
 def register_law(name: str, stress: Callable, parameters: dict[str, int] | tuple[str, ...], **options) -> Law:
@@ -106,13 +113,9 @@ def register_law(name: str, stress: Callable, parameters: dict[str, int] | tuple
 def law_named(name: str) -> Law:
     """The law of that name; `a+b` is the mixture of the laws a and b (see `mixture`). Errors: ConfigError naming the known ones.
     """
-    # the built-in laws register themselves on import
-    from mosa.physics import elasticity, plasticity, viscosity  # noqa: F401
-
-    if "+" in name and name not in _LAWS:
-        from mosa.physics.mixture import register_mixture
-
-        register_mixture(name, [law_named(part) for part in name.split("+")])
+    for sign, make in _COMPOSED.items():
+        if sign in name and name not in _LAWS:
+            make(name, [law_named(part) for part in name.split(sign)])
     if name not in _LAWS:
         raise ConfigError(f"law: expected one of {', '.join(law_names())}, found {name!r}")
     return _LAWS[name]
@@ -120,5 +123,4 @@ def law_named(name: str) -> Law:
 
 def law_names() -> list[str]:
     """Names of all registered laws, without the mixtures of them."""
-    law_named("neo_hookean")
     return sorted(name for name in _LAWS if "+" not in name)

@@ -15,7 +15,7 @@ import warp as wp
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.physics.laws import SLOTS, Law, LawParameters, register_law
+from mosa.physics.laws import SLOTS, Law, LawParameters, register_composition, register_law
 
 INDEX = "law"
 """Name of the parameter that says which law a particle follows."""
@@ -131,3 +131,6 @@ def _chosen_mapping(own: Callable, other: Callable, slot: int, number: int) -> C
         return A, yielded
 
     return mapping
+
+
+register_composition("+", register_mixture)
