@@ -21,7 +21,7 @@ from mosa.errors import ConfigError
 ELSEWHERE = ("hydra", "scene", "prior", "reconstruction", "fit.prior", "fit.prior_eta", "fit.joint", "world.walls",
              "world.colliders", "simulate.colliders")  # fmt: skip
 """Sections that are the arguments of what is built from them, or whose keys depend on a kind: there they are named."""
-LOOSE = ("losses", "reconstruction", "heterogeneity", "prior", "adapter")
+LOOSE = ("losses", "reconstruction", "prior", "adapter")
 """Sections of which any key may be left out: each has a default where it is read."""
 
 
@@ -103,7 +103,9 @@ def check_known(values: Mapping[str, Any], conf: Path, name: str, *schemas: Mapp
 
 
 def conf_folder() -> Path | None:
-    """Where the running program's configuration was composed from; None where that is no folder."""
+    """Where the running program's configuration was composed from; None where that is no folder, or nothing runs."""
+    if not HydraConfig.initialized():
+        return None
     sources = HydraConfig.get().runtime.config_sources
     found = next((Path(source.path) for source in sources if source.provider == "main"), None)
     return found if found is not None and found.is_dir() else None
