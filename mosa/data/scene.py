@@ -61,7 +61,8 @@ def load_scene(
     arguments = {k: v for k, v in keys.items() if v is not None}
     arguments["ground"] = ground_from(ground)
     if keys.get("particles") is not None:
-        arguments["particles"] = under(root, keys["particles"])
+        beside = under(root, path) / keys["particles"]  # in the scene's own folder, as its images are
+        arguments["particles"] = beside if beside.is_dir() else under(root, keys["particles"])
     return validate(call(loader, {"path": under(root, path), **arguments}))
 
 
