@@ -30,15 +30,16 @@ def tree_of(conf: Path, name: str) -> dict[str, Any]:
     """Every key of conf/<name>.yaml and of all options of all groups, nested, as a section or None; conf: the folder."""
     tree: dict[str, Any] = {}
     for file in [conf / f"{name}.yaml", *sorted(conf.glob("*/*.yaml"))]:
-        group = "" if file.parent == conf else file.parent.name
-        if group == "hydra":
-            continue
-        text = file.read_text()
-        whole = "@package _global_" in text.partition("\n")[0]
-        found = yaml.safe_load(text) or {}
-        found = {key: value for key, value in found.items() if key != "defaults"}
-        merge(tree, found if whole or not group else {group: found})
+        if file.parent.name != "hydra":
+            merge(tree, placed(file, main=file.parent == conf))
     return tree
+
+
+def placed(file: Path, main: bool = False) -> dict[str, Any]:
+    """The keys of a file, where Hydra puts them: in its group's section, or anywhere with the package _global_."""
+    text = file.read_text()
+    found = {key: value for key, value in (yaml.safe_load(text) or {}).items() if key != "defaults"}
+    return found if main or "@package _global_" in text.partition("\n")[0] else {file.parent.name: found}
 
 
 def merge(tree: dict[str, Any], more: Mapping[str, Any]) -> None:
@@ -89,9 +90,8 @@ def needed(conf: Path, name: str) -> tuple[str, ...]:
     main = yaml.safe_load((conf / f"{name}.yaml").read_text())
     found = list(paths({key: value for key, value in main.items() if key != "defaults"}))
     for group in groups_of(conf, name):
-        options = [yaml.safe_load(file.read_text()) or {} for file in sorted((conf / group).glob("*.yaml"))]
-        shared = set.intersection(*(set(paths(option)) for option in options)) - {"defaults"}
-        found += [group, *(f"{group}.{key}" for key in sorted(shared))]
+        options = [placed(file) for file in sorted((conf / group).glob("*.yaml"))]
+        found += sorted(set.intersection(*(set(paths(option)) for option in options)))
     loose = tuple(f"{section}." for section in (*LOOSE, *ELSEWHERE))
     return tuple(path for path in found if not path.startswith(loose))
 

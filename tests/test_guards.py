@@ -8,7 +8,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from strangers import checkpoint, saved
-from test_config import composed
+from test_known import composed
 
 from mosa.checkpoints import check_same, read_checkpoint
 from mosa.config import rehearse
