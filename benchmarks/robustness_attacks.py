@@ -342,8 +342,9 @@ def caches(folder: Path) -> Iterator[Attack]:
 def runs(folder: Path) -> Iterator[Attack]:
     """Whole processes: an exit code of 2 with one message counts as one."""
     def train(*arguments: str, code: int = 2):
-        found = subprocess.run([sys.executable, "train.py", f"hydra.run.dir={folder}/run", "debug=default", *arguments], cwd=ROOT,
-                               capture_output=True, text=True)
+        flags = [argument for argument in arguments if argument.startswith("-")]
+        keys = [f"hydra.run.dir={folder}/run", "debug=default", *(argument for argument in arguments if argument not in flags)]
+        found = subprocess.run([sys.executable, "train.py", *flags, *keys], cwd=ROOT, capture_output=True, text=True)
         if found.returncode != code or "Traceback" in found.stderr:
             raise AssertionError(f"{found.returncode}: {found.stderr[-300:]}")
         refuse("one message")
