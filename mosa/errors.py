@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+LONGEST = 2000
+"""Characters of a message; what was found may be a file's worth of text."""
+
 
 class MosaError(Exception):
     """Base of every error this package raises on purpose. `train.py` and `eval.py` print it without a traceback."""
+
+    def __str__(self) -> str:
+        message = super().__str__()
+        return message if len(message) <= LONGEST else f"{message[: LONGEST - 500]} ... {message[-500:]}"
 
 
 class DataError(MosaError):

@@ -21,7 +21,7 @@ from mosa.errors import ConfigError
 ELSEWHERE = ("hydra", "scene", "prior", "reconstruction", "fit.prior", "fit.prior_eta", "fit.joint", "world.walls",
              "world.colliders", "simulate.colliders")  # fmt: skip
 """Sections that are the arguments of what is built from them, or whose keys depend on a kind: there they are named."""
-LOOSE = ("losses", "reconstruction", "heterogeneity", "prior", "adapter")
+LOOSE = ("losses", "reconstruction", "prior", "adapter")
 """Sections of which any key may be left out: each has a default where it is read."""
 
 
@@ -30,15 +30,16 @@ def tree_of(conf: Path, name: str) -> dict[str, Any]:
     """Every key of conf/<name>.yaml and of all options of all groups, nested, as a section or None; conf: the folder."""
     tree: dict[str, Any] = {}
     for file in [conf / f"{name}.yaml", *sorted(conf.glob("*/*.yaml"))]:
-        group = "" if file.parent == conf else file.parent.name
-        if group == "hydra":
-            continue
-        text = file.read_text()
-        whole = "@package _global_" in text.partition("\n")[0]
-        found = yaml.safe_load(text) or {}
-        found = {key: value for key, value in found.items() if key != "defaults"}
-        merge(tree, found if whole or not group else {group: found})
+        if file.parent.name != "hydra":
+            merge(tree, placed(file, main=file.parent == conf))
     return tree
+
+
+def placed(file: Path, main: bool = False) -> dict[str, Any]:
+    """The keys of a file, where Hydra puts them: in its group's section, or anywhere with the package _global_."""
+    text = file.read_text()
+    found = {key: value for key, value in (yaml.safe_load(text) or {}).items() if key != "defaults"}
+    return found if main or "@package _global_" in text.partition("\n")[0] else {file.parent.name: found}
 
 
 def merge(tree: dict[str, Any], more: Mapping[str, Any]) -> None:
@@ -89,9 +90,8 @@ def needed(conf: Path, name: str) -> tuple[str, ...]:
     main = yaml.safe_load((conf / f"{name}.yaml").read_text())
     found = list(paths({key: value for key, value in main.items() if key != "defaults"}))
     for group in groups_of(conf, name):
-        options = [yaml.safe_load(file.read_text()) or {} for file in sorted((conf / group).glob("*.yaml"))]
-        shared = set.intersection(*(set(paths(option)) for option in options)) - {"defaults"}
-        found += [group, *(f"{group}.{key}" for key in sorted(shared))]
+        options = [placed(file) for file in sorted((conf / group).glob("*.yaml"))]
+        found += sorted(set.intersection(*(set(paths(option)) for option in options)))
     loose = tuple(f"{section}." for section in (*LOOSE, *ELSEWHERE))
     return tuple(path for path in found if not path.startswith(loose))
 
@@ -103,7 +103,9 @@ def check_known(values: Mapping[str, Any], conf: Path, name: str, *schemas: Mapp
 
 
 def conf_folder() -> Path | None:
-    """Where the running program's configuration was composed from; None where that is no folder."""
+    """Where the running program's configuration was composed from; None where that is no folder, or nothing runs."""
+    if not HydraConfig.initialized():
+        return None
     sources = HydraConfig.get().runtime.config_sources
     found = next((Path(source.path) for source in sources if source.provider == "main"), None)
     return found if found is not None and found.is_dir() else None

@@ -1,5 +1,7 @@
 """A checkpoint as a run leaves it, of a small cube that nothing was fitted to: where tests of malicious ones start from."""
 
+import copy
+import functools
 from pathlib import Path
 
 import torch
@@ -22,7 +24,12 @@ def cube() -> dict[str, torch.Tensor]:
 
 
 def saved(*overrides: str) -> dict:
-    """What `torch.save` would be given; overrides: of the configuration."""
+    """What `torch.save` would be given, a copy of one's own; overrides: of the configuration."""
+    return copy.deepcopy(_saved(*overrides))
+
+
+@functools.cache
+def _saved(*overrides: str) -> dict:
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         cfg = OmegaConf.to_container(compose("train", overrides=["debug=default", *overrides]), resolve=True)
     world = {"ground": {"height": 0.0, "mode": "sticky", "friction": 0.0}, "gravity": [0, -9.8, 0], "up": [0, 1, 0],

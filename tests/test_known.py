@@ -1,5 +1,7 @@
 """Every key of the YAML files is known, every other one is refused with the nearest; what is left out is named."""
 
+import copy
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -17,7 +19,9 @@ ROOT = Path(__file__).parents[1]
 CONF = ROOT / "conf"
 
 
+@functools.cache
 def composed(*overrides: str, name: str = "train") -> dict:
+    """Not to be changed: composing takes longer than any test here."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return OmegaConf.to_container(compose(name, overrides=list(overrides)), resolve=False)
 
@@ -56,14 +60,17 @@ def test_what_is_known_passes(overrides):
 ])  # fmt: skip
 def test_an_unknown_key_is_refused_with_the_nearest(override, nearest):
     key = override[1:].split("=")[0]
+    values = copy.deepcopy(composed())
+    part = functools.reduce(dict.__getitem__, key.split(".")[:-1], values)
+    part[key.split(".")[-1]] = 1
     with pytest.raises(ConfigError, match=rf"^{key}: unknown key; the nearest known one is {nearest}"):
-        check(override)
+        check_known(values, CONF, "train", TRAINING, EVALUATION)
 
 
 @pytest.mark.parametrize("key", ["seed", "scene", "adapter", "fit", "fit.views", "fit.prior", "world.colliders", "losses",
                                  "trainer", "simulation.stride", "rendering.backend", "logger.enabled", "resume"])
 def test_a_key_that_was_deleted_is_named(key):
-    values = composed()
+    values = copy.deepcopy(composed())
     *above, last = key.split(".")
     part = values
     for level in above:

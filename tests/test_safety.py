@@ -7,11 +7,14 @@ import zipfile
 import numpy as np
 import pytest
 import torch
+import yaml
 from omegaconf import OmegaConf
 from strangers import checkpoint
 
+from mosa.data.transforms import read_transforms
 from mosa.errors import DataError
 from mosa.guards import evaluated_scene
+from mosa.known import tree_of
 from mosa.npz import read_npz, write_npz
 from mosa.twin import Twin
 
@@ -210,3 +213,22 @@ def test_a_cut_npz_is_named(tmp_path, share):
     (tmp_path / "a.npz").write_bytes(content[: int(share * len(content))])
     with pytest.raises(DataError, match=r"a\.npz: expected a readable npz"):
         read_npz(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("tag", ["!!python/object/apply:os.system ['touch {}']", "!!python/object/new:pathlib.Path ['{}']"])
+def test_a_malicious_yaml_runs_nothing(tmp_path, tag):
+    (tmp_path / "train.yaml").write_text("seed: 0\n")
+    (tmp_path / "prior").mkdir()
+    (tmp_path / "prior" / "evil.yaml").write_text("law: " + tag.format(tmp_path / "touched") + "\n")
+    with pytest.raises(yaml.constructor.ConstructorError):
+        tree_of(tmp_path, "train")
+    with pytest.raises(yaml.constructor.ConstructorError):
+        OmegaConf.load(tmp_path / "prior" / "evil.yaml")  # Hydra's reader
+    assert not (tmp_path / "touched").exists()
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"frames": [' + '{"a":' * 50_000, '{"frames": ' + "9" * 100_000 + "}"])
+def test_a_malicious_listing_is_one_message(tmp_path, text):
+    (tmp_path / "transforms.json").write_text(text)
+    with pytest.raises(DataError, match=r"transforms\.json: expected"):
+        read_transforms(tmp_path)

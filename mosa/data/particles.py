@@ -10,6 +10,7 @@ import torch
 from plyfile import PlyData, PlyParseError
 from torch import Tensor
 
+from mosa.data.ply import check_ply
 from mosa.errors import DataError
 
 
@@ -17,6 +18,7 @@ def read_ply(path: Path) -> Tensor:
     """(M, 3) [m] vertices of a PLY file. Errors: DataError naming the file."""
     if not path.is_file():
         raise DataError(f"{path}: file not found")
+    check_ply(path)
     try:
         vertices = PlyData.read(path)["vertex"]
         points = np.stack([np.asarray(vertices[axis], dtype=np.float32) for axis in "xyz"], -1)

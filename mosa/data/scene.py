@@ -102,10 +102,11 @@ def beside(path: Path, name: str) -> Path | None:
 
 def call(loader: Callable, arguments: dict) -> Scene:
     """loader(**arguments). Errors: ConfigError where it does not know a key that is set."""
-    known = set(inspect.signature(loader).parameters)
-    if "world" in known:
-        known |= set(inspect.signature(assemble).parameters)
-    for key, parameter in inspect.signature(loader).parameters.items():
+    takes = dict(inspect.signature(loader).parameters)
+    if "world" in takes:
+        takes |= {k: p for k, p in inspect.signature(assemble).parameters.items() if k not in ("name", "footage")}
+    known = set(takes)
+    for key, parameter in takes.items():
         if parameter.default is parameter.empty and parameter.kind is parameter.KEYWORD_ONLY and key not in arguments:
             raise ConfigError(f"scene.{key}: expected a value, found none")
     for key in arguments:

@@ -13,6 +13,7 @@ import torch
 from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
+from mosa.data.ply import check_ply
 from mosa.errors import DataError
 from mosa.rendering.covariance import scales_and_rotations
 from mosa.rendering.spherical_harmonics import DEGREES, constant_coefficients, degree_of, mean_colors
@@ -67,6 +68,7 @@ def load_ply(path: str | Path) -> tuple[Splats, Tensor]:
     path = Path(path)
     if not path.is_file():
         raise DataError(f"{path}: file not found; expected a PLY file of 3D Gaussians")
+    check_ply(path)
     try:
         document = PlyData.read(path)
         vertices = {p.name: document["vertex"][p.name] for p in document["vertex"].properties}

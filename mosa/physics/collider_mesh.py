@@ -12,9 +12,11 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from mosa.errors import ConfigError
+from mosa.errors import ConfigError, DataError
 
 MAX_LATTICE = 2**24
+FARTHEST = 1e6
+"""[m]"""
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,9 @@ def field_of_triangles(
         raise ConfigError(f"mesh: expected vertices (P, 3) and triangles (T, 3), found {points.shape} and {index.shape}")
     if not np.isfinite(points).all() or index.min() < 0 or index.max() >= len(points):
         raise ConfigError(f"mesh: expected finite vertices and indices from 0 to {len(points) - 1}")
+    if float(np.abs(points).max()) > FARTHEST:
+        far = float(np.abs(points).max())
+        raise ConfigError(f"mesh: expected vertices within {FARTHEST:g} m, found one at {far:.3g} m: check scale")
     points, index = _welded(points, index)
     directed = np.concatenate([index[:, [0, 1]], index[:, [1, 2]], index[:, [2, 0]]])
     keys, counts = np.unique(directed, axis=0, return_counts=True)
@@ -88,9 +93,10 @@ def field_of_triangles(
         raise ConfigError(f"mesh: spacing: expected a positive number [m], found {spacing}")
     margin = max(2 * spacing, margin or 0.0)
     low = points.min(0) - margin
-    dims = np.ceil((points.max(0) + margin - low) / spacing).astype(int) + 1
-    if dims.prod() > MAX_LATTICE:
+    dims = np.ceil((points.max(0) + margin - low) / spacing) + 1
+    if not dims.prod() <= MAX_LATTICE:  # in floating point, which does not overflow
         raise ConfigError(f"mesh: a lattice of {dims.tolist()} nodes at spacing {spacing:.3g} m is too large: use a larger spacing")
+    dims = dims.astype(int)
     axes = [low[i] + spacing * np.arange(dims[i]) for i in range(3)]
     lattice = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     values = torch.from_numpy(_signed_distance(points, index, lattice)).reshape(*dims.tolist())
@@ -129,6 +135,8 @@ def field_of_mesh(path: Path, spacing: float | None = None, margin: float | None
         raise ConfigError(f"mesh: {path}: expected a file .obj or .ply")
     try:
         vertices, faces = readers[path.suffix.lower()](path)
+    except DataError as error:
+        raise ConfigError(f"mesh: {error}") from error
     except Exception as error:  # whatever a parser finds: the file is not what its name says
         raise ConfigError(f"mesh: {path} cannot be read ({type(error).__name__}: {error})") from error
     triangles = [(f[0], f[i], f[i + 1]) for f in faces for i in range(1, len(f) - 1)]
@@ -153,6 +161,9 @@ def _read_obj(path: Path) -> tuple[np.ndarray, list]:
 def _read_ply(path: Path) -> tuple[np.ndarray, list]:
     from plyfile import PlyData
 
+    from mosa.data.ply import check_ply
+
+    check_ply(path)
     data = PlyData.read(str(path))
     vertex, face = data["vertex"], data["face"]
     name = next(p.name for p in face.properties if p.name in ("vertex_indices", "vertex_index"))

@@ -222,7 +222,7 @@ def _collider(item: Mapping, where: str) -> Collider:
 
 
 def _motion(item: dict) -> Motion:
-    motion = dict(item.get("motion") or {})
+    motion = {key: value for key, value in (item.get("motion") or {}).items() if value is not None}
     rotation = item.get("rotation")
     if item.get("normal") is not None:
         if rotation is not None:

@@ -189,3 +189,9 @@ def meeting_spread(scene, frame):
     origins, along = lines(scene, frame)
     arm = meeting_point(scene, frame) - origins
     return float((arm - (arm * along).sum(-1, keepdim=True) * along).norm(dim=-1).mean())
+
+
+def test_particles_beside_the_images_are_found(pacnerf_folder, tmp_path):
+    positions = torch.rand(5, 7, 3)
+    export_particles(positions, pacnerf_folder / "ply")
+    assert torch.equal(pacnerf(pacnerf_folder, particles="ply", root=str(tmp_path / "elsewhere")).particles[2], positions[2])

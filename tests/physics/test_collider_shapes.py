@@ -184,7 +184,7 @@ def test_unreadable_files(tmp_path):
     with pytest.raises(ConfigError, match=r"a\.stl: expected a file"):
         field_of_mesh(tmp_path / "a.stl")
     (tmp_path / "a.ply").write_text("no ply")
-    with pytest.raises(ConfigError, match=r"a\.ply cannot be read"):
+    with pytest.raises(ConfigError, match=r"a\.ply: expected a PLY file"):
         field_of_mesh(tmp_path / "a.ply")
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3")
     with pytest.raises(ConfigError, match=r"a\.obj: mesh: expected a closed surface"):

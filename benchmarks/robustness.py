@@ -1,0 +1,77 @@
+"""Attacks on the program, replayed: what a stranger's files and a user's mistakes end in.
+
+    python benchmarks/robustness.py                     # all groups, about two CPU-minutes
+    python benchmarks/robustness.py --only data,npz     # some of them
+    python benchmarks/robustness.py --runs              # and whole processes: exit codes, a sweep of failures (minutes)
+
+Each attack ends in one clear message (a MosaError of one line), in a traceback, in a hang (over 60 s), or it runs. What runs is
+listed: those are the attacks that the program has no word against. The attacks are in robustness_attacks.py.
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+from robustness_attacks import GROUPS
+
+from mosa.errors import MosaError
+
+PATIENCE = 60
+HEAD = "| group | tried | one clear message | traceback or hang | ran |\n|---|---|---|---|---|"
+
+
+class Hang(Exception):
+    """An attack took longer than PATIENCE seconds."""
+
+
+def outcome(attack: Callable[[], object]) -> tuple[str, str]:
+    """(message | traceback | hang | ran, what was said)."""
+
+    def ring(*_):
+        raise Hang
+
+    signal.signal(signal.SIGALRM, ring)
+    signal.alarm(PATIENCE)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            attack()
+    except MosaError as error:
+        return ("message" if "\n" not in str(error) else "traceback"), str(error)
+    except Hang:
+        return "hang", ""
+    except BaseException as error:  # an attack may end in anything
+        return "traceback", f"{type(error).__name__}: {error}"
+    finally:
+        signal.alarm(0)
+    return "ran", ""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default=",".join(name for name in GROUPS if name != "runs"))
+    parser.add_argument("--runs", action="store_true")
+    options = parser.parse_args()
+    rows, said = [], []
+    for name in [*options.only.split(","), *(["runs"] if options.runs else [])]:
+        counts = dict.fromkeys(("message", "traceback", "hang", "ran"), 0)
+        with tempfile.TemporaryDirectory() as folder:
+            for what, attack in GROUPS[name](Path(folder)):
+                kind, text = outcome(attack)
+                counts[kind] += 1
+                said += [f"{name}: {kind}: {what[:100]} {text[:150]}"] if kind != "message" else []
+        rows.append(f"| {name} | {sum(counts.values())} | {counts['message']} | {counts['traceback'] + counts['hang']} | "
+                    f"{counts['ran']} |")
+        print(rows[-1], flush=True)
+    print("\n".join(["", HEAD, *rows, "", *said]))
+    sys.exit(1 if any("traceback:" in line or "hang:" in line for line in said) else 0)
+
+
+if __name__ == "__main__":
+    main()
