@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import math
 import os
@@ -26,11 +27,16 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         partial = path.with_name(path.name + ".partial")
-        with open(partial, "wb") as file:
-            torch.save(checkpoint, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
+        try:
+            with open(partial, "wb") as file:
+                torch.save(checkpoint, file)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(partial, path)
+        except RuntimeError as error:  # what torch makes of a disk that is full
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
+        finally:
+            partial.unlink(missing_ok=True)
 
 
 class KeepLast(L.Callback):
@@ -102,17 +108,19 @@ class StageNotes(L.Callback):
 
 
 class Pace(L.Callback):
-    """Logs what a step took (`time/step_s`) and the learning rate of each group of parameters in it (`lr/<group>`)."""
+    """Logs what a step took (`time/step_s`) and the learning rate of each group of parameters in it (`lr/<group>`); a step in which
+    no optimiser of torch stepped has none."""
 
     def __init__(self) -> None:
-        self.began, self.index = 0.0, 0
+        self.began, self.index, self.stepped = 0.0, 0, 0
 
     def on_train_batch_start(self, trainer, module, batch, batch_idx) -> None:
         self.began, self.index = time.perf_counter(), module.stage_index  # the step may be its stage's last
+        self.stepped = trainer.global_step  # counts steps of optimisers, not of the fit
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
         values = {"time/step_s": time.perf_counter() - self.began}
-        for optimizer in trainer.optimizers[self.index : self.index + 1]:
+        for optimizer in trainer.optimizers[self.index : self.index + 1] if trainer.global_step > self.stepped else ():
             values |= {f"lr/{group.get('name', k)}": group["lr"] for k, group in enumerate(optimizer.param_groups)}
         module.log_dict({k: torch.tensor(v, dtype=torch.float32) for k, v in values.items()}, on_step=True, on_epoch=False)
 
@@ -128,7 +136,7 @@ class ImageStrips(L.Callback):
             add_picture(module.loggers, "real_above_rendered_below", enlarged(module.strip()), module.steps_done)
 
 
-LEGIBLE = 480
+LEGIBLE = 320
 """Height [px] that a strip of two rows has at least: windows around an object are often 60 px high."""
 
 

@@ -153,6 +153,31 @@ def checked(checkpoint: Mapping[str, Any], path: str | Path) -> tuple[dict, dict
     return config, saved["start"], tensors
 
 
+def checked_posterior(checkpoint: Mapping[str, Any], numbers: int, path: str | Path) -> dict | None:
+    """What `Posterior.read` takes, of a body with so many learned numbers; None where the run kept none. Errors: DataError."""
+    found = checkpoint["mosa"].get("posterior")
+    if found is None:
+        return None
+    where = f"ckpt_path: {path}: mosa.posterior"
+    shapes = {"mean": (numbers,), "covariance": (numbers, numbers), "determined": (numbers,)}
+    try:
+        parts(found, ("names", "model_error", *shapes), "mosa.posterior")
+    except ConfigError as error:
+        raise DataError(f"ckpt_path: {path}: {error}") from error
+    for name, shape in shapes.items():
+        value = found[name]
+        if not isinstance(value, Tensor) or tuple(value.shape) != shape or not bool(torch.isfinite(value).all()):
+            raise DataError(f"{where}.{name}: expected {' x '.join(map(str, shape))} finite numbers")
+    names = found["names"]
+    if not isinstance(names, list) or len(names) != numbers or not all(isinstance(n, str) for n in names):
+        raise DataError(f"{where}.names: expected {numbers} names")
+    if not is_number(found["model_error"]) or found["model_error"] < 0:
+        raise DataError(f"{where}.model_error: expected a distance in m, found {found['model_error']!r}")
+    if not float(torch.linalg.eigvalsh(found["covariance"].double()).min()) > 0:
+        raise DataError(f"{where}.covariance: expected a positive definite matrix")
+    return found
+
+
 def parts(found: Any, wanted: Iterable[str], where: str) -> None:
     """Errors: ConfigError naming the parts that are missing."""
     if not isinstance(found, Mapping):
@@ -172,11 +197,27 @@ def check_tensors(tensors: Mapping[str, Any], path: str | Path) -> None:
             raise DataError(f"ckpt_path: {path}: body.{name}: expected floating point numbers of shape "
                             f"({', '.join(('N', *map(str, each)))}), N particles, found {found.dtype} {tuple(found.shape)}")
     for name, value in tensors.items():
+        if not isinstance(value, Tensor):
+            raise DataError(f"ckpt_path: {path}: body.{name}: expected a tensor, found {type(value).__name__}")
         unset = name.startswith("adapter.") and value.ndim == 0  # an adapter that was not switched on yet has no unit
-        if not isinstance(value, Tensor) or (value.is_floating_point() and not unset and not bool(torch.isfinite(value).all())):
+        if value.is_floating_point() and not unset and not bool(torch.isfinite(value).all()):
             raise DataError(f"ckpt_path: {path}: body.{name}: expected finite numbers")
     if not float(tensors["volume"].min()) > 0 or not math.isfinite(float(tensors["rest"].abs().max())):
         raise DataError(f"ckpt_path: {path}: body.volume: expected volumes above 0 m^3, found {float(tensors['volume'].min()):g}")
+
+
+def check_same(checkpoint: Mapping[str, Any], module: torch.nn.Module, path: str | Path) -> None:
+    """The checkpoint is of this very model. Errors: DataError naming the first part that is not."""
+    here, there = module.state_dict(), checkpoint["state_dict"]
+    count = len(here["body.rest"])
+    if checkpoint["mosa"]["particles"] != count:
+        raise DataError(f"ckpt_path: {path}: expected a body of {count} particles, found {checkpoint['mosa']['particles']}: the "
+                        "checkpoint belongs to another scene, reconstruction or simulation.particles")
+    for name in sorted(set(here) | set(there)):
+        found = [tuple(state[name].shape) if isinstance(state.get(name), Tensor) else None for state in (here, there)]
+        if found[0] != found[1]:
+            raise DataError(f"ckpt_path: {path}: {name}: expected {found[0] or 'nothing of that name'}, found {found[1]}: "
+                            "the checkpoint belongs to another configuration (adapter, prior, heterogeneity)")
 
 
 def check_resumed(checkpoint: Mapping[str, Any], path: str | Path) -> None:
@@ -186,5 +227,7 @@ def check_resumed(checkpoint: Mapping[str, Any], path: str | Path) -> None:
         parts(checkpoint["mosa"], ("stage", "losses", "steps_done", "particles"), "mosa")
         counts = or_null(whole(0))
         check(checkpoint["mosa"], {name: counts for name in ("stage", "steps_done", "particles")})
+        check({"losses": checkpoint["mosa"]["losses"]}, {"losses": Kind("numbers", lambda v: isinstance(v, list) and all(
+            isinstance(x, (int, float)) for x in v))})
     except ConfigError as error:
         raise DataError(f"ckpt_path: {path}: {error}; a fit goes on from a checkpoint that train.py wrote") from error

@@ -22,9 +22,9 @@ from mosa.modules.material import Material
 from mosa.modules.stages import Stage
 from mosa.modules.stiffness_modes import StiffnessModes
 from mosa.physics.boundary import Plane
-from mosa.physics.laws import law_named
 from mosa.physics.collider_motion import Motion
 from mosa.physics.colliders import colliders_from_config, domain_walls
+from mosa.physics.laws import law_named
 from mosa.types import Ground, Scene
 
 if TYPE_CHECKING:
@@ -64,8 +64,8 @@ def build_walls(walls: Mapping[str, Any] | None, box: Tensor) -> tuple[Plane, ..
     """The six sides of the box, none where `walls` is None. Errors: ConfigError naming the key."""
     if walls is None:
         return ()
-    if "mode" not in walls:
-        raise ConfigError("world.walls: expected null, or {mode: separate, friction: 0.1}, found no mode")
+    if not walls:
+        raise ConfigError("world.walls: expected null, or keys as in {mode: separate, friction: 0.1}, found none")
     return tuple(known_keys("world.walls", domain_walls, walls, box))
 
 
@@ -92,13 +92,18 @@ def fitting(adapter: torch.nn.Module | None, law: str) -> torch.nn.Module | None
     known = law_named(law)
     if getattr(adapter, "strain", None) is None or ("mu" in known.offsets and known.viscosity is None):
         return adapter
-    warnings.warn(f"adapter: {law} has no shear stiffness that could be anisotropic; the run learns its parameters and stiffness modes "
-                  "alone (adapter=mosa corrects its stress by networks)", stacklevel=2)
+    warnings.warn(f"adapter: {law} has no shear stiffness that could be anisotropic; the run learns its parameters and stiffness "
+                  "modes alone (adapter=mosa corrects its stress by networks)", stacklevel=2)
     return None
 
 
 def build_simulation(config: Mapping[str, Any], dx: float) -> SimulationSettings:
     """Settings of the rollouts on a grid of spacing dx [m]."""
+    if missing := [k for k in ("stride", "max_substeps", "courant", "precision", "contact_offset") if k not in config]:
+        raise ConfigError(f"simulation.{missing[0]}: expected this key, found none")
+    if config["stride"] > config["max_substeps"]:
+        raise ConfigError(f"simulation.stride: expected at most simulation.max_substeps={config['max_substeps']}, as a frame has "
+                          f"whole strides, found {config['stride']}")
     names = ("stride", "max_substeps", "courant", "precision", "contact_offset")
     newer = (name for name in ("adaptive", "min_substeps") if name in config)  # than some checkpoints
     return SimulationSettings(dx=dx, **{name: config[name] for name in (*names, *newer)})
@@ -110,7 +115,7 @@ def build_prior(config: Mapping[str, Any]) -> tuple[Material, dict[str, Any]]:
     options = keys.pop("options", None) or {}
     if unknown := [name for name in options if name not in LAW_OPTIONS]:
         raise ConfigError(f"prior.options.{unknown[0]}: unknown key; expected one of {', '.join(LAW_OPTIONS)}")
-    keys["frozen"] = keys.get("frozen") or ()
+    keys["frozen"], keys["candidates"] = keys.get("frozen") or (), keys.get("candidates") or ()
     return known_keys("prior", Material, keys), options
 
 
@@ -142,9 +147,12 @@ def rehearse(cfg: Mapping[str, Any]) -> None:
             warnings.simplefilter("ignore")
             adapter = fitting(build_adapter(cfg["adapter"]), material.law)
     build_simulation(cfg["simulation"], 1.0)
-    build_stages(cfg["fit"], heterogeneity, adapter)
+    build_stages(cfg["fit"], heterogeneity, adapter, bool(material.candidates))
     build_criterion(cfg)
     build_identification(cfg)
+    if not any(cfg["losses"].get(name) for name in ("image", "mask", "flow", "rotation", "stretch", "position")):
+        raise ConfigError("losses: expected a weight above 0 for image, mask, flow, rotation, stretch or position: nothing else "
+                          "tells the prior anything")
     build_walls(cfg["world"]["walls"], torch.stack([low, high]))
     for collider in colliders_from_config(cfg["world"]["colliders"] or ()):
         if isinstance(collider.motion, Motion) and collider.motion.times is not None:
@@ -156,6 +164,9 @@ def known_keys(where: str, build: Callable, keys: Mapping[str, Any], *positional
     known = inspect.signature(build).parameters
     if unknown := [k for k in keys if k not in known]:
         raise ConfigError(f"{where}.{unknown[0]}: unknown key; expected one of {', '.join(list(known)[len(positional):])}")
+    needed = [k for k, parameter in list(known.items())[len(positional):] if parameter.default is parameter.empty]
+    if missing := [k for k in needed if k not in keys]:
+        raise ConfigError(f"{where}.{missing[0]}: expected this key, found none")
     return build(*positional, **keys)
 
 
@@ -189,13 +200,17 @@ def build_identification(cfg: Mapping[str, Any]) -> IdentificationSettings:
 
 
 def build_stages(
-    fit: Mapping[str, Any], heterogeneity: torch.nn.Module | None, adapter: torch.nn.Module | None
+    fit: Mapping[str, Any], heterogeneity: torch.nn.Module | None, adapter: torch.nn.Module | None, searching: bool = False
 ) -> list[Stage]:
-    """The stages of a run, without those that have nothing to optimise or no iterations, each with the optimiser that it runs."""
+    """The stages of a run, without those that have nothing to optimise or no iterations, each with the optimiser that it runs.
+
+    searching: whether the calibration chooses the law too."""
     stages = [known_keys(f"fit.{name}", Stage, fit[name], name) for name in ("prior", "prior_eta", "joint")]
     parts = {"prior": (), "prior_eta": (heterogeneity,), "joint": (heterogeneity, adapter)}
     wanted = {"prior": True, "prior_eta": heterogeneity is not None, "joint": adapter is not None or heterogeneity is not None}
     stages = [s.resolved(all(map(few_numbers, parts[s.name]))) for s in stages if wanted[s.name] and s.iterations > 0]
+    if searching and stages and not stages[0].newton:
+        raise ConfigError("prior=auto: expected fit.prior.optimizer auto or gauss_newton, which compares the candidates; found adam")
     if not stages or stages[0].name != "prior":
         raise ConfigError("fit.prior.iterations: expected at least 1: every later figure is compared with the calibrated prior")
     return stages

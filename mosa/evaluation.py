@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mosa import metrics
 from mosa.analysis.anisotropy import stiffest_axis
-from mosa.analysis.stiffness import stiffest
+from mosa.analysis.stiffness import angle_between, stiffest
 from mosa.analysis.vibration import GROWTH_LIMIT, vibration_growth
 from mosa.errors import SimulationDiverged
 from mosa.modules.body import VARIANTS, Body, Start, World
@@ -227,6 +227,24 @@ def identification(body: Body, scene: Scene) -> dict[str, float]:
                 figures |= {f"{prefix}/{key}": value for key, value in errors.items()}
         figures[f"{prefix}/contact_offset_m"] = float(contact().detach())
     return figures
+
+
+def hidden_figures(body: Body, scene: Scene, figures: Mapping[str, float]) -> dict[str, float]:
+    """What was learned beside the hidden material of a built-in scene: `id/fibre_angle_deg` between the stiffest direction found
+    (of `law_figures`) and the fibres, `id/stiffness_correlation` of the stiffness over the particles, each where the truth has
+    it."""
+    if scene.truth is None or not scene.synthetic:
+        return {}
+    from mosa.data.builtin.floor import hidden_of
+
+    hidden, found = hidden_of(scene), {}
+    fibre, axis = getattr(hidden, "fibre", None), [figures.get(f"id/stiffest_{name}") for name in "xyz"]
+    if fibre is not None and getattr(hidden, "ratio", 1) > 1 and None not in axis:
+        found["id/fibre_angle_deg"] = float(angle_between(torch.tensor(axis), torch.tensor(fibre)))
+    learned, true = body.factor(body.parts("adapted")[2]).detach().cpu(), hidden.factor(body.rest.cpu().float())
+    if float(true.std()) > 1e-6 and float(learned.std()) > 1e-6:
+        found["id/stiffness_correlation"] = float(torch.corrcoef(torch.stack([true, learned.float()]))[0, 1])
+    return found
 
 
 def law_figures(body: Body) -> dict[str, float]:

@@ -12,7 +12,7 @@ import shutil
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
@@ -41,6 +41,16 @@ def folder_name(overrides: str) -> str:
 
 
 OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
+
+
+def check_arguments(arguments: Sequence[str], conf: Path) -> None:
+    """Exit with 2 and a message for <group>=null, to which Hydra answers with a traceback; conf: the folder of the groups."""
+    for argument in arguments:
+        group, mark, value = argument.lstrip("+").partition("=")
+        if mark and value in ("", "null", "Null", "NULL", "~") and "." not in group and group and (conf / group).is_dir():
+            options = ", ".join(sorted(file.stem for file in (conf / group).glob("*.yaml")))
+            print(f"\nConfigError: {group}: expected one of {options}, found {argument!r}", file=sys.stderr)
+            sys.exit(2)
 
 
 class Failures(Callback):

@@ -18,24 +18,34 @@ from lightning.pytorch.plugins.environments import LightningEnvironment
 from omegaconf import DictConfig, OmegaConf
 
 from mosa import __version__, parallel
-from mosa.analysis.figures import side_by_side, write_strip, write_video
-from mosa.analysis.tables import parameter_table, results_table
+from mosa.analysis.comparison import compare, write_comparisons
+from mosa.analysis.tables import determined_text, parameter_table, results_table
 from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLast, Pace, StageNotes
-from mosa.config import build_body, build_fit, build_world, plain, rehearse, run_config, world_config
-from mosa.data.agreement import seen_at
+from mosa.checkpoints import check_same, read_checkpoint
+from mosa.config import build_body, build_fit, build_world, plain, run_config, world_config
 from mosa.data.datamodule import MultiViewDataModule, training_observations
 from mosa.data.sequences import load_sequences, taught_names
 from mosa.errors import ConfigError, DataError, MosaError
-from mosa.evaluation import Sequence, evaluate, floor_figures, identification, law_figures, render, true_motion
+from mosa.evaluation import (
+    Sequence,
+    evaluate,
+    floor_figures,
+    hidden_figures,
+    identification,
+    law_figures,
+    test_means,
+    true_motion,
+)
+from mosa.guards import check_begin, check_configuration, check_evaluation, check_seen, check_starts, evaluated_scene
 from mosa.loggers import build_loggers, chosen, log_outcome
 from mosa.modules.body import Body, Start, World
+from mosa.modules.gauss_newton import Posterior
 from mosa.modules.lit_mosa import LitMosa, Take
-from mosa.physics.collider_overlap import check_clear
-from mosa.physics.colliders import colliders_from_config
 from mosa.physics.memory import KEPT_ON_CPU
+from mosa.plan import plan, plan_text
+from mosa.prediction import determined, predicted_spread
 from mosa.progress import tqdm
 from mosa.reconstruction.starts import first_contact, sequence_start, splats_of
-from mosa.rendering.cameras import crop_boxes, crop_images
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import use_backend
 from mosa.run import (
@@ -48,8 +58,7 @@ from mosa.run import (
     shared_starts,
     write_figures,
 )  # fmt: skip
-from mosa.schema import EVALUATION, SIMULATION, TRAINING, check
-from mosa.twin import Twin, save_observed, save_rollout, save_truth
+from mosa.twin import Twin, save_observed, save_rollout, save_spread, save_truth
 from mosa.types import MotionCues, Reconstruction, Scene
 
 log = logging.getLogger(__name__)
@@ -66,7 +75,7 @@ class Clock:
         began = time.perf_counter()
         yield
         self.figures[f"time/{stage}_s"] = self.figures.get(f"time/{stage}_s", 0.0) + time.perf_counter() - began
-        log.info("%s: done in %.1f s", stage, time.perf_counter() - began)
+        log.info("%s took %.1f s", stage, time.perf_counter() - began)
 
 
 def run_folder() -> Path:
@@ -112,13 +121,6 @@ def starts(
     return found
 
 
-def check_starts(world: World, body: Body, found: dict[str, Start]) -> None:
-    """No sequence starts inside of a solid. Errors: ConfigError naming the collider."""
-    for prefix, start in found.items():
-        x = (body.rest - body.center) @ start.rotation.to(body.rest).T + start.center.to(body.rest)
-        check_clear(world.colliders, x, f"the body of {prefix}")
-
-
 def sequences(body: Body, training: Scene, others: list[Scene], found: dict[str, Start]) -> list[Sequence]:
     """found: start by prefix, in the order of the sequences (`starts`)."""
     return [Sequence(p, s, start, first_contact(body, start, s)) for (p, start), s in zip(found.items(), [training, *others])]
@@ -133,8 +135,7 @@ def run_sequences(config: dict, body: Body) -> list[Sequence]:
 def train(cfg: DictConfig) -> float | None:
     """Run everything `cfg` asks for; returns the figure a sweep optimises. Errors: MosaError of whatever was wrong."""
     quiet()
-    check(plain(cfg), TRAINING, EVALUATION)
-    rehearse(plain(cfg))
+    check_configuration(plain(cfg))
     chosen(plain(cfg.logger))
     L.seed_everything(cfg.seed, verbose=False)
     clock, folder = Clock(), run_folder()
@@ -143,14 +144,14 @@ def train(cfg: DictConfig) -> float | None:
         log.info("skipped: %s has its metrics.json (resume=auto)", folder)
         return optimized(done, cfg.optimized_metric)
     cfg.ckpt_path = begins_from(cfg, folder)
+    check_begin(cfg)
     device = device_of(cfg)
     use_backend(cfg.rendering.backend)
     with clock.measure("data"):
         scene, held_out = scenes(cfg)
     taught = taught_names(plain(cfg.scene))
     parallel.check_share(len(device_names(cfg)), 1 + len(taught), min(cfg.fit.views, len(scene.training_cameras)))
-    if (place := seen_at(scene)) is not None:  # before the reconstruction; the body itself is checked after it
-        check_clear(colliders_from_config(plain(cfg.world)["colliders"] or ()), place[None], "the object, as frame 0 shows it,")
+    check_seen(cfg, scene)
     if scene.synthetic:
         log.info("scene %s: synthetic, made by this program; not a capture", scene.name)
     with clock.measure("reconstruction"):
@@ -177,16 +178,28 @@ def train(cfg: DictConfig) -> float | None:
     learned_from = [prefix for prefix in found if prefix.startswith("train")]
     save_observed(folder / "observed.npz", {prefix: take.cues for prefix, take in zip(learned_from, module.takes)})
     with clock.measure("evaluation"):
-        figures, kept = evaluate(body, sequences(body, scene, held_out, found), world,
-                                 samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
+        evaluated = sequences(body, scene, held_out, found)
+        figures, kept = evaluate(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
     figures |= identification(body, scene) | law_figures(body) | start_figures(found["train"])
+    figures |= hidden_figures(body, scene, figures) | posterior_figures(body, module.posterior, evaluated, world, folder)
+    figures |= {f"id_prior/compared/{law}_m": distance for law, distance in module.compared.items()}
     if cfg.evaluation.floor:
-        figures |= floor_figures(body, sequences(body, scene, held_out, found), world,
-                                 samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
+        figures |= floor_figures(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
     figures |= clock.figures | cost(device) | {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
     log_outcome(plain(cfg.logger), folder, plain(cfg), figures)
-    write_outputs(folder, cfg, body, sequences(body, scene, held_out, found), figures, kept)
+    write_outputs(folder, cfg, body, evaluated, figures, kept)
     return optimized(figures, cfg.optimized_metric)
+
+
+def posterior_figures(body: Body, posterior: Posterior | None, evaluated: list[Sequence], world: World, folder: Path) -> dict:
+    """What the data determined and how sure predictions are; uncertainty.npz with the latter. Nothing where there is no
+    posterior."""
+    if posterior is None:
+        return {}
+    figures, spreads = predicted_spread(body, posterior, evaluated, world)
+    if spreads:
+        save_spread(folder / "uncertainty.npz", spreads)
+    return figures | test_means(figures) | determined(body, posterior)
 
 
 def body_of(reconstruction: Reconstruction, config: dict) -> Body:
@@ -256,9 +269,9 @@ def fit_estimate(module: LitMosa, processes: int = 1) -> str:
 
 
 def fit(cfg, module: LitMosa, data: MultiViewDataModule, folder: Path, device: str) -> None:
-    """The staged optimisation under Lightning; resumes from cfg.ckpt_path. Errors: ConfigError for a missing checkpoint."""
-    if cfg.ckpt_path is not None and not Path(cfg.ckpt_path).is_file():
-        raise ConfigError(f"ckpt_path: no file {cfg.ckpt_path}; a run writes <run folder>/checkpoints/last.ckpt")
+    """The staged optimisation under Lightning; resumes from cfg.ckpt_path. Errors: DataError for a checkpoint of another run."""
+    if cfg.ckpt_path is not None:
+        check_same(read_checkpoint(cfg.ckpt_path), module, cfg.ckpt_path)
     settings = plain(cfg.logger)
     logger = build_loggers(settings, folder)
     callbacks = [KeepLast(folder / "checkpoints"), FitProgress(), StageNotes(), *([Pace()] if logger else [])]
@@ -301,27 +314,11 @@ def write_outputs(folder: Path, cfg: DictConfig, body: Body, evaluated: list[Seq
         save_truth(folder / "truth.npz", known)
     if cfg.evaluation.video:
         shown = [s for s in evaluated if s.prefix.startswith("test")] or evaluated[-1:]
-        pictures = {s.prefix: comparison(body, s, kept[s.prefix]) for s in shown}
-        columns = pictures[shown[-1].prefix]
-        enlarge = max(1, round(320 / max(columns["real"].shape[1:3])))
-        write_video(folder / "video.mp4", side_by_side(columns, enlarge), fps=6)
-        rows = {f"{prefix}: {title}": images for prefix, each in pictures.items() for title, images in each.items()}
-        write_strip(folder / "strip.png", rows, enlarge=max(1, enlarge - 1))
-    table = results_table(figures) + "\n\n" + parameter_table(figures)
+        write_comparisons(folder, {s.prefix: compare(body, s, kept[s.prefix]) for s in shown})
+    table = "\n\n".join(filter(None, (results_table(figures), parameter_table(figures), determined_text(figures))))
     (folder / "results.md").write_text(table + "\n")
     write_figures(folder, figures)  # the last file: the run is complete
     log.info("\n%s\n\nrun folder: %s", table, folder)
-
-
-def comparison(body: Body, shown: Sequence, variants: dict) -> dict:
-    """Images (T, h, w, 3) of real, prior and adapted from the first camera, cut to where the object goes."""
-    scene = shown.scene
-    camera = [(scene.training_cameras or [0])[0]]
-    x0, y0, width, height = crop_boxes(scene.mattes[camera], margin=16)
-    columns = {"real": scene.images[camera]}
-    for variant, title in (("prior", "prior"), ("adapted", "adapted (MoSA)")):
-        columns[title] = render(body, variants[variant], scene, camera).cpu()
-    return {title: crop_images(images, x0, y0, width, height, axis=2)[0] for title, images in columns.items()}
 
 
 def optimized(figures: dict[str, float], wanted: str) -> float | None:
@@ -338,9 +335,14 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     if OmegaConf.is_missing(cfg, "ckpt_path"):
         raise ConfigError("ckpt_path: expected the checkpoint of a run, found none; "
                           "python eval.py ckpt_path=<run folder>/checkpoints/last.ckpt")
-    check(plain(cfg), EVALUATION, SIMULATION)
+    check_evaluation(plain(cfg))
     folder = run_folder()
     twin = Twin.load(cfg.ckpt_path, named_device(cfg.device))
+    if cfg.plan is not None:
+        ranked = plan(twin, count=cfg.plan)
+        log.info("\n%s", plan_text(ranked))
+        (folder / "plan.md").write_text(plan_text(ranked) + "\n")
+        return -ranked[0].gain
     simulate = plain(cfg.simulate)
     if any(simulate[k] is not None for k in ("velocity", "rotation", "height", "angular_velocity", "colliders")):
         rollout = twin.simulate(**simulate, progress=True)
@@ -362,22 +364,11 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     evaluated = sequences(body, scene, held_out, found)
     figures, kept = evaluate(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
     figures |= identification(body, scene) | law_figures(body)
+    figures |= hidden_figures(body, scene, figures) | posterior_figures(body, twin.posterior, evaluated, world, folder)
     if cfg.evaluation.floor:
         figures |= floor_figures(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
     write_outputs(folder, cfg, body, evaluated, figures, kept)
     return optimized(figures, "test/rms_m")
-
-
-def evaluated_scene(cfg: DictConfig, twin: Twin) -> DictConfig:
-    """The keys of the scene to evaluate on: eval.py's own, else what the run stored, which is read as data. Stored paths are read
-    from, and never written to: what is made goes to eval.py's own cache. Errors: DataError."""
-    stored = twin.config["cfg"].get("scene")
-    if not cfg.get("scene") and not isinstance(stored, dict):
-        raise DataError(f"ckpt_path: {cfg.ckpt_path}: expected the stored configuration's scene, found none; set scene=<option>")
-    keys = plain(cfg.scene) if cfg.get("scene") else {**stored, "also_train": None, "cache": None}
-    if not cfg.get("scene") and keys.get("path") is not None:
-        print(f"scene: reads {keys['path']} below {keys.get('root')}, as the checkpoint says (scene=... reads another)")
-    return OmegaConf.create({"scene": keys | {"cache": keys.get("cache") or cfg.get("cache")}})
 
 
 def quiet() -> None:

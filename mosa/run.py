@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 
 from mosa import parallel
 from mosa.config import plain
-from mosa.errors import ConfigError
+from mosa.errors import ConfigError, DataError
 from mosa.modules.body import Body, Start
 
 log = logging.getLogger(__name__)
@@ -41,7 +41,13 @@ def write_figures(folder: Path, figures: dict[str, float | str]) -> None:
 
 def read_figures(path: Path) -> dict[str, float | str]:
     """What `write_figures` wrote: infinite figures and those that are not numbers are floats again."""
-    found = json.loads(path.read_text())
+    try:
+        found = json.loads(path.read_text())
+        if not isinstance(found, dict) or not all(isinstance(v, (int, float, str)) for v in found.values()):
+            raise ValueError("no figures by name")
+    except (ValueError, RecursionError, OSError) as error:
+        raise DataError(f"{path}: expected the figures of a complete run, found a damaged file ({error}); remove it and the run is "
+                        "made again") from error
     return {k: SPECIAL.get(v, v) if isinstance(v, str) else v for k, v in found.items()}
 
 

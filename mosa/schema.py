@@ -51,6 +51,7 @@ def is_sequence(value: Any) -> bool:
     return isinstance(value, str) or (isinstance(value, Mapping) and isinstance(value.get("path"), str))
 
 
+TEXT = Kind("a text", lambda v: isinstance(v, str))
 FLAG = Kind("true or false", lambda v: isinstance(v, bool))
 NAMES = Kind("a list of names like [a, b]", lambda v: isinstance(v, list) and all(isinstance(name, str) for name in v))
 SEQUENCES = Kind("a list of names or folders like [a, b], or of sections like {path: a, frames: [0, 9]}",
@@ -66,6 +67,11 @@ WIDEST = 4096
 SECTIONS = ("scene", "prior", "adapter", "reconstruction", "simulation", "fit", "rendering", "trainer", "logger", "evaluation",
             "heterogeneity", "losses", "world", "fit.prior", "fit.prior_eta", "fit.joint", "reconstruction.static",
             "reconstruction.appearance", "reconstruction.dynamic")  # fmt: skip
+
+FIGURE = Kind("a figure's name like test/rms_m (docs/figures.md)",
+              lambda v: isinstance(v, str) and v.split("/")[0] in FIGURES and "/" in v)
+FIGURES = ("train", "test", "camera", "prior", "prior_eta", "id", "id_prior", "floor", "time")
+"""What the names of figures begin with."""
 
 TRAINING: dict[str, Kind] = {
     **{name: SECTION for name in SECTIONS},
@@ -83,17 +89,22 @@ TRAINING: dict[str, Kind] = {
     "heterogeneity.amplitude": POSITIVE,
     "heterogeneity.hidden": whole(1, WIDEST),
     "heterogeneity.frequencies": whole(0, 32),
+    "adapter.name": or_null(TEXT),
+    "adapter._target_": or_null(TEXT),
     "adapter.alpha": POSITIVE,
     "adapter.l_max": or_null(POSITIVE),
     "adapter.input_scale": POSITIVE,
     "adapter.hidden": whole(1, WIDEST),
     **{f"adapter.{name}": FLAG for name in ("rest_free", "plastic", "major_symmetry", "recompute", "no_C", "no_pre", "no_post",
                                             "no_prior_stress")},
-    "simulation.particles": whole(8),
+    "simulation.particles": whole(8, 10**8),
     "simulation.dx": or_null(POSITIVE),
     "simulation.courant": number(0, 1, above=True),  # beyond, an explicit step is unstable
     "simulation.adaptive": FLAG,
     "simulation.contact_offset": FLAG,
+    "simulation.stride": whole(1, 10**6),
+    "simulation.max_substeps": whole(1, 10**6),
+    "prior.law": TEXT,
     "prior.parameters": SECTION,
     "prior.frozen": or_null(NAMES),
     "prior.modulated": or_null(NAMES),
@@ -104,10 +115,14 @@ TRAINING: dict[str, Kind] = {
     "prior.options.on_inversion": one_of("warn", "ignore", "error"),
     "prior.options.init_affine": one_of("spin", "zero"),
     "rendering.margin": whole(0),
-    "reconstruction.resolution": whole(8),
+    "reconstruction.resolution": whole(8, 1024),  # a hull of that many voxels per side has 4 GB
+    "reconstruction.splats": or_null(TEXT),
+    "reconstruction.cue": one_of("neighbourhood", "gaussian"),
+    "reconstruction.dynamic.model": one_of("modes", "network"),
+    "reconstruction.dynamic.carriers": one_of("static", "particles"),
     "reconstruction.ridge_passes": whole(0),
     "reconstruction.carve": FLAG,
-    "reconstruction.points": whole(8),
+    "reconstruction.points": whole(8, 10**8),
     "reconstruction.neighbours": whole(4),  # fewer leave every deformation gradient open
     "reconstruction.margin": whole(0),
     "reconstruction.*.iterations": whole(0),
@@ -141,6 +156,10 @@ TRAINING: dict[str, Kind] = {
     "logger.wandb": or_null(SECTION),
     "logger.wandb.offline": FLAG,
     "logger.wandb.tags": or_null(NAMES),
+    "rendering.backend": TEXT,
+    "ckpt_path": or_null(TEXT),
+    "optimized_metric": FIGURE,
+    "scene.cache": or_null(TEXT),
     "logger.images_every": whole(0),
 }
 BODY = {key: kind for key, kind in TRAINING.items()
@@ -153,6 +172,11 @@ EVALUATION: dict[str, Kind] = {
     "evaluation.video": FLAG,
 }
 SIMULATION: dict[str, Kind] = {
+    **{name: SECTION for name in ("simulate", "evaluation")},
+    "ckpt_path": TEXT,
+    "cache": or_null(TEXT),
+    "plan": or_null(whole(2)),
+    "simulate.variant": one_of("adapted", "prior_eta", "prior"),
     "simulate.velocity": or_null(THREE),
     "simulate.angular_velocity": or_null(THREE),
     "simulate.rotation": or_null(TURN),

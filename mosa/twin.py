@@ -20,14 +20,17 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from mosa.analysis.figures import side_by_side, write_video
-from mosa.checkpoints import TENSORS, checked, read_checkpoint
-from mosa.errors import ConfigError, DataError, MosaError
+from mosa.checkpoints import TENSORS, checked, checked_posterior, read_checkpoint
+from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
 from mosa.limits import machine_memory
 from mosa.modules.body import VARIANTS, Body, Start, World
+from mosa.modules.gauss_newton import Posterior
+from mosa.modules.identification import read_numbers, write_numbers
 from mosa.modules.observer import deformed_covariances, observe
 from mosa.npz import write_npz
 from mosa.physics.collider_overlap import check_clear
 from mosa.physics.colliders import Collider, colliders_from_config
+from mosa.prediction import total_spread
 from mosa.progress import tqdm
 from mosa.rendering.cameras import look_at
 from mosa.schema import is_number
@@ -37,9 +40,11 @@ from mosa.types import Cameras, MotionCues, Rollout
 class Twin:
     """A learned body in its world. `frame_dt` [s]: time between the frames it was trained on."""
 
-    def __init__(self, body: Body, world: World, frame_dt: float, config: dict, training_start: Start) -> None:
+    def __init__(
+        self, body: Body, world: World, frame_dt: float, config: dict, training_start: Start, posterior: Posterior | None = None
+    ) -> None:
         self.body, self.world, self.frame_dt = body, world, frame_dt
-        self.config, self.training_start = config, training_start
+        self.config, self.training_start, self.posterior = config, training_start, posterior
 
     @classmethod
     def load(cls, path: str | Path, device: str = "cpu") -> Twin:
@@ -47,7 +52,8 @@ class Twin:
         or was not written by this program."""
         from mosa.config import build_body, build_world  # the builder needs the whole package, a twin's user only this line
 
-        config, begun, tensors = checked(read_checkpoint(path), path)
+        checkpoint = read_checkpoint(path)
+        config, begun, tensors = checked(checkpoint, path)
         try:
             body = build_body(config, {name: tensors[name] for name in TENSORS})
             body.load_state_dict(tensors)
@@ -55,7 +61,32 @@ class Twin:
         except Exception as error:  # every part has been checked; a file of a stranger may still fit no body
             reason = str(error) if isinstance(error, MosaError) else f"{type(error).__name__}: {error}"
             raise DataError(f"ckpt_path: {path}: no body can be built from it ({' '.join(reason.split())[:300]})") from error
-        return cls(body.to(device).eval(), world, config["frame_dt"], config, start)
+        known = checked_posterior(checkpoint, len(read_numbers(body)), path)
+        posterior = None if known is None else Posterior.read(known)
+        return cls(body.to(device).eval(), world, config["frame_dt"], config, start, posterior)
+
+    def predict(self, *, draws: int = 16, seed: int = 0, **start) -> tuple[Rollout, Tensor]:
+        """(rollout of the learned law, standard deviation (T, N) [m] of every particle's position) from a new start.
+
+        start: as `simulate` takes it; draws: laws drawn from the posterior. Errors: ConfigError where the run kept no posterior
+        (a fit by Adam), or where fewer than two of the draws can be simulated.
+        """
+        if self.posterior is None:
+            raise ConfigError("predict: this run kept no posterior; a fit by Gauss-Newton does (fit.joint.optimizer=auto)")
+        rollout, found, kept = self.simulate(**start), [], read_numbers(self.body)
+        try:
+            for numbers in self.posterior.draws(draws, torch.Generator().manual_seed(seed)):
+                write_numbers(self.body, numbers)
+                try:
+                    found.append(self.simulate(**start).x)
+                except SimulationDiverged:
+                    continue
+        finally:
+            write_numbers(self.body, kept)
+        if len(found) < 2:
+            raise ConfigError(f"predict: expected at least two of {draws} draws of the law that can be simulated from this start, found "
+                              f"{len(found)}")
+        return rollout, total_spread(torch.stack(found), self.posterior.model_error)
 
     @torch.no_grad()
     def simulate(
@@ -126,7 +157,9 @@ class Twin:
         for t, x in enumerate(rollout.x.cpu().numpy()):
             write_ply(folder / "ply" / f"{t:03d}.ply", x, self.body.colors.cpu().numpy())
         if video:
-            write_video(folder / "simulation.mp4", side_by_side({title: self.render(rollout)}), fps=max(5.0, 0.3 / self.frame_dt))
+            moments = [f"frame {t}, {time:.3f} s" for t, time in enumerate(rollout.times.tolist())]
+            frames = side_by_side({title: self.render(rollout)}, footer=moments)
+            write_video(folder / "simulation.mp4", frames, fps=max(5.0, 0.3 / self.frame_dt))
         return folder
 
 
@@ -193,6 +226,11 @@ def save_rollout(path: str | Path, parts: dict[str, Rollout]) -> None:
 def save_observed(path: str | Path, parts: dict[str, MotionCues]) -> None:
     """npz with x [T, N, 3] and covariances [T, N, 3, 3] of the motions learned from, under `<name>/...` as `save_rollout`."""
     save_parts(path, {name: {"x": cues.positions, "covariances": cues.covariances} for name, cues in parts.items()})
+
+
+def save_spread(path: str | Path, parts: dict[str, Tensor]) -> None:
+    """npz with sd [T, N], the predicted standard deviation of every particle's position [m], under `<name>/sd`."""
+    save_parts(path, {name: {"sd": sd.float()} for name, sd in parts.items()})
 
 
 def save_truth(path: str | Path, parts: dict[str, Tensor]) -> None:

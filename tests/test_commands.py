@@ -46,14 +46,23 @@ def call(built, tmp_path, module, *arguments):
     return subprocess.run([sys.executable, "-c", start, *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True)
 
 
-@pytest.mark.parametrize("module, arguments", [("train", ["debug=default", "scene.seed=3"]), ("eval", ["ckpt_path=x.ckpt"])])
-def test_the_commands_find_their_configuration(built, tmp_path, module, arguments):
+def configured(built, tmp_path, module, *arguments):
+    """The configuration that a command would run with, and hydra's own."""
     result = call(built, tmp_path, module, *arguments, "--cfg", "all")
     assert result.returncode == 0, result.stderr[-2000:]
     cfg = OmegaConf.create(result.stdout)
     sources = [source.path for source in cfg.hydra.runtime.config_sources if source.provider == "main"]
     assert sources == [str(built / "mosa" / "conf")] and cfg.hydra.job.name == module  # the folder's name: outputs/train/...
-    assert cfg.ckpt_path == "x.ckpt" if module == "eval" else (cfg.simulation.particles, cfg.scene.seed) == (200, 3)
+    return cfg
+
+
+def test_the_commands_find_their_configuration_and_an_experiment_of_ones_own(built, tmp_path):
+    (tmp_path / "mine" / "experiment").mkdir(parents=True)
+    (tmp_path / "mine" / "experiment" / "duck.yaml").write_text(
+        "# @package _global_\ndefaults:\n  - override /scene: transforms\nsimulation: {particles: 77}\n")
+    cfg = configured(built, tmp_path, "train", "--config-dir", "mine", "experiment=duck", "scene.scale=0.3")
+    assert (cfg.simulation.particles, cfg.scene.format, cfg.scene.scale) == (77, "transforms", 0.3)
+    assert configured(built, tmp_path, "eval", "ckpt_path=x.ckpt").ckpt_path == "x.ckpt"
 
 
 def test_in_a_clone_the_configuration_is_where_it_is_edited():

@@ -33,7 +33,7 @@ def test_every_scene_with_every_prior_composes(scene):
         assert config["prior"] and config["scene"]
 
 
-@pytest.mark.parametrize("name", ["reconstruction", "simulation", "fit", "criterion", "trainer", "logger", "ablation"])
+@pytest.mark.parametrize("name", ["reconstruction", "simulation", "fit", "criterion", "trainer", "logger", "ablation", "experiment"])
 def test_every_option_of_a_group_composes(name):
     for option in group(name):
         assert composed(f"{name}={option}")
@@ -91,8 +91,8 @@ def test_a_stage_takes_gauss_newton_where_all_it_learns_has_few_numbers(adapter,
     assert {s.optimizer for s in build_stages(adam, heterogeneity=None, adapter=build_adapter({"name": adapter}))} == {"adam"}
 
 
-@pytest.mark.parametrize("group_name", ["adapter", "ablation", "criterion", "debug", "fit", "logger", "prior", "reconstruction",
-                                        "rendering", "scene", "simulation", "trainer"])  # fmt: skip
+@pytest.mark.parametrize("group_name", ["adapter", "ablation", "criterion", "debug", "experiment", "fit", "logger", "prior",
+                                        "reconstruction", "rendering", "scene", "simulation", "trainer"])  # fmt: skip
 def test_every_option_passes_the_checks_before_a_run(group_name):
     for option in group(group_name):
         config = composed(f"{group_name}={option}")
@@ -185,3 +185,12 @@ def test_an_ablation_changes_the_switch_it_names_and_nothing_else(name):
     whole = "paper" if any(key.startswith("adapter.") for key in EXPECTED[name]) else "full"
     full, ablated = flat(composed(f"ablation={whole}")), flat(composed(f"ablation={name}"))
     assert {k for k in full.keys() | ablated.keys() if full.get(k) != ablated.get(k)} == EXPECTED[name]
+
+
+@pytest.mark.parametrize("name, overrides", [
+    ("bird", ["scene=pacnerf_bird", "prior=neo_hookean", "scene.holdout_cameras=[5]"]),
+    ("paper_size", ["simulation=paper", "trainer=gpu", "scene.scale=1"]),
+])  # fmt: skip
+def test_an_experiment_is_what_its_overrides_are(name, overrides):
+    assert composed(f"experiment={name}") == composed(*overrides) != composed()
+    assert composed(f"experiment={name}", "seed=3", "prior=stvk")["prior"]["law"] == composed("prior=stvk")["prior"]["law"]

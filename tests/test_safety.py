@@ -11,8 +11,8 @@ from omegaconf import OmegaConf
 from strangers import checkpoint
 
 from mosa.errors import DataError
+from mosa.guards import evaluated_scene
 from mosa.npz import read_npz, write_npz
-from mosa.pipeline import evaluated_scene
 from mosa.twin import Twin
 
 

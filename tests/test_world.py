@@ -62,8 +62,8 @@ def test_a_collider_of_the_wrong_form_is_named(colliders, message):
         build_world(WORLD | {"colliders": colliders})
 
 
-@pytest.mark.parametrize("walls", [{}, {"mode": "separate", "friction": float("inf")}, {"mode": ["slip"]},
-                                   {"mode": "separate", "friction": True}])
+@pytest.mark.parametrize("walls", [{}, {"friction": float("nan")}, {"mode": "separate", "friction": float("inf")},
+                                   {"mode": ["slip"]}, {"mode": "separate", "friction": True}])
 def test_walls_of_the_wrong_form_are_named(walls):
     with pytest.raises(ConfigError, match=r"^world\.walls"):
         build_world(WORLD | {"walls": walls})

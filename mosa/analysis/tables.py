@@ -32,10 +32,58 @@ def _sequences(figures: Mapping[str, float]) -> list[str]:
 
 def parameter_table(figures: Mapping[str, float]) -> str:
     """Markdown table of identified parameters: after calibration, after the joint stage, relative error where truth is known."""
-    names = [k.split("/", 1)[1] for k in figures if k.startswith("id_prior/") and not k.endswith(("_relative_error", "_ratio"))]
+    names = [k.split("/", 1)[1] for k in figures
+             if k.startswith("id_prior/") and k.count("/") == 1 and not k.endswith(("_relative_error", "_ratio"))]
     rows = [[n, f"{figures[f'id_prior/{n}']:.5g}", f"{figures.get(f'id/{n}', float('nan')):.5g}",
              f"{figures[f'id_prior/{n}_relative_error']:.1%}" if f"id_prior/{n}_relative_error" in figures else ""] for n in names]
     return markdown(["parameter", "prior", "joint", "error of prior"], rows)
+
+
+SURE_DEGREES = 30.0
+"""Half angle of a direction's 95 % cone above which it counts as not determined."""
+NOTICEABLE = 1.1
+"""Ratio of the largest to the smallest Young's modulus below which a law counts as isotropic."""
+
+
+def determined_text(figures: Mapping[str, float]) -> str:
+    """What the data determine and what they do not, in sentences; empty where a run kept no posterior."""
+    compared = {k.removeprefix("id_prior/compared/").removesuffix("_m"): v for k, v in figures.items()
+                if k.startswith("id_prior/compared/")}
+    lines = []
+    if compared:
+        taken = min(compared, key=compared.get)
+        listed = ", ".join(f"{law} {distance * 1e3:.2f} mm" for law, distance in sorted(compared.items(), key=lambda each: each[1]))
+        lines = [f"Backbone: {taken}, which is nearest to the training motion (mean distance after calibration: {listed}).", ""]
+    if "posterior/draws" not in figures:
+        return "\n".join(lines[:1])
+    lines += ["What the data determine:", ""]
+    for name, unit in (("E", "Pa"), ("mu", "Pa"), ("kappa", "Pa"), ("yield_stress", "Pa")):
+        if f"posterior/{name}_relative_sd" in figures:
+            lines.append(f"- {name} = {figures[f'id/{name}']:.4g} {unit}, with a standard deviation of "
+                         f"{figures[f'posterior/{name}_relative_sd']:.1%}.")
+    if "posterior/nu_sd" in figures:
+        lines.append(f"- nu = {figures['id/nu']:.3f} with a standard deviation of {figures['posterior/nu_sd']:.3f}.")
+    if "posterior/stiffest_cone_deg" in figures:
+        ratio, half = figures["id/stiffness_ratio"], figures["posterior/stiffest_cone_deg"]
+        axis = ", ".join(f"{figures[f'id/stiffest_{n}']:.2f}" for n in "xyz")
+        spread = f"{ratio:.2f} +- {figures['posterior/stiffness_ratio_sd']:.2f}"
+        if ratio < NOTICEABLE:
+            lines.append(f"- No anisotropy: the largest over the smallest Young's modulus is {spread}: the law predicts as its prior.")
+        elif half > SURE_DEGREES:
+            lines.append(f"- Some anisotropy (largest over smallest Young's modulus {spread}) whose direction is *not* determined: the "
+                         f"95 % cone about ({axis}) has a half angle of {half:.0f} degrees. A second drop from another side would tell.")
+        else:
+            lines.append(f"- The stiffest direction is ({axis}), within {half:.0f} degrees (95 %); the largest over the smallest "
+                         f"Young's modulus is {spread}.")
+    for name, what in (("operator", "numbers of the anisotropic stiffness"), ("stiffness", "modes of the stiffness over the body")):
+        if f"posterior/{name}_numbers" in figures:
+            lines.append(f"- Of {figures[f'posterior/{name}_numbers']:.0f} {what} the data determine "
+                         f"{figures[f'posterior/{name}_determined']:.1f}; the rest is where the prior has it.")
+    if "posterior/test/sd_m" in figures:
+        lines.append(f"- Held-out positions after contact are predicted to {figures['posterior/test/sd_m'] * 1e3:.1f} mm (root mean "
+                     "square)" + (f"; {figures['posterior/test/coverage']:.0%} of the errors lie within two standard deviations."
+                        if "posterior/test/coverage" in figures else "."))
+    return "\n".join(lines)
 
 
 def markdown(header: list[str], rows: list[list[str]]) -> str:

@@ -5,12 +5,14 @@ new start instead.
 """
 
 import os
+import sys
+from pathlib import Path
 
 import hydra
 from omegaconf import DictConfig
 
 from mosa.commands import begin_log, configuration
-from mosa.jobs import attempt
+from mosa.jobs import attempt, check_arguments
 
 
 @hydra.main(version_base="1.3", config_path=configuration(), config_name="eval")
@@ -26,4 +28,5 @@ def run(cfg: DictConfig) -> float | None:
 
 def main() -> None:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    check_arguments(sys.argv[1:], Path(configuration()))
     run()

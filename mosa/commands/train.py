@@ -2,12 +2,13 @@
 
 import os
 import sys
+from pathlib import Path
 
 import hydra
 from omegaconf import DictConfig
 
 from mosa.commands import begin_log, configuration
-from mosa.jobs import Failures, attempt
+from mosa.jobs import Failures, attempt, check_arguments
 
 
 @hydra.main(version_base="1.3", config_path=configuration(), config_name="train")
@@ -26,5 +27,6 @@ def main() -> None:
     if os.environ.get("LOCAL_RANK", "0") != "0":  # a further process of a fit on several devices: the first speaks for all
         os.environ["TQDM_DISABLE"] = "1"
         sys.stdout = open(os.devnull, "w")  # until the process ends
+    check_arguments(sys.argv[1:], Path(configuration()))
     run()
     sys.exit(1 if Failures.count else 0)

@@ -50,12 +50,6 @@ def misses(origins: Tensor, directions: Tensor, radii: Tensor) -> tuple[Tensor, 
     return point, torch.where(depth > 0, distance / (radii * depth.clamp(min=1e-9)), torch.inf)
 
 
-def seen_at(scene: Scene, frame: int = 0) -> Tensor | None:
-    """(3,) [m], float64: where the lines of sight through the mattes' centroids meet; None with fewer than two whole mattes."""
-    chosen, origins, directions, radii = lines_of_sight(scene, frame)
-    return misses(origins, directions, radii)[0] if len(chosen) > 1 else None
-
-
 def check_agreement(scene: Scene, label: str, frame: int = 0) -> None:
     """The lines of sight through the mattes' centroids meet, inside the scene's box.
 

@@ -18,6 +18,9 @@ WHITE = np.ones(3, np.float32)
 # columns 1 and 2 of a pose with OpenGL axes (y up, looks along -z) point against those of OpenCV (y down, z forward)
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
+LARGEST = 1e30
+"""Of a number in a file: single precision holds it."""
+
 # relative jitter of frame times that still counts as a constant frame rate
 TIME_JITTER = 1e-3
 
@@ -45,16 +48,25 @@ def read_json(path: Path):
         raise DataError(
             f"{path}: expected JSON, found a mistake in line {error.lineno}, column {error.colno}: {error.msg}"
         ) from error
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: expected JSON text, found bytes that are no UTF-8") from error
+    except RecursionError as error:
+        raise DataError(f"{path}: expected JSON of a few levels, found brackets in brackets beyond any depth") from error
+    except ValueError as error:  # a number of thousands of digits
+        if isinstance(error, UnicodeDecodeError):
+            raise DataError(f"{path}: expected JSON text, found bytes that are no UTF-8") from error
+        raise DataError(f"{path}: expected JSON, found what cannot be read ({error})") from error
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
 
 
 def matrix(value, shape: tuple[int, int], where: str) -> np.ndarray:
     """A finite matrix of that shape from nested lists. Errors: DataError beginning with `where`."""
     try:
         array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+        whole = array.ndim == 2 and all(isinstance(x, (int, float)) and not isinstance(x, bool) for row in value for x in row)
+    except (TypeError, ValueError, OverflowError) as error:
         raise DataError(f"{where}: expected a {shape[0]}x{shape[1]} matrix of numbers, found {str(value)[:80]}") from error
+    if array.ndim == 2 and not whole:
+        raise DataError(f"{where}: expected numbers, found texts or flags: {str(value)[:80]}")
     if array.shape == (4, 4) and shape == (3, 4):
         array = array[:3]
     if array.shape != shape:
@@ -66,8 +78,8 @@ def matrix(value, shape: tuple[int, int], where: str) -> np.ndarray:
 
 def number(value, where: str) -> float:
     """A finite number. Errors: DataError beginning with `where`."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise DataError(f"{where}: expected a finite number, found {value!r}")
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST:
+        raise DataError(f"{where}: expected a finite number, found {str(value)[:80]!r}")
     return float(value)
 
 
@@ -141,7 +153,10 @@ def even_times(times: list[float], frames: list[int], where: str, remedy: str) -
 
 def scaled(K: np.ndarray, full: tuple[int, int], size: tuple[int, int]) -> np.ndarray:
     """K (3, 3) [px] of images that were brought from `full` to `size`, (width, height) [px] each."""
-    return np.diag([size[0] / full[0], size[1] / full[1], 1.0]) @ K
+    K = K.astype(np.float32)  # as a scene keeps it: what was read before has the same bits, and so the same place in the cache
+    K[0] *= size[0] / full[0]
+    K[1] *= size[1] / full[1]
+    return K
 
 
 def footage_of(

@@ -9,6 +9,10 @@ import numpy as np
 from PIL import Image
 
 from mosa.errors import ConfigError, DataError
+from mosa.limits import machine_memory
+
+MOST_PIXELS = 2**26
+"""Of one picture: twice an 8K frame."""
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -20,6 +24,7 @@ def read_image(path: Path) -> np.ndarray:
     if not path.is_file():
         raise DataError(f"{path}: image not found")
     try:
+        check_pixels(path)
         pixels = deep_png(path)
         if pixels is None:
             with Image.open(path) as picture:
@@ -41,6 +46,24 @@ def read_image(path: Path) -> np.ndarray:
     if not np.isfinite(pixels).all():
         raise DataError(f"{path}: expected finite pixels, found {int((~np.isfinite(pixels)).sum())} that are NaN or infinite")
     return np.clip(pixels, 0, 1)
+
+
+def check_pixels(path: Path) -> None:
+    """The header says how large a picture is, before any of it is decoded. Errors: DataError."""
+    with Image.open(path) as picture:
+        width, height = picture.size
+    if width * height > MOST_PIXELS:
+        raise DataError(f"{path}: expected at most {MOST_PIXELS / 1e6:.0f} million pixels, found {width}x{height}: scale it down")
+
+
+def check_amount(pictures: int, width: int, height: int) -> None:
+    """Errors: ConfigError where that many pictures with mattes, of that size, do not fit into this machine's memory."""
+    wanted = 2 * 16 * pictures * width * height  # colours and matte in single precision, and once more while they are put together
+    if wanted > machine_memory():
+        most = (machine_memory() / wanted) ** 0.5
+        raise ConfigError(f"scene.scale: {pictures} pictures of {width}x{height} px take {wanted / 1e9:.1f} GB, more than this "
+                          f"machine's {machine_memory() / 1e9:.1f} GB; "
+                          f"multiply scene.scale by at most {most:.2g}, or restrict scene.frames")
 
 
 def plain_mode(picture: Image.Image) -> str:

@@ -22,7 +22,7 @@ from mosa.data.footage import (
     scaled,
     world_to_camera,
 )  # fmt: skip
-from mosa.data.images import composite, expect_size, fill_holes, read_image, resize, scaled_size
+from mosa.data.images import check_amount, composite, expect_size, fill_holes, read_image, resize, scaled_size
 from mosa.data.matting import matte_from_plate
 from mosa.data.scene import assemble
 from mosa.errors import DataError
@@ -82,6 +82,7 @@ def read_pacnerf(path: str | Path, *, frames=None, fps: float | None = None, sca
             if full is None:
                 full, first = pixels.shape[1::-1], file.name
                 size = scaled_size(*full, scale)
+                check_amount(len(calibration) * len(numbers), *size)
                 scaled_calibration[camera] = scaled(K, full, size), w2c
             expect_size(file, pixels, *full, reason=f"as {first} of the same camera")
             color, matte = split(file, pixels, plate)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -25,8 +26,14 @@ FORMATS = {
 """Format -> module:function. A new format is one function (path=..., the keys it needs) -> Scene and one line here."""
 
 
+DENSITIES = 0.1, 1e5
+"""[kg/m^3]: aerogel has 1, osmium 22,590."""
+WIDEST = 1e5
+"""[m] of scene.box: with gravity and seconds, nothing that cameras film is larger."""
+
+
 def load_scene(
-    *, format: str, root: str | None = None, path: str | None = None, ground=None, cache=None, **keys
+    *, format: str | None = None, root: str | None = None, path: str | None = None, ground=None, cache=None, **keys
 ) -> Scene:
     """The scene that the keys of conf/scene describe, validated.
 
@@ -34,14 +41,20 @@ def load_scene(
     None; cache: folder for made scenes.
     Errors: ConfigError for keys (unknown, missing, out of range), DataError for files.
     """
-    if format not in FORMATS:
+    if not isinstance(format, str) or format not in FORMATS:
         raise ConfigError(f"scene.format: expected one of {', '.join(sorted(FORMATS))}, found {format!r}")
     module, function = FORMATS[format].split(":")
     loader = getattr(importlib.import_module(module), function)
     if format == "builtin":
+        if given := [key for key, value in (("path", path), ("ground", ground)) if value is not None]:
+            raise ConfigError(f"scene.{given[0]}: not a key of built-in scenes, which have their own; scene=transforms reads one")
         return validate(call(loader, {"cache": cache, **{k: v for k, v in keys.items() if v is not None}}))
     if keys.get("fps") is not None:
         check_fps(keys["fps"])
+    check_names(name=keys.get("name"), sequence=keys.get("sequence"))
+    for key, text in (("root", root), ("path", path), ("cache", cache), ("particles", keys.get("particles"))):
+        if text is not None and (not isinstance(text, (str, Path)) or "\0" in str(text)):
+            raise ConfigError(f"scene.{key}: expected a folder, found {text!r}")
     if path is None:
         raise ConfigError(
             f"scene.path: expected the folder of a scene in format {format}, found nothing; scene.path=<folder>"
@@ -53,6 +66,13 @@ def load_scene(
         found = beside(place, keys["particles"])
         arguments["particles"] = under(root, keys["particles"]) if found is None else found
     return validate(call(loader, {"path": place, **arguments}))
+
+
+def check_names(**names) -> None:
+    """They become parts of file names. Errors: ConfigError naming the key."""
+    for key, name in names.items():
+        if name is not None and (not isinstance(name, str) or re.fullmatch(r"[\w][\w .+-]{0,99}", name) is None):
+            raise ConfigError(f"scene.{key}: expected a name of at most 100 letters, digits and - _ . +, found {str(name)[:120]!r}")
 
 
 def held_out_sequences(**keys) -> list[Scene]:
@@ -119,6 +139,8 @@ def ground_from(keys) -> Ground | None:
 
 def vector(value, key: str) -> torch.Tensor:
     """(3,) float32. Errors: ConfigError naming the key."""
+    if isinstance(value, (str, Mapping)) or (isinstance(value, (list, tuple)) and any(isinstance(v, (bool, str)) for v in value)):
+        raise ConfigError(f"scene.{key}: expected three numbers, found {value!r}")
     try:
         result = torch.tensor([float(v) for v in value], dtype=torch.float32)
     except (TypeError, ValueError) as error:
@@ -130,7 +152,7 @@ def vector(value, key: str) -> torch.Tensor:
 
 def check_fps(fps) -> None:
     """Errors: ConfigError where frames per second are none."""
-    if isinstance(fps, bool) or not isinstance(fps, (int, float)) or not fps > 0:
+    if not is_number(fps) or not fps > 0:
         raise ConfigError(f"scene.fps: expected a positive number, found {fps!r}")
 
 
@@ -222,8 +244,11 @@ def assemble(
     box = torch.stack([vector(low, "box"), vector(high, "box")])
     if not bool((box[1] > box[0]).all()):
         raise ConfigError(f"scene.box: expected min < max on every axis, found {box.tolist()}")
-    if isinstance(density, bool) or not (isinstance(density, (int, float)) and density > 0):
-        raise ConfigError(f"scene.density: expected a positive number [kg/m^3], found {density!r}")
+    if float(box.abs().max()) > WIDEST:
+        raise ConfigError(f"scene.box: expected metres within {WIDEST:g}, found {box.tolist()}")
+    if not is_number(density) or not DENSITIES[0] <= density <= DENSITIES[1]:
+        raise ConfigError(f"scene.density: expected a positive number of {DENSITIES[0]:g} to {DENSITIES[1]:g} kg/m^3, "
+                          f"found {density!r}")
     times = footage.times
     if fps is not None:
         check_fps(fps)

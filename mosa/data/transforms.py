@@ -23,12 +23,14 @@ from mosa.data.footage import (
     scaled,
     world_to_camera,
 )  # fmt: skip
-from mosa.data.images import composite, expect_size, fill_holes, read_image, resize, scaled_size
+from mosa.data.images import check_amount, composite, expect_size, fill_holes, read_image, resize, scaled_size
 from mosa.data.lens import COEFFICIENTS, is_fisheye, lens_of
 from mosa.data.scene import assemble
 from mosa.errors import DataError
 from mosa.types import Scene
 
+LONGEST = 1000
+"""Characters of a path: a file system takes 4096 bytes, of names of 255 each."""
 EXTENSIONS = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG")
 CUT = 1e-3
 """Share of a matte that undoing a lens may cut off before it is said."""
@@ -79,6 +81,7 @@ def read_transforms(path: str | Path, *, frames=None, fps: float | None = None, 
             if full is None:
                 full, first = color.shape[1::-1], row[frame].image.name
                 size = scaled_size(*full, scale)
+                check_amount(len(cameras) * len(wanted), *size)
                 K = camera_matrix(shot, *full)
                 lens = lens_of(K, shot.intrinsics, *full, fisheye=shot.fisheye, where=shot.where)
                 calibration[name] = scaled(K if lens is None else lens.K, full, size), shot.w2c
@@ -127,6 +130,8 @@ def intrinsic_keys() -> tuple[str, ...]:
 
 def locate(folder: Path, name: str, where: str) -> Path:
     """The file a path names, its extension left out or not. Errors: DataError where there is none."""
+    if len(name) > LONGEST or "\0" in name:
+        raise DataError(f"{where}: expected a path of at most {LONGEST} characters, found {len(name)}: {name[:60]!r} ...")
     for extension in EXTENSIONS:
         candidate = folder / (name + extension)
         if candidate.is_file():
@@ -237,6 +242,8 @@ def camera_matrix(shot: Shot, width: int, height: int) -> np.ndarray:
     if "fl_x" in known:
         focal = known["fl_x"], known.get("fl_y", known["fl_x"])
     elif "camera_angle_x" in known:
+        if not 0 < known["camera_angle_x"] < math.pi:
+            raise DataError(f"{shot.where}: camera_angle_x: expected radians between 0 and pi, found {known['camera_angle_x']:g}")
         focal = (0.5 * width / math.tan(0.5 * known["camera_angle_x"]),) * 2
     else:
         raise DataError(f"{shot.where}: expected fl_x (and fl_y) in pixels or camera_angle_x in radians, found neither")

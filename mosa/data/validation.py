@@ -9,9 +9,13 @@ import warnings
 import torch
 
 from mosa.data.agreement import check_agreement, holes_report
+from mosa.data.falling import check_fall
 from mosa.data.footage import TIME_JITTER
 from mosa.errors import DataError
 from mosa.types import Scene
+
+FULL = 0.99
+"""Share of an image from which on a matte says nothing."""
 
 
 def validate(scene: Scene) -> Scene:
@@ -39,7 +43,11 @@ def validate(scene: Scene) -> Scene:
     check_cameras(scene, label)
     check_times(scene, label)
     check_mattes(scene, label)
+    check_borders(scene, label)
     check_agreement(scene, label)
+    for frame in range(1, scene.frames):
+        check_agreement(scene, label, frame)
+    check_fall(scene, label)
     holes = None if scene.synthetic else holes_report(scene)
     if holes:
         warnings.warn(f"{label}: {holes}", stacklevel=2)
@@ -91,11 +99,25 @@ def check_mattes(scene: Scene, label: str) -> None:
                 f"{label}: camera {name}: the matte of the first frame is empty; expected the object in view of every "
                 "camera there: matte it, remove the camera, or start later with scene.frames"
             )
-        if float(covered[v].min()) > 0.99:
-            raise DataError(
-                f"{label}: camera {name}: the matte covers {float(covered[v].min()):.0%} of every image; "
-                "the footage has no matte (an alpha channel that is opaque everywhere?)"
-            )
+        if float(covered[v].max()) > FULL:
+            t = int(covered[v].argmax())
+            every = "; the footage has no matte (an alpha channel that is opaque everywhere?)"
+            one = ": an opaque alpha channel, or an object too near; matte it, or restrict scene.frames"
+            raise DataError(f"{label}: camera {name}, frame {t}: the matte covers {float(covered[v, t]):.0%} of the image"
+                            f"{every if float(covered[v].min()) > FULL else one}")
+
+
+def check_borders(scene: Scene, label: str) -> None:
+    """The first frame, which says where the object is, shows all of it to two learning cameras at least."""
+    covered = scene.mattes > 0.5
+    cut = torch.cat([covered[:, :, 0], covered[:, :, -1], covered[..., 0], covered[..., -1]], 2).any(2)
+    names = [scene.cameras.names[v] for v in scene.training_cameras if bool(cut[v, 0])]
+    if len(scene.training_cameras) - len(names) < 2:
+        raise DataError(f"{label}: the image's border cuts the object in frame 0 of the cameras {', '.join(names)}: expected two "
+                        "that see all of it; film from farther away, or start with another frame (scene.frames)")
+    if names:
+        warnings.warn(f"{label}: the image's border cuts the object in frame 0 of the cameras {', '.join(names)}; what is outside "
+                      "is known to the others alone", stacklevel=3)
 
 
 def fingerprint(scene: Scene) -> str:

@@ -56,7 +56,8 @@ def corrected_rollout(roll: Callable[..., Rollout], state, observed: Tensor, gai
     if not parts:
         return roll(state, frames=1)
     stacked = {
-        name: torch.cat([getattr(parts[0], name), *(getattr(part, name)[1:] for part in parts[1:])]) for name in ("x", "v", "F", "F_tot")
+        name: torch.cat([getattr(parts[0], name), *(getattr(part, name)[1:] for part in parts[1:])])
+        for name in ("x", "v", "F", "F_tot")
     }
     reactions = None if parts[0].reactions is None else torch.cat([part.reactions for part in parts])
     times = frame_dt * torch.arange(len(observed), dtype=parts[0].times.dtype, device=parts[0].times.device)

@@ -62,21 +62,25 @@ class Seat:
 
 @dataclass
 class Posterior:
-    """mean (D,), covariance (D, D) float64 of the numbers of `names`, and `determined` (D,) in [0, 1]: the share of each number's
-    precision that comes from the data and not from its prior."""
+    """mean (D,), covariance (D, D) float64 of the numbers of `names`; `determined` (D,) in [0, 1]: the share of each number's
+    precision that comes from the data and not from its prior; model_error [m]: distance of the identified model from what was seen.
+    """
 
     names: list[str]
     mean: Tensor
     covariance: Tensor
     determined: Tensor
+    model_error: float = 0.0
 
     def written(self) -> dict:
         """Plain containers, fit for a checkpoint; `read` gives the same numbers."""
-        return {"names": list(self.names), "mean": self.mean, "covariance": self.covariance, "determined": self.determined}
+        return {"names": list(self.names), "mean": self.mean, "covariance": self.covariance, "determined": self.determined,
+                "model_error": self.model_error}
 
     @classmethod
     def read(cls, written: dict) -> Posterior:
-        return cls(list(written["names"]), *(written[name].double() for name in ("mean", "covariance", "determined")))
+        tensors = (written[name].double() for name in ("mean", "covariance", "determined"))
+        return cls(list(written["names"]), *tensors, float(written["model_error"]))
 
     def draws(self, count: int, generator: torch.Generator) -> Tensor:
         """(count, D) float64."""

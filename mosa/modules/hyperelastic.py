@@ -1,11 +1,12 @@
 """The default adapter: an anisotropic stiffness added to the prior's energy, so that the learned law has an energy at every strain.
 
-psi(F) = psi_prior(F) + mu E : S : E, E a strain in the material frame (`physics.strain`), mu the prior's shear modulus at the particle.
-At small strain the prior's stiffness 2 mu C0 becomes 2 mu (C0 + S). S follows from numbers A as
+psi(F) = psi_prior(F) + mu E : S : E, E a strain in the material frame (`physics.strain`), mu the prior's shear modulus at the
+particle. At small strain the prior's stiffness 2 mu C0 becomes 2 mu (C0 + S). S follows from numbers A as
 
     C0 + S = C0^(1/2) exp(A) C0^(1/2),      A symmetric, orthogonal to the two isotropic tensors,
 
-which is positive definite whatever A is, isotropic only for A = 0, and leaves E and nu their meaning: they carry the isotropic part.
+which is positive definite whatever A is, isotropic only for A = 0, and leaves E and nu their meaning: they carry the isotropic
+part.
 """
 
 from __future__ import annotations
@@ -91,7 +92,8 @@ class HyperelasticAdapter(Adapter):
         return root @ self._exponential() @ root
 
     def correction(self, poisson: Tensor | None = None) -> Tensor:
-        """S (6, 6) float64, see `stiffness`; exactly 0 where the numbers are. poisson: of C0, () float64, None for the prior's now."""
+        """S (6, 6) float64, see `stiffness`; exactly 0 where the numbers are. poisson: of C0, () float64, None for the prior's
+        now."""
         root = root_stiffness(self._poisson().double() if poisson is None else poisson)
         change = self._exponential() - torch.eye(6, dtype=torch.float64, device=root.device)
         return root @ change @ root
@@ -106,19 +108,22 @@ class HyperelasticAdapter(Adapter):
         return max(ADAPTER_MARGIN, acoustic_stiffening(self.relative(poisson).cpu(), poisson.cpu()))
 
     def relative(self, poisson: Tensor | None = None) -> Tensor:
-        """(6, 6) float64 S C0^-1 on vech components: what is added to the prior's stress at small strain. poisson: as `correction`."""
+        """(6, 6) float64 S C0^-1 on vech components: what is added to the prior's stress at small strain. poisson: as
+        `correction`."""
         poisson = self._poisson().double() if poisson is None else poisson
         C0 = isotropic_stiffness(poisson)
         scale = torch.tensor([1.0, 1, 1, 2**0.5, 2**0.5, 2**0.5], dtype=torch.float64, device=C0.device)
         return (self.correction(poisson) @ torch.linalg.inv(C0)) * scale / scale[:, None]
 
     def forward(self, state: MaterialState) -> AdapterOperator:
-        """G: S for every particle, (N, 6, 6) in Mandel scaling and units of 2 mu; h: zeros. Errors: ConfigError before `switch_on`."""
+        """G: S for every particle, (N, 6, 6) in Mandel scaling and units of 2 mu; h: zeros. Errors: ConfigError before
+        `switch_on`."""
         self.check_on()
         n = len(state.w)
         S = self.correction().to(state.w)
         return AdapterOperator(S.expand(n, 6, 6).contiguous(), state.w.new_zeros(n, 6))
 
     def statistics(self) -> OperatorStatistics:
-        """mean_abs_C: mean |entry| of S C0^-1, which is what the paper's C does to the stress at small strain; mean: the numbers."""
+        """mean_abs_C: mean |entry| of S C0^-1, which is what the paper's C does to the stress at small strain; mean: the
+        numbers."""
         return OperatorStatistics(self.relative().abs().mean(), self.numbers, torch.zeros_like(self.numbers))

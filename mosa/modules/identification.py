@@ -10,7 +10,7 @@ import copy
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -37,7 +37,8 @@ ROUNDED = 8
 
 @dataclass(frozen=True)
 class IdentificationSettings:
-    """count: independent data in a frame; model_error: of grid and contact, in cells; operator_sd, stiffness_sd: prior standard deviations of the operator's numbers and of the
+    """count: independent data in a frame; model_error: of grid and contact, in cells; operator_sd, stiffness_sd: prior standard
+    deviations of the operator's numbers and of the
     stiffness modes before the evidence finds their factor; smoothness: power with which that of the modes falls with their wave
     number; evidence: whether it is found; tolerance: of the last step, in posterior standard deviations; threads: rollouts side by
     side on a CPU, 0 for one a core. Errors: ConfigError naming the key."""
@@ -102,8 +103,46 @@ def write_numbers(body: Body, numbers: Tensor) -> None:
     Seat(tensors, lambda: numbers).write(numbers)
 
 
+def read_numbers(body: Body) -> Tensor:
+    """What `write_numbers` sets, (D,)."""
+    return Seat(tensors_of(body, adapter=_learned(body.adapter), heterogeneity=_learned(body.heterogeneity)), torch.empty).read()
+
+
 def _learned(module) -> bool:
     return module is not None and few_numbers(module)
+
+
+TRIED = 4
+"""Iterations after which candidates for the backbone are compared: from the best start of the grid they hardly move later."""
+
+
+def choose_law(body: Body, candidates: Sequence[str], build: Callable[[], Identification]) -> dict[str, float]:
+    """Calibrate every candidate and leave `body` at the one with the smallest mean distance from the cues, which is returned for
+    each [m], infinite where a law cannot be simulated. build: a calibration of `body`. Errors: SimulationDiverged where none can.
+    """
+    found: dict[str, float] = {}
+    best: tuple[float, dict, str] | None = None
+    for law in candidates:
+        body.material.law = law
+        calibration = build()
+        try:
+            calibration.search()
+            for _ in range(TRIED):
+                calibration.iterate()
+            found[law] = calibration.distance()
+        except SimulationDiverged:
+            found[law] = math.inf
+            continue
+        if best is None or found[law] < best[0]:
+            best = (found[law], {part: copy.deepcopy(getattr(body, part).state_dict()) for part in ("material", "contact")}, law)
+    if best is None:
+        raise SimulationDiverged(f"prior=auto: none of {', '.join(candidates)} can be calibrated; set prior.parameters nearer to the "
+                                 "body's")
+    for part, state in best[1].items():
+        getattr(body, part).load_state_dict(state)
+    for material in (body.material, *(variant["material"] for variant in body.frozen.values())):
+        material.choose(best[2])
+    return found
 
 
 class Identification:
@@ -126,8 +165,8 @@ class Identification:
         self.gains = (0.0,) if self.calibrating else criterion.gains
         self.kinds = (True, False, False) if self.calibrating and kinds[0] else kinds
         if not any(self.kinds):
-            raise ConfigError("losses: identification compares motion cues, and the weights of position, rotation and stretch are all "
-                              "0; use fit=adam, which learns from images too")
+            raise ConfigError("losses: identification compares motion cues, and the weights of position, rotation and stretch are "
+                              "all 0; use fit=adam, which learns from images too")
         self.chosen = residuals.sampled(len(body.rest), body.rest.device)
         blocks = blocks_of(body, adapter=self.adapter, heterogeneity=self.heterogeneity, settings=settings,
                            calibrating=self.calibrating)
@@ -164,7 +203,8 @@ class Identification:
 
     def _fields(self, body: Body) -> list[residuals.Fields]:
         return [
-            residuals.fields(self.rollout(body, i, gain, self.substeps[i]), self.takes[i].cues, self.takes[i].start.rotation, self.chosen)
+            residuals.fields(self.rollout(body, i, gain, self.substeps[i]), self.takes[i].cues, self.takes[i].start.rotation,
+                             self.chosen)
             for i, gain in self.pairs
         ]
 
@@ -199,8 +239,8 @@ class Identification:
             if distance < best[0]:
                 best = (distance, row)
         if not math.isfinite(best[0]):
-            raise SimulationDiverged("fit.prior: none of the starts of the coarse grid can be simulated; set prior.parameters nearer to "
-                                     "the body's, or raise simulation.max_substeps")
+            raise SimulationDiverged("fit.prior: none of the starts of the coarse grid can be simulated; set prior.parameters nearer "
+                                     "to the body's, or raise simulation.max_substeps")
         self._set(best[1])
         return best[0]
 
@@ -245,5 +285,10 @@ class Identification:
         self.noise = None if state["noise"] is None else [tuple(t.to(device) for t in each) for each in state["noise"]]
 
     def posterior(self) -> Posterior:
-        """Laplace's approximation at what was found."""
-        return self.newton.posterior()
+        """Laplace's approximation at what was found, with the root mean square distance of free rollouts from the cues after first
+        contact as the model's error."""
+        found = []
+        for i, take in enumerate(self.takes):
+            away = self.rollout(self.body, i).x - take.cues.positions
+            found.append(float(away[take.first_contact :].square().sum(-1).mean()))
+        return replace(self.newton.posterior(), model_error=(sum(found) / len(found)) ** 0.5)

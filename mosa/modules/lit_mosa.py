@@ -16,7 +16,7 @@ from mosa.modules.adapter import pool
 from mosa.modules.body import Body, Start, World
 from mosa.modules.criteria import Criterion
 from mosa.modules.gauss_newton import Posterior
-from mosa.modules.identification import Identification, IdentificationSettings
+from mosa.modules.identification import Identification, IdentificationSettings, choose_law
 from mosa.modules.material import material_states
 from mosa.modules.observer import deformed_covariances, observe
 from mosa.modules.restorable import Restorable
@@ -76,6 +76,7 @@ class LitMosa(Restorable, L.LightningModule):
         self.identification: Identification | None = None  # of the running stage, where it is Gauss-Newton's
         self.saved_identification: dict | None = None  # its state in the checkpoint that the fit goes on from
         self.posterior: Posterior | None = None
+        self.compared: dict[str, float] = {}  # mean distance [m] of the calibrated candidates for the backbone
         self.column = lambda: None
         """Called after each column of a Jacobian: these are what takes long."""
 
@@ -90,6 +91,7 @@ class LitMosa(Restorable, L.LightningModule):
                               "steps_done": self.steps_done, "particles": len(self.body.rest), "misfit": self.misfit,
                               "start": self.takes[0].start.written(),
                               "identification": self.identification.state() if self.identification else None,
+                              "compared": self.compared,
                               "posterior": self.posterior.written() if self.posterior else None}
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
@@ -102,6 +104,11 @@ class LitMosa(Restorable, L.LightningModule):
         self.stage_index, self.losses, self.steps_done = saved["stage"], list(saved["losses"]), saved["steps_done"]
         self.misfit = saved.get("misfit", MISFIT)
         self.saved_identification = saved.get("identification")
+        self.compared = dict(saved.get("compared") or {})
+        if self.compared:
+            for material in (self.body.material, *(variant["material"] for variant in self.body.frozen.values())):
+                material.choose(saved["config"]["cfg"]["prior"]["law"])
+            self.settle_law()
         self.posterior = Posterior.read(saved["posterior"]) if saved.get("posterior") else None
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
@@ -159,12 +166,14 @@ class LitMosa(Restorable, L.LightningModule):
         failure, found = None, {}
         try:
             if self.identification is None:
-                kinds = tuple(self.weights.get(name, 0.0) != 0 for name in ("position", "rotation", "stretch"))
-                self.identification = Identification(self.body, self.takes, self.world, stage, self.criterion, self.settings, kinds,
-                                                     progress=lambda: self.column())
+                searched = bool(self.body.material.candidates)  # then the best of them is where its calibration left it
+                if searched:
+                    self.compared = choose_law(self.body, self.body.material.candidates, lambda: self.identifying(stage))
+                    self.settle_law()
+                self.identification = self.identifying(stage)
                 if iteration > 0 and self.saved_identification is not None:
                     self.identification.restore(self.saved_identification)
-                elif stage.name == "prior":
+                elif stage.name == "prior" and not searched:
                     self.identification.search()
             found = self.identification.iterate()
         except MosaError as error:
@@ -178,6 +187,18 @@ class LitMosa(Restorable, L.LightningModule):
             if stage.name == "joint":
                 self.posterior = self.identification.posterior()
             self.finish(stage)
+
+    def identifying(self, stage: Stage) -> Identification:
+        """A stage's identification on the takes, from where the body stands."""
+        kinds = tuple(self.weights.get(name, 0.0) != 0 for name in ("position", "rotation", "stretch"))
+        return Identification(self.body, self.takes, self.world, stage, self.criterion, self.settings, kinds,
+                              progress=lambda: self.column())
+
+    def settle_law(self) -> None:
+        """What is written from now on is a run of the law that was chosen."""
+        prior = dict(self.config.get("cfg", {}).get("prior", {}))
+        if prior:
+            self.config["cfg"]["prior"] = prior | {"law": self.body.material.law, "candidates": []}
 
     def rollouts(self, stage: Stage) -> float:
         """About how many rollouts, one after another, a stage of Gauss-Newton takes at most."""

@@ -17,6 +17,8 @@ from mosa.physics.plasticity import friction_alpha
 from mosa.physics.rollout import Simulator
 
 NU_MAX, ANGLE_MAX = 0.49, 89.0
+AUTO = "auto"
+"""prior.law: the calibration chooses among prior.candidates."""
 
 
 class Form(NamedTuple):
@@ -54,16 +56,23 @@ class Material(nn.Module):
 
     law: name in `mosa.physics`; parameters: initial physical values (SI, friction_angle in degrees); frozen: names that are not
     learned; modulated: names the heterogeneity factor multiplies, by default the stiffness (E, or mu and kappa together).
+    candidates: laws among which a calibration chooses, with law=auto; until then it is the first.
     A parameter that starts on a bound of its range is held there.
     Errors: ConfigError naming the parameter, what was expected and what was found.
     """
 
     def __init__(
-        self, law: str, parameters: Mapping[str, float], frozen: Sequence[str] = (), modulated: Sequence[str] | None = None
+        self, law: str, parameters: Mapping[str, float], frozen: Sequence[str] = (), modulated: Sequence[str] | None = None,
+        candidates: Sequence[str] = (),
     ) -> None:
         super().__init__()
-        self._check_names(law, parameters, frozen, modulated)
-        self.law, self.names = law, tuple(parameters)
+        if (law == AUTO) != bool(candidates):
+            raise ConfigError(f"prior.candidates: expected a list of laws with prior.law=auto and none otherwise, found "
+                              f"{list(candidates)} with law {law!r}")
+        for each in candidates or (law,):
+            self._check_names(each, parameters, frozen, modulated)
+        self.candidates = tuple(candidates)
+        self.law, self.names = candidates[0] if candidates else law, tuple(parameters)
         self.stiffness = "E" if "E" in parameters else "kappa"
         self.modulated = tuple(modulated) if modulated is not None else tuple(n for n in STIFFNESS if n in parameters)
         self.raw = nn.ParameterDict()
@@ -86,6 +95,10 @@ class Material(nn.Module):
         known = law_named(law)
         takes = {name for name in known.parameters if name != known.reference}
         gives = {taken for name in parameters for taken in GIVES.get(name, (name,))}
+        listed = [taken for name in parameters for taken in GIVES.get(name, (name,))]
+        if twice := sorted({name for name in listed if listed.count(name) > 1}):
+            raise ConfigError(f"prior.parameters: expected each of {', '.join(sorted(takes))} once, found {', '.join(twice)} twice "
+                              f"by {', '.join(parameters)} (mu, lam come from E, nu)")
         if takes != gives:
             raise ConfigError(
                 f"prior.parameters: law {law} takes {', '.join(sorted(takes))}; {', '.join(parameters)} give "
@@ -108,9 +121,18 @@ class Material(nn.Module):
                 f"prior.parameters.{name}: expected a number between {form.low:g} and {form.high:g}, found {value:g}"
             )
 
+    def choose(self, law: str) -> None:
+        """Settle on one of the candidates."""
+        self.law, self.candidates = law, ()
+
     def physical(self) -> dict[str, Tensor]:
         """Constrained global values, scalars, in SI units (friction_angle in degrees)."""
         return {n: getattr(self, f"held_{n}") if n in self.held else FORMS[n].physical(self.raw[n]) for n in self.names}
+
+    @staticmethod
+    def physical_of(name: str, raw: Tensor) -> Tensor:
+        """The constrained value of one parameter, from its unconstrained one."""
+        return FORMS[name].physical(raw)
 
     def per_particle(self, factor: Tensor | float = 1.0) -> dict[str, Tensor]:
         """Values the simulator takes, by the law's own names; factor: (N,) heterogeneity of the modulated parameters, or 1.

@@ -16,7 +16,8 @@ class Stage:
     """One stage of the fit.
 
     iterations: of Adam; optimizer: auto | gauss_newton | adam, auto being the first where all that is learned has few numbers;
-    newton_iterations: of Gauss-Newton, at most. The rates are Adam's. lr: global parameters; lr_networks: heterogeneity field; lr_adapter: adapter; lr_contact [cells]: contact offset;
+    newton_iterations: of Gauss-Newton, at most. The rates are Adam's. lr: global parameters; lr_networks: heterogeneity field;
+    lr_adapter: adapter; lr_contact [cells]: contact offset;
     converged: relative change of the mean loss of 10 iterations below which the stage ends (0: run all iterations);
     start: backbone whose parameters the stage starts from (joint: prior | prior_eta).
     """

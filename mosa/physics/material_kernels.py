@@ -4,6 +4,7 @@ Fields may be float32; everything between load and store is float64 (see `kinema
 vech order: xx, yy, zz, yz, zx, xy, plain components.
 """
 
+# ruff: noqa: RUF059
 # (Warp: `int(0)` makes a variable that a dynamic loop or branch may change, and results are unpacked whole)
 
 from functools import cache

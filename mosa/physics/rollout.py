@@ -48,8 +48,8 @@ class Simulator:
     chained: whether the evaluations of an adapter that is a torch module and the segments between them run as chains (chain.py);
     None: on CUDA, where a chain is one captured graph. Not with colliders or adaptive substeps, which are cut in segments.
     Gradients through a chain reach the adapter's parameters, not other tensors that it may use.
-    strain: hencky | biot | green: what adapters answer is a stiffness S in units of 2 mu, of the energy mu E : S : E that is added to
-    the prior's; None: an operator on the prior's stress.
+    strain: hencky | biot | green: what adapters answer is a stiffness S in units of 2 mu, of the energy mu E : S : E that is
+    added to the prior's; None: an operator on the prior's stress.
     Errors: ConfigError naming the argument. Not safe for use by two threads: buffers are shared between rollouts.
     """
 
@@ -84,7 +84,7 @@ class Simulator:
         if strain is not None and (strain not in STRAINS or "mu" not in self.law.offsets or self.law.viscosity is not None):
             if strain not in STRAINS:
                 raise ConfigError(f"strain: expected one of {', '.join(STRAINS)} or None, found {strain!r}")
-            raise ConfigError(f"strain: expected a law with a shear modulus mu, found {law!r}: a stiffness is counted in multiples of 2 mu")
+            raise ConfigError(f"strain: expected a law with a shear modulus mu, found {law!r}: stiffness is in units of 2 mu")
         if dtype not in SCALARS:
             raise ConfigError(f"dtype: expected torch.float32 or torch.float64, found {dtype}")
         if init_affine not in ("spin", "zero"):

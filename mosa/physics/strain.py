@@ -1,6 +1,7 @@
 """Finite strain measures of one 3x3 deformation gradient and the stress that is conjugate to each, with closed differentials.
 
-A measure is E(C) = V diag(e(lambda)) V^T of the right Cauchy-Green tensor C = F^T F = V diag(lambda) V^T (Seth 1964, Hill 1968): Green's
+A measure is E(C) = V diag(e(lambda)) V^T of the right Cauchy-Green tensor C = F^T F = V diag(lambda) V^T (Seth 1964, Hill 1968):
+Green's
 e = (lambda - 1)/2, Biot's sqrt(lambda) - 1, Hencky's log(lambda)/2; all are lambda/2 - 1/2 to first order. An energy psi(E) has the
 Kirchhoff stress tau = 2 F (DE(C)[T]) F^T with T = dpsi/dE (Ogden, Non-linear Elastic Deformations, section 4.2). In the frame of V
 the derivative is T_ij e[lambda_i, lambda_j] with divided differences, and its own differential needs those of second order

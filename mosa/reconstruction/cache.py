@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import logging
@@ -18,6 +19,25 @@ from torch import Tensor
 from mosa.reconstruction.observed import Windows
 
 log = logging.getLogger(__name__)
+SPLATS = {"means": (3,), "scales": (3,), "rotations": (4,), "opacities": (), "colors": (3,)}
+RESULTS: dict[str, dict[str, tuple[int, ...]]] = {
+    "static": SPLATS, "particles": SPLATS | {"volume": ()}, "motion": {"positions": (3,), "covariances": (3, 3)},
+}  # fmt: skip
+"""Tensors of a stage, with their last dimensions."""
+LEADING = {"static": 1, "particles": 1, "motion": 2}
+"""How many dimensions are before those, the same in all tensors of a stage."""
+
+
+def check_result(name: str, result: Any, leading: tuple[int, ...] | None) -> None:
+    """Errors: ValueError where a stored result is not one of that stage; names that are not in the table are not looked at."""
+    if name == "hull":
+        if not (result["values"].ndim == 3 and result["origin"].shape == (3,) and result["pitch"] > 0):
+            raise ValueError("not a hull")
+    for key, last in RESULTS.get(name, {}).items():
+        found = tuple(result[key].shape)
+        leading = found[: LEADING[name]] if leading is None else leading
+        if found != (*leading, *last) or 0 in found or not bool(torch.isfinite(result[key]).all()):
+            raise ValueError(f"{key} of shape {found}, expected {(*leading, *last)} finite numbers")
 
 
 class StageCache:
@@ -27,24 +47,33 @@ class StageCache:
         self.folder = None
         if root is not None:
             digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]
-            self.folder = Path(root) / "reconstruction" / f"{key['scene']}-{digest}"
+            self.folder = Path(root) / "reconstruction" / f"{key['scene'].replace('/', '_')[:80]}-{digest}"
             self.folder.mkdir(parents=True, exist_ok=True)
             (self.folder / "key.json").write_text(json.dumps(key, indent=1, sort_keys=True))
 
-    def stage(self, name: str, compute: Callable[[], Any]) -> Any:
-        """The stored result of a stage, or `compute()` stored. A damaged file is computed again."""
+    def stage(self, name: str, compute: Callable[[], Any], leading: tuple[int, ...] | None = None) -> Any:
+        """The stored result of a stage, or `compute()` stored. A damaged file, or one that holds something else, is computed again.
+        leading: lengths that the first dimensions of its tensors have, where they are known."""
         if self.folder is None:
             return compute()
         path = self.folder / f"{name}.pt"
         if path.exists():
             try:
-                return torch.load(path, map_location="cpu", weights_only=True)
+                result = torch.load(path, map_location="cpu", weights_only=True)
+                check_result(name, result, leading)
+                return result
             except Exception as error:
                 log.warning("%s: cannot be read (%s); this stage is computed again", path, error)
         result = compute()
         partial = path.with_suffix(f".{os.getpid()}.tmp")
-        torch.save(result, partial)
-        os.replace(partial, path)
+        try:
+            with open(partial, "wb") as file:
+                torch.save(result, file)
+            os.replace(partial, path)
+        except RuntimeError as error:  # what torch makes of a disk that is full
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
+        finally:
+            partial.unlink(missing_ok=True)
         return result
 
     def strip(self, name: str, windows: Windows, rendered: Tensor, columns: int = 8) -> None:

@@ -234,7 +234,7 @@ def reconstruct(
         static = Splats(**cache.stage("static", static_stage)).to(device)
         return _motion(scene, splats.to(device), static, windows, background, settings, seed, bar, cache)
 
-    motion = cache.stage("motion", motion_stage)
+    motion = cache.stage("motion", motion_stage, (len(frames), len(splats.means)))
     static = Splats(**cache.stage("static", static_stage))
     return Reconstruction(splats, spacing, volume, cues_of(motion, splats, settings), static)
 
@@ -293,7 +293,7 @@ def follow(
         return _motion(scene, splats.to(device), static.to(device), windows, scene.background.to(device), settings, seed, bar,
                        cache)
 
-    motion = cache.stage("motion", motion_stage)
+    motion = cache.stage("motion", motion_stage, (len(frames), len(splats.means)))
     return Reconstruction(splats, reconstruction.spacing, reconstruction.volume, cues_of(motion, splats, settings), static)
 
 

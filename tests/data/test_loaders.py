@@ -119,7 +119,7 @@ def test_frames_cameras_and_the_last_free_frame_are_chosen_by_the_numbers_in_the
 
 
 def test_frame_rate_overrides_the_times_of_the_data(pacnerf_folder):
-    assert torch.allclose(pacnerf(pacnerf_folder, fps=50.0).times, torch.arange(5) / 50)
+    assert torch.allclose(pacnerf(pacnerf_folder, fps=25.0).times, torch.arange(5) / 25)
 
 
 def test_particles_are_ordered_by_number(blocks, pacnerf_folder, tmp_path):

@@ -108,13 +108,16 @@ def test_only_small_enclosed_holes_are_filled():
 
 
 def ball_scene(views=6):
-    """A ball of 0.15 m radius at (0.1, 0.3, 0) seen by a ring of cameras; five equal frames."""
+    """A ball of 0.15 m radius that falls from (0.1, 0.3, 0), seen by a ring of cameras; five frames, 24 per second."""
     scene = block_scene(views)
     rig = ring_of_cameras(views, 32, target=(0.0, 0.3, 0), distance=1.5, elevations=(0.2, 0.6), field=0.6, turn=0.4)
     origins, directions = rays(rig)
-    arm = torch.tensor([0.1, 0.3, 0.0]) - origins[:, None, None]
-    distance = (arm - (arm * directions).sum(-1, keepdim=True) * directions).norm(dim=-1)
-    mattes = (distance < 0.15).float()[:, None].expand(-1, 5, -1, -1)
+    mattes = []
+    for t in range(5):
+        arm = torch.tensor([0.1, 0.3 - 4.9 * (t / 24) ** 2, 0.0]) - origins[:, None, None]
+        distance = (arm - (arm * directions).sum(-1, keepdim=True) * directions).norm(dim=-1)
+        mattes.append((distance < 0.15).float())
+    mattes = torch.stack(mattes, 1)
     return replace(scene, cameras=rig, mattes=mattes, images=1 - 0.5 * mattes[..., None].expand(-1, -1, -1, -1, 3))
 
 

@@ -5,12 +5,20 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from mosa.data.builtin.hidden import Hidden
 from mosa.data.builtin.objects import object_named
 from mosa.errors import ConfigError
 from mosa.physics.colliders import reach
 from mosa.physics.rollout import Simulator
 from mosa.physics.time_step import required_substeps
 from mosa.types import ParticleState, Scene
+
+
+def hidden_of(scene: Scene) -> Hidden:
+    """The hidden material of a built-in scene, for figures alone. Errors: ConfigError where the scene is not a built-in one."""
+    if scene.truth is None or not scene.synthetic:
+        raise ConfigError(f"scene {scene.name}: the true law is known for built-in scenes only")
+    return object_named(scene.name).material.variant("anisotropic" if scene.truth.parameters["ratio"] > 1 else "isotropic")
 
 
 @torch.no_grad()
@@ -23,10 +31,7 @@ def floor_rollout(body, scene: Scene, world) -> Tensor:
     left between this and the truth is the learner's discretisation: differences below it mean nothing.
     Errors: ConfigError where the scene is not a built-in one; SimulationDiverged.
     """
-    truth = scene.truth
-    if truth is None or not scene.synthetic:
-        raise ConfigError(f"scene {scene.name}: the true law is known for built-in scenes only")
-    hidden = object_named(scene.name).material.variant("anisotropic" if truth.parameters["ratio"] > 1 else "isotropic")
+    truth, hidden = scene.truth, hidden_of(scene)
     settings, frame_dt = body.settings, float(scene.times[1] - scene.times[0])
     rest, device = body.rest.detach().float().cpu(), body.rest.device
     Q = truth.rotation.float()

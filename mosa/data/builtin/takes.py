@@ -7,7 +7,6 @@ import hashlib
 import logging
 import os
 import tempfile
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +20,8 @@ from mosa.data.builtin.shapes import SHAPES
 from mosa.data.builtin.surface import Skin, Surface, bind, extract_surface, fill
 from mosa.data.footage import WHITE
 from mosa.data.images import composite, resize
-from mosa.errors import ConfigError
+from mosa.errors import ConfigError, DataError
+from mosa.npz import read_npz
 from mosa.progress import tqdm
 from mosa.threads import threaded
 from mosa.types import Cameras
@@ -134,9 +134,13 @@ def read_take(file: Path) -> Take | None:
     if not file.is_file():
         return None
     try:
-        with np.load(file) as stored:
-            return Take(*(stored[n] for n in ("pictures", "rest", "positions", "rotation", "velocity")))
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        stored = read_npz(file)
+        take = Take(*(stored[n] for n in ("pictures", "rest", "positions", "rotation", "velocity")))
+        shapes = take.pictures.shape[1:2] + take.rest.shape, take.positions.shape
+        if take.pictures.ndim != 5 or shapes[0] != shapes[1] or take.rotation.shape != (3, 3) or take.velocity.shape != (3,):
+            raise DataError(f"{file}: not a film of a built-in scene")
+        return take
+    except (DataError, KeyError) as error:
         log.warning("%s: damaged cache file (%s); making it again", file, error)
         return None
 

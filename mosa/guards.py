@@ -1,0 +1,99 @@
+"""What is refused before anything long runs: one function for each moment at which something more is known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from mosa.checkpoints import check_resumed, read_checkpoint
+from mosa.config import plain, rehearse
+from mosa.data.agreement import lines_of_sight, misses
+from mosa.errors import ConfigError, DataError
+from mosa.known import check_known, conf_folder
+from mosa.limits import machine_memory
+from mosa.modules.body import Body, Start, World
+from mosa.physics.collider_overlap import check_clear
+from mosa.physics.colliders import colliders_from_config
+from mosa.schema import EVALUATION, SIMULATION, TRAINING, check
+from mosa.twin import Twin
+from mosa.types import Scene
+
+PARTICLE_BYTES = 5e3
+"""Of a particle through reconstruction and fit, at least: modes, neighbours, frames, buffers of the rollout."""
+FEWEST = 8
+
+
+def check_configuration(values: Mapping[str, Any]) -> None:
+    """All that train.py's configuration says by itself. Errors: ConfigError naming the key."""
+    if (conf := conf_folder()) is not None:
+        check_known(values, conf, "train", TRAINING, EVALUATION)
+    check(values, TRAINING, EVALUATION)
+    check_particles("simulation.particles", values["simulation"]["particles"])
+    rehearse(values)
+
+
+def check_evaluation(values: Mapping[str, Any]) -> None:
+    """All that eval.py's configuration says by itself. Errors: ConfigError naming the key."""
+    if (conf := conf_folder()) is not None:
+        check_known({k: v for k, v in values.items() if k != "scene"}, conf, "eval", EVALUATION, SIMULATION)
+    check(values, EVALUATION, SIMULATION)
+
+
+def check_particles(key: str, count: float) -> None:
+    """Errors: ConfigError where the machine cannot hold as many."""
+    most = int(machine_memory() / PARTICLE_BYTES)
+    if count > most:
+        raise ConfigError(f"{key}: expected at most {most} particles, which fill this machine's {machine_memory() / 1e9:.1f} GB, "
+                          f"found {count:.3g}")
+
+
+def check_begin(cfg: DictConfig) -> None:
+    """The checkpoint that a fit is to go on from is one. Errors: DataError."""
+    if cfg.ckpt_path is None:
+        return
+    try:
+        check_resumed(read_checkpoint(cfg.ckpt_path), cfg.ckpt_path)
+    except DataError as error:
+        again = "; remove the file, and resume=auto begins the fit anew" if cfg.resume == "auto" else ""
+        raise DataError(f"{error}{again}") from error
+
+
+def check_seen(cfg: DictConfig, scene: Scene) -> None:
+    """The object as frame 0 shows it, before its reconstruction: no solid contains it, and the grid's spacing suits its size.
+
+    Errors: ConfigError naming the key. Silent where fewer than two mattes are whole.
+    """
+    chosen, origins, directions, radii = lines_of_sight(scene, 0)
+    if len(chosen) < 2:
+        return
+    place, _ = misses(origins, directions, radii)
+    solids = colliders_from_config(plain(cfg.world)["colliders"] or ())
+    check_clear(solids, place[None], "the object, as frame 0 shows it,")
+    dx, radius = cfg.simulation.dx, float((radii * ((place - origins) * directions).sum(1)).mean())
+    if dx is not None:
+        count = 4 / 3 * 3.14 * (radius / (dx / 2)) ** 3
+        check_particles("simulation.dx", count)
+        if count < FEWEST:
+            raise ConfigError(f"simulation.dx: expected a grid that is finer than the object, of a radius of {radius:.3g} m, found "
+                              f"{dx} m")
+
+
+def check_starts(world: World, body: Body, found: dict[str, Start]) -> None:
+    """No sequence starts inside of a solid. Errors: ConfigError naming the collider."""
+    for prefix, start in found.items():
+        x = (body.rest - body.center) @ start.rotation.to(body.rest).T + start.center.to(body.rest)
+        check_clear(world.colliders, x, f"the body of {prefix}")
+
+
+def evaluated_scene(cfg: DictConfig, twin: Twin) -> DictConfig:
+    """The keys of the scene to evaluate on: eval.py's own, else what the run stored, which is read as data. Stored paths are read
+    from, and never written to: what is made goes to eval.py's own cache. Errors: DataError."""
+    stored = twin.config["cfg"].get("scene")
+    if not cfg.get("scene") and not (isinstance(stored, dict) and all(isinstance(key, str) for key in stored)):
+        raise DataError(f"ckpt_path: {cfg.ckpt_path}: expected the stored configuration's scene, found none; set scene=<option>")
+    keys = plain(cfg.scene) if cfg.get("scene") else {**stored, "cache": None}
+    if not cfg.get("scene") and keys.get("path") is not None:
+        print(f"scene: reads {keys['path']} below {keys.get('root')}, as the checkpoint says (scene=... reads another)")
+    return OmegaConf.create({"scene": keys | {"cache": keys.get("cache") or cfg.get("cache")}})
