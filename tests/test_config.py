@@ -33,7 +33,8 @@ def test_every_scene_with_every_prior_composes(scene):
         assert config["prior"] and config["scene"]
 
 
-@pytest.mark.parametrize("name", ["reconstruction", "simulation", "fit", "criterion", "trainer", "logger", "ablation", "experiment"])
+@pytest.mark.parametrize("name", ["reconstruction", "simulation", "fit", "criterion", "trainer", "logger", "ablation",
+                                  "experiment"])  # fmt: skip
 def test_every_option_of_a_group_composes(name):
     for option in group(name):
         assert composed(f"{name}={option}")
@@ -133,9 +134,8 @@ def test_a_value_of_the_wrong_kind_is_named_before_anything_is_computed(override
     (["heterogeneity.amplitude=2"], r"heterogeneity\.amplitude"),
     (["simulation.precision=16"], r"simulation\.precision"),
     (["fit.prior.iterations=0"], r"fit\.prior\.iterations"),
-    (["world.walls={mode:slip,foo:1}"], r"world\.walls\.foo: unknown key; expected one of mode, friction"),
-    (["world.walls={mode:separate,friction:abc}"], r"world\.walls\.friction"),
-    (["world.walls={friction:0.1}"], r"world\.walls: expected null, or \{mode: separate, friction: 0\.1\}, found no mode"),
+    (["world.walls={foo:1}"], r"world\.walls\.foo: unknown key; expected one of mode, friction"),
+    (["world.walls={friction:abc}"], r"world\.walls\.friction"),
     (["world.walls={mode:sticky,friction:0.1}"], r"world\.walls\.friction"),
     (["world.colliders=[{type:cone}]"], r"world\.colliders\[0\]\.type"),
 ])  # fmt: skip

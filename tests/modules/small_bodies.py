@@ -69,4 +69,6 @@ def cues_of(rollout, rotation) -> MotionCues:
 def take_of(body: Body, begins: Start, frames: int, world: World = WORLD):
     """A sequence of the body as it is, with all that it has."""
     rollout = body.simulate(begins, world, frames, FRAME_DT)
-    return SimpleNamespace(start=begins, cues=cues_of(rollout, begins.rotation), frame_dt=FRAME_DT)
+    touched = (rollout.x[:, :, 1].amin(1) < 0.7 * DX).nonzero()  # a grid stops a body a fraction of a cell before it touches
+    first = int(touched[0]) if len(touched) else frames - 1
+    return SimpleNamespace(start=begins, cues=cues_of(rollout, begins.rotation), frame_dt=FRAME_DT, first_contact=first)

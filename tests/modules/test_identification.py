@@ -63,6 +63,10 @@ def test_a_calibration_finds_modulus_and_poisson_number_from_the_coarse_grid(beg
     assert found.distance() < 1e-5
     posterior = found.posterior()
     assert posterior.names == ["E", "nu"] and posterior.determined.min() > 0.99
+    away = found.rollout(body, 0).x - found.takes[0].cues.positions
+    seen = away[found.takes[0].first_contact :]
+    assert posterior.model_error == pytest.approx(float((seen**2).sum(-1).mean().sqrt()), rel=1e-9)
+    assert 0 < found.takes[0].first_contact < FRAMES - 3 and posterior.model_error < 1e-5
 
 
 def test_a_contact_offset_is_found_with_them():
