@@ -24,7 +24,7 @@ from mosa.twin import Twin
 
 BODIES = ("observed", "truth", "prior", "learned")
 """What a clip can have, from left to right: the motion learned from, or where none was the true one, and the two models'."""
-COLORS = ("appearance", "heterogeneity", "deviation")
+COLORS = ("appearance", "heterogeneity", "deviation", "uncertainty")
 DISTANCE = 1.4
 """From one body to the next, in widths of what they take up together in the frame where that is most."""
 GRAY = 0.6
@@ -73,7 +73,8 @@ class Clip:
     """A sequence of a run. times: (T,) [s]; bodies: by name, in the order of BODIES: learned always, over all frames; prior, the
     calibrated law's without adapter and heterogeneity, where the run left it; one of observed, over the frames that were learned
     from, and truth, or neither; appearance: (N, 3) in [0, 1]; opacities: (N,); factor: (N,) 1 + a tanh eta, by which a particle's
-    stiffness differs from the law's."""
+    stiffness differs from the law's; spread: (T, N) [m] predicted standard deviation of the learned positions, None where the run
+    left none."""
 
     name: str
     times: np.ndarray
@@ -82,6 +83,7 @@ class Clip:
     opacities: np.ndarray
     factor: np.ndarray
     world: World
+    spread: np.ndarray | None = None
 
     @property
     def learned(self) -> Motion:
@@ -152,18 +154,24 @@ class Clip:
             high = max(float(np.quantile(self.deviation(t, model), 0.99)) for t in frames for model in self.models)
             label = {"observed": "distance to the observed motion [mm]", "truth": "distance to the true motion [mm]"}
             found["deviation"] = Scale(label[self.reference], "viridis", 0, max(1e3 * high, 1e-3), "max")
+        if self.spread is not None:
+            high = float(np.quantile(self.spread, 0.99, axis=1).max())
+            found["uncertainty"] = Scale("predicted standard deviation [mm]", "magma", 0, max(1e3 * high, 1e-3), "max")
         return found
 
     def paint(self, frame: int, by: str, model: str = "learned") -> np.ndarray:
         """(N, 3) colours in [0, 1] of a model's body. heterogeneity: blue softer, red stiffer, the prior has none; deviation: up
-        to the 99th percentile of the sequence's worst frame, gray where there is nothing to compare with. Errors: ConfigError for
-        another name."""
+        to the 99th percentile of the sequence's worst frame, gray where there is nothing to compare with; uncertainty: likewise, of
+        the learned body. Errors: ConfigError for another name."""
         if by not in COLORS:
             raise ConfigError(f"color: expected {' or '.join(COLORS)}, found {by!r}")
         if by == "appearance":
             return self.appearance
         if by == "heterogeneity":
             return self.scales[by].paint(self.factor if model == "learned" else np.ones_like(self.factor))
+        if by == "uncertainty":
+            known = self.spread is not None and model == "learned"
+            return self.scales[by].paint(1e3 * self.spread[frame]) if known else np.full_like(self.appearance, GRAY)
         far = self.deviation(frame, model)
         return np.full_like(self.appearance, GRAY) if far is None else self.scales[by].paint(1e3 * far)
 
@@ -204,6 +212,7 @@ def read_run(folder: str | Path) -> list[Clip]:
     paths = {kind: folder / f"{'rollout' if kind == 'learned' else kind}.npz" for kind in BODIES}
     files = {kind: arrays(path) for kind, path in paths.items() if kind != "learned" and path.is_file()} | {"learned": rollouts}
     factor = body.factor(body.heterogeneity)
+    spreads = arrays(folder / "uncertainty.npz") if (folder / "uncertainty.npz").is_file() else {}
     clips = []
     for name in (key.removesuffix("/x") for key in rollouts if key.endswith("/x")):
         check_motion(rollouts, name, paths["learned"], ("x",))
@@ -223,10 +232,20 @@ def read_run(folder: str | Path) -> list[Clip]:
             check_motion(stored, name, paths[kind], ("F_tot", "covariances"))
             bodies[kind] = Motion(stored[f"{name}/x"], covariances(stored, name, body))
         clips.append(Clip(name, rollouts[f"{name}/times"], bodies, body.colors.clamp(0, 1).numpy(), body.opacities.numpy(),
-                          factor.numpy(), twin.world))  # fmt: skip
+                          factor.numpy(), twin.world, spread_of(spreads, name, shape, folder / "uncertainty.npz")))  # fmt: skip
     if not clips:
         raise DataError(f"{folder / 'rollout.npz'}: expected the rollouts of a run, found none")
     return clips
+
+
+def spread_of(stored: dict[str, np.ndarray], name: str, shape: tuple[int, int], path: Path) -> np.ndarray | None:
+    """(T, N) [m], None where the file has none for this sequence. Errors: DataError naming file and entry."""
+    found = stored.get(f"{name}/sd")
+    if found is None:
+        return None
+    if found.shape != shape or found.dtype.kind != "f" or not np.isfinite(found).all() or found.min() < 0:
+        raise DataError(f"{path}: {name}/sd: expected {shape} finite standard deviations, found {found.dtype} {found.shape}")
+    return found
 
 
 def check_motion(stored: dict[str, np.ndarray], name: str, path: Path, keys: tuple[str, ...]) -> None:

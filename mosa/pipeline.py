@@ -45,6 +45,7 @@ from mosa.physics.memory import KEPT_ON_CPU
 from mosa.plan import plan, plan_text
 from mosa.prediction import determined, predicted_spread
 from mosa.progress import tqdm
+from mosa.reconstruction.resolution import ENOUGH, resolution
 from mosa.reconstruction.starts import first_contact, sequence_start, splats_of
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import use_backend
@@ -160,6 +161,11 @@ def train(cfg: DictConfig) -> float | None:
     log.info("body: %d particles, %.4g cm^3, grid spacing %.4g m", len(volume), 1e6 * float(volume.sum()), dx)
     config = run_config(plain(cfg), scene, dx)
     body = body_of(reconstruction, config).to(device)
+    resolved = resolution(body.rest, dx / 2)
+    if not resolved.enough:
+        warnings.warn(f"simulation.particles: the thin parts of this body are {resolved.cells:.1f} cells across, fewer than {ENOUGH:g}: "
+                      f"the grid stiffens them, and the law that is found makes up for it; about {resolved.particles} particles would "
+                      "resolve them", stacklevel=1)
     with clock.measure("starts"):
         found = shared_starts(cfg, folder, lambda: starts(body, reconstruction, scene, held_out, taught), body)
     for prefix, start in found.items():
@@ -186,6 +192,7 @@ def train(cfg: DictConfig) -> float | None:
     if cfg.evaluation.floor:
         figures |= floor_figures(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
     figures |= clock.figures | cost(device) | {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
+    figures["geometry/cells_across"] = resolved.cells
     log_outcome(plain(cfg.logger), folder, plain(cfg), figures)
     write_outputs(folder, cfg, body, evaluated, figures, kept)
     return optimized(figures, cfg.optimized_metric)

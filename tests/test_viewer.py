@@ -165,7 +165,7 @@ def test_colours_say_what_they_are_by(run):
     thrown = train.learned.centers + 0.02 * (np.arange(T) == 1)[:, None, None]
     worst = replace(train, bodies=train.bodies | {"learned": replace(train.learned, centers=thrown + np.array([0, 0.05, 0]))})
     assert worst.scales["deviation"].high == pytest.approx(1e3 * worst.deviation(1).max(), rel=1e-3)  # of the worst frame
-    with pytest.raises(ConfigError, match="color: expected appearance or heterogeneity or deviation, found 'speed'"):
+    with pytest.raises(ConfigError, match="color: expected appearance or heterogeneity or deviation or uncertainty, found 'speed'"):
         train.paint(0, "speed")
 
 
@@ -277,3 +277,18 @@ def test_the_server_shows_a_learned_body_alone(run):
         assert shown.layout.value == "side by side" and not shown.layout.disabled and shown.nodes["observed"][0].visible
     finally:
         shown.stop()
+
+
+def test_the_spread_of_the_prediction_is_a_colour_of_the_learned_body_alone(run):
+    sd = np.linspace(0.001, 0.02, T * N, dtype=np.float32).reshape(T, N)
+    np.savez(run / "uncertainty.npz", **{"train/sd": sd})
+    train, test = read_run(run)
+    assert np.array_equal(train.spread, sd) and test.spread is None and "uncertainty" not in test.scales
+    high = 1e3 * float(np.quantile(sd[-1], 0.99))
+    assert train.scales["uncertainty"].high == pytest.approx(high, rel=1e-6)
+    expected = matplotlib.colormaps["magma"](1e3 * sd[2] / high)[:, :3]
+    assert np.allclose(train.paint(2, "uncertainty"), expected, atol=0.01)
+    assert (train.paint(2, "uncertainty", "prior") == GRAY).all() and (test.paint(2, "uncertainty") == GRAY).all()
+    np.savez(run / "uncertainty.npz", **{"train/sd": -sd})
+    with pytest.raises(DataError, match="train/sd: expected"):
+        read_run(run)
