@@ -210,7 +210,7 @@ def build_stages(
     wanted = {"prior": True, "prior_eta": heterogeneity is not None, "joint": adapter is not None or heterogeneity is not None}
     stages = [s.resolved(all(map(few_numbers, parts[s.name]))) for s in stages if wanted[s.name] and s.iterations > 0]
     if searching and stages and not stages[0].newton:
-        raise ConfigError("prior=auto: expected fit.prior.optimizer auto or gauss_newton, which compares the candidates; found adam")
+        raise ConfigError("prior=auto: expected fit.prior.optimizer=auto or gauss_newton, which compares candidates; found adam")
     if not stages or stages[0].name != "prior":
         raise ConfigError("fit.prior.iterations: expected at least 1: every later figure is compared with the calibrated prior")
     return stages

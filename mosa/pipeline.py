@@ -163,9 +163,9 @@ def train(cfg: DictConfig) -> float | None:
     body = body_of(reconstruction, config).to(device)
     resolved = resolution(body.rest, dx / 2)
     if not resolved.enough:
-        warnings.warn(f"simulation.particles: the thin parts of this body are {resolved.cells:.1f} cells across, fewer than {ENOUGH:g}: "
-                      f"the grid stiffens them, and the law that is found makes up for it; about {resolved.particles} particles would "
-                      "resolve them", stacklevel=1)
+        warnings.warn(f"simulation.particles: the thin parts of this body are {resolved.cells:.1f} cells across, fewer than {ENOUGH:g}: the "
+                      "grid stiffens them, and the law that is found makes up for it; about "
+                      f"{resolved.particles} particles would resolve them", stacklevel=1)
     with clock.measure("starts"):
         found = shared_starts(cfg, folder, lambda: starts(body, reconstruction, scene, held_out, taught), body)
     for prefix, start in found.items():

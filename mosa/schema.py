@@ -65,12 +65,12 @@ WIDEST = 4096
 """Of a layer of a network: many times what any run has used, and far below what memory would not hold."""
 
 SECTIONS = ("scene", "prior", "adapter", "reconstruction", "simulation", "fit", "rendering", "trainer", "logger", "evaluation",
-            "heterogeneity", "losses", "world", "fit.prior", "fit.prior_eta", "fit.joint", "reconstruction.static",
+            "heterogeneity", "losses", "world", "criterion", "identification", "fit.prior", "fit.prior_eta", "fit.joint", "reconstruction.static",
             "reconstruction.appearance", "reconstruction.dynamic")  # fmt: skip
 
 FIGURE = Kind("a figure's name like test/rms_m (docs/figures.md)",
               lambda v: isinstance(v, str) and v.split("/")[0] in FIGURES and "/" in v)
-FIGURES = ("train", "test", "camera", "prior", "prior_eta", "id", "id_prior", "floor", "time")
+FIGURES = ("train", "test", "camera", "prior", "prior_eta", "id", "id_prior", "floor", "time", "posterior", "geometry", "frames")
 """What the names of figures begin with."""
 
 TRAINING: dict[str, Kind] = {
@@ -86,6 +86,23 @@ TRAINING: dict[str, Kind] = {
     "fit.joint.start": or_null(one_of("prior", "prior_eta")),
     "losses.*": WEIGHT,
     "heterogeneity.enabled": FLAG,
+    "heterogeneity.kind": one_of("modes", "network"),
+    "heterogeneity.wavelength": number(0, 2, above=True),
+    "heterogeneity.most": whole(1, WIDEST),
+    "criterion.name": one_of("free", "corrected", "both"),
+    "criterion.gain": number(0, 1, above=True),
+    "identification.count": POSITIVE,
+    "identification.model_error": number(0, 1),
+    "identification.operator_sd": POSITIVE,
+    "identification.stiffness_sd": POSITIVE,
+    "identification.smoothness": WEIGHT,
+    "identification.evidence": FLAG,
+    "identification.tolerance": POSITIVE,
+    "identification.threads": whole(0, 256),
+    "fit.*.optimizer": one_of("auto", "gauss_newton", "adam"),
+    "fit.*.newton_iterations": COUNT,
+    "adapter.strain": one_of("green", "biot", "hencky"),
+    "prior.candidates": or_null(NAMES),
     "heterogeneity.amplitude": POSITIVE,
     "heterogeneity.hidden": whole(1, WIDEST),
     "heterogeneity.frequencies": whole(0, 32),

@@ -84,8 +84,8 @@ class Twin:
         finally:
             write_numbers(self.body, kept)
         if len(found) < 2:
-            raise ConfigError(f"predict: expected at least two of {draws} draws of the law that can be simulated from this start, found "
-                              f"{len(found)}")
+            raise ConfigError(f"predict: expected at least two of {draws} draws of the law that can be simulated from this start, "
+                              f"found {len(found)}")
         return rollout, total_spread(torch.stack(found), self.posterior.model_error)
 
     @torch.no_grad()

@@ -33,7 +33,8 @@ def test_every_scene_with_every_prior_composes(scene):
         assert config["prior"] and config["scene"]
 
 
-@pytest.mark.parametrize("name", ["reconstruction", "simulation", "fit", "trainer", "logger", "ablation", "experiment"])
+@pytest.mark.parametrize("name", ["reconstruction", "simulation", "fit", "criterion", "trainer", "logger", "ablation",
+                                  "experiment"])  # fmt: skip
 def test_every_option_of_a_group_composes(name):
     for option in group(name):
         assert composed(f"{name}={option}")
@@ -50,8 +51,10 @@ def test_a_mistyped_option_is_refused(override):
     ({"_target_": "mosa.modules.direct.DirectAdapter", "no_C": True}, "no_C"),
     ({"_target_": "mosa.modules.adapter.StressAdapter", "alfa": 0.1}, "adapter.alfa: unknown key; expected one of alpha"),
     ({"name": "stress", "alfa": 0.1}, "adapter.alfa: unknown key; expected one of alpha"),
-    ({"name": "stres"}, "adapter.name: expected stress, direct"),
-    ({"name": ["stress"]}, "adapter.name: expected stress"),
+    ({"name": "stres"}, "adapter.name: expected hyperelastic, stress, direct or null, found 'stres'"),
+    ({"name": ["stress"]}, "adapter.name: expected hyperelastic, stress, direct or null"),
+    ({"name": "hyperelastic", "strain": "almansi"}, "adapter.strain: expected one of hencky, biot, green, found 'almansi'"),
+    ({"name": "hyperelastic", "alpha": 0.2}, "adapter.alpha: unknown key; expected one of strain"),
     ({"name": "direct", "_target_": "mosa.modules.adapter.StressAdapter"}, "found both"),
     ({"_target_": "mosa.modules.adapter.Stress"}, "adapter._target_: expected a known adapter"),
     ({"_target_": ["subprocess.Popen"]}, "adapter._target_"),
@@ -70,13 +73,27 @@ def test_a_mistake_in_the_simulation_names_its_key(key, value):
 def test_a_mistake_in_a_stage_names_its_key():
     fit = {name: {"iterations": 2, "lr": 0.1} for name in ("prior", "prior_eta", "joint")}
     with pytest.raises(ConfigError, match=r"fit\.joint\.lrr: unknown key; expected one of iterations, lr,"):
-        build_stages(fit | {"joint": {"iterations": 2, "lrr": 1}}, heterogeneity=True, adapter=True)
+        build_stages(fit | {"joint": {"iterations": 2, "lrr": 1}}, heterogeneity=None, adapter=None)
     with pytest.raises(ConfigError, match=r"fit\.joint\.start"):
-        build_stages(fit | {"joint": {"iterations": 2, "lr": 1, "start": "foo"}}, heterogeneity=True, adapter=True)
+        build_stages(fit | {"joint": {"iterations": 2, "lr": 1, "start": "foo"}}, heterogeneity=None, adapter=None)
 
 
-@pytest.mark.parametrize("group_name", ["adapter", "ablation", "debug", "experiment", "fit", "logger", "prior", "reconstruction",
-                                        "rendering", "scene", "simulation", "trainer"])  # fmt: skip
+@pytest.mark.parametrize("adapter, expected", [("hyperelastic", "gauss_newton"), (None, None), ("stress", "adam")])
+def test_a_stage_takes_gauss_newton_where_all_it_learns_has_few_numbers(adapter, expected):
+    fit = composed()["fit"]
+    stages = build_stages(fit, heterogeneity=None, adapter=build_adapter({"name": adapter}))
+    found = {stage.name: stage.optimizer for stage in stages}
+    assert found.get("joint") == expected and found["prior"] == "gauss_newton"  # without an adapter there is nothing to join
+    asked = fit | {"joint": fit["joint"] | {"optimizer": "gauss_newton"}}
+    if expected == "adam":
+        with pytest.raises(ConfigError, match=r"fit\.joint\.optimizer: gauss_newton learns few numbers"):
+            build_stages(asked, heterogeneity=None, adapter=build_adapter({"name": adapter}))
+    adam = composed("fit=adam")["fit"]
+    assert {s.optimizer for s in build_stages(adam, heterogeneity=None, adapter=build_adapter({"name": adapter}))} == {"adam"}
+
+
+@pytest.mark.parametrize("group_name", ["adapter", "ablation", "criterion", "debug", "experiment", "fit", "logger", "prior",
+                                        "reconstruction", "rendering", "scene", "simulation", "trainer"])  # fmt: skip
 def test_every_option_passes_the_checks_before_a_run(group_name):
     for option in group(group_name):
         config = composed(f"{group_name}={option}")
@@ -98,8 +115,9 @@ def test_every_option_passes_the_checks_before_a_run(group_name):
     "evaluation.samples=0", "logger.images_every=-1",
 ])  # fmt: skip
 def test_a_value_of_the_wrong_kind_is_named_before_anything_is_computed(override):
+    base = ["adapter=linear"] if override.startswith("adapter.") else []  # it has the keys, and the default has not
     with pytest.raises(ConfigError, match=rf"^{override.lstrip('+').split('=')[0]}: expected .*, found "):
-        check(composed(override), TRAINING, EVALUATION)
+        check(composed(*base, override), TRAINING, EVALUATION)
 
 
 @pytest.mark.parametrize("overrides, message", [
@@ -107,7 +125,12 @@ def test_a_value_of_the_wrong_kind_is_named_before_anything_is_computed(override
     (["+prior.foo=1"], r"prior\.foo: unknown key; expected one of law, parameters, frozen, modulated"),
     (["+prior.options.foo=1"], r"prior\.options\.foo: unknown key; expected one of yield_convention"),
     (["reconstruction.static.max_points=5000"], r"reconstruction\.static\.max_points: expected null"),
-    (["adapter.alpha=2"], r"adapter\.alpha"),
+    (["adapter=linear", "adapter.alpha=2"], r"adapter\.alpha"),
+    (["adapter.strain=almansi"], r"adapter\.strain"),
+    (["heterogeneity.wavelength=3"], r"heterogeneity\.wavelength"),
+    (["criterion.name=open"], r"criterion\.name"),
+    (["criterion.gain=2"], r"criterion\.gain"),
+    (["identification.count=0"], r"identification\.count"),
     (["heterogeneity.amplitude=2"], r"heterogeneity\.amplitude"),
     (["simulation.precision=16"], r"simulation\.precision"),
     (["fit.prior.iterations=0"], r"fit\.prior\.iterations"),

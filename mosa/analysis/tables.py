@@ -68,10 +68,10 @@ def determined_text(figures: Mapping[str, float]) -> str:
         axis = ", ".join(f"{figures[f'id/stiffest_{n}']:.2f}" for n in "xyz")
         spread = f"{ratio:.2f} +- {figures['posterior/stiffness_ratio_sd']:.2f}"
         if ratio < NOTICEABLE:
-            lines.append(f"- No anisotropy: the largest over the smallest Young's modulus is {spread}: the law predicts as its prior.")
+            lines.append(f"- No anisotropy: largest over smallest Young's modulus {spread}; the law predicts as its prior.")
         elif half > SURE_DEGREES:
-            lines.append(f"- Some anisotropy (largest over smallest Young's modulus {spread}) whose direction is *not* determined: the "
-                         f"95 % cone about ({axis}) has a half angle of {half:.0f} degrees. A second drop from another side would tell.")
+            lines.append(f"- Some anisotropy (largest over smallest Young's modulus {spread}), but its direction is *not* determined: "
+                         f"the 95 % cone about ({axis}) has a half angle of {half:.0f} degrees. Another drop would tell.")
         else:
             lines.append(f"- The stiffest direction is ({axis}), within {half:.0f} degrees (95 %); the largest over the smallest "
                          f"Young's modulus is {spread}.")
@@ -80,8 +80,7 @@ def determined_text(figures: Mapping[str, float]) -> str:
             lines.append(f"- Of {figures[f'posterior/{name}_numbers']:.0f} {what} the data determine "
                          f"{figures[f'posterior/{name}_determined']:.1f}; the rest is where the prior has it.")
     if "posterior/test/sd_m" in figures:
-        lines.append(f"- Held-out positions after contact are predicted to {figures['posterior/test/sd_m'] * 1e3:.1f} mm (root mean "
-                     "square)" + (f"; {figures['posterior/test/coverage']:.0%} of the errors lie within two standard deviations."
+        lines.append(f"- Held-out positions after contact are predicted to {figures['posterior/test/sd_m'] * 1e3:.1f} mm (rms)" + (f"; {figures['posterior/test/coverage']:.0%} of the errors lie within two standard deviations."
                         if "posterior/test/coverage" in figures else "."))
     return "\n".join(lines)
 

@@ -136,8 +136,8 @@ def choose_law(body: Body, candidates: Sequence[str], build: Callable[[], Identi
         if best is None or found[law] < best[0]:
             best = (found[law], {part: copy.deepcopy(getattr(body, part).state_dict()) for part in ("material", "contact")}, law)
     if best is None:
-        raise SimulationDiverged(f"prior=auto: none of {', '.join(candidates)} can be calibrated; set prior.parameters nearer to the "
-                                 "body's")
+        raise SimulationDiverged(f"prior=auto: none of {', '.join(candidates)} can be calibrated; set prior.parameters nearer "
+                                 "to the body's")
     for part, state in best[1].items():
         getattr(body, part).load_state_dict(state)
     for material in (body.material, *(variant["material"] for variant in body.frozen.values())):

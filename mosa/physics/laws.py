@@ -1,7 +1,7 @@
 """Registry of constitutive laws: a law is one Warp function for the stress and, where it yields, one for the return mapping.
 
-Elastic laws are in `elasticity`, yielding ones in `plasticity`, those that flow at a rate in `viscosity`, bodies of different laws in
-one grid in `mixture`; the package imports these, and they register themselves. Another module adds its own with `register_law`.
+Elastic laws are in `elasticity`, yielding ones in `plasticity`, those that flow at a rate in `viscosity`, bodies of different laws
+in one grid in `mixture`; the package imports these, and they register themselves. Another module adds its own with `register_law`.
 """
 
 from collections.abc import Callable

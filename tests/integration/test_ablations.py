@@ -7,28 +7,29 @@ from assembled import assembled
 
 @pytest.fixture(scope="module")
 def first_step(cache):
-    """Function ablation -> (loss terms of the first joint step, names of the trainable parameters)."""
+    """Function (ablation, overrides) -> (loss terms of the first joint step, names of the trainable parameters)."""
     known = {}
 
-    def compute(ablation: str):
-        if ablation not in known:
-            _, scene, module = assembled(cache, f"ablation={ablation}")
+    def compute(ablation: str, *overrides: str):
+        name = (ablation, *overrides)
+        if name not in known:
+            _, scene, module = assembled(cache, f"ablation={ablation}", *overrides)
             body = module.body
             joint = module.stages[-1]
             module.begin(joint)
             with torch.no_grad():
                 terms, _ = module.terms(joint, [0, 1], scene.frames)
-            compute.modules[ablation] = module
-            known[ablation] = ({k: float(v) for k, v in terms.items()},
+            compute.modules[name] = module
+            known[name] = ({k: float(v) for k, v in terms.items()},
                                {n for n, p in body.named_parameters() if p.requires_grad})
-        return known[ablation]
+        return known[name]
 
     compute.modules = {}
     return compute
 
 
 DROPPED_TERMS = {"no_flow": {"flow"}, "no_scale": {"stretch"}, "no_rot": {"rotation"},
-                 "no_motion": {"flow", "stretch", "rotation"}, "no_het": {"heterogeneity"}, "no_stress": {"operator"}}
+                 "no_motion": {"flow", "stretch", "rotation"}, "no_het": {"heterogeneity"}, "no_stress": set()}
 
 
 OF_THE_NETWORKS = ("no_C", "no_pre", "no_post", "no_prior_stress")
@@ -69,9 +70,20 @@ def test_no_prior_stress_starts_near_the_prior(first_step):
     assert terms["position"] == pytest.approx(full["position"], rel=0.05)  # which was fitted to the prior's
 
 
+LINEAR = "adapter=linear"
+"""It has a penalty of its size; that of the default adapter is the prior of its numbers."""
+
+
+def test_without_the_adapter_there_is_no_penalty_of_it(first_step):
+    full, _ = first_step("full", LINEAR)
+    terms, _ = first_step("no_stress", LINEAR)
+    assert full.keys() - terms.keys() == {"operator"}
+    assert terms == {k: v for k, v in full.items() if k != "operator"}
+
+
 def test_the_penalty_of_the_operator_weighs_less_the_more_the_prior_leaves_unexplained(first_step):
-    terms, _ = first_step("full")
-    module = first_step.modules["full"]
+    terms, _ = first_step("full", LINEAR)
+    module = first_step.modules["full", LINEAR]
     assert module.misfit == pytest.approx(terms["position"], rel=1e-6)  # the adapter has not moved: the prior's own
     with torch.no_grad():
         penalty = [module.terms(module.stages[-1], [0, 1], 3)[0]["operator"] for module.misfit in (0.01, 0.04)]
@@ -79,14 +91,20 @@ def test_the_penalty_of_the_operator_weighs_less_the_more_the_prior_leaves_unexp
     assert float(penalty[0]) == pytest.approx(1e-4, rel=1e-3)  # of an operator that is nothing yet
 
 
-def test_a_stage_that_starts_from_the_prior_forgets_eta(first_step):
-    first_step("full")
-    body = first_step.modules["full"].body
+@pytest.mark.parametrize("kind", ["modes", "network"])
+def test_a_stage_that_starts_from_the_prior_forgets_eta(first_step, kind):
+    overrides = () if kind == "modes" else ("heterogeneity.kind=network", LINEAR)
+    first_step("full", *overrides)
+    body = first_step.modules["full", *overrides].body
     body.freeze("prior")
     with torch.no_grad():
-        body.heterogeneity.net[-1].bias.fill_(0.3)
+        last = body.heterogeneity.coefficients if kind == "modes" else body.heterogeneity.net[-1].bias
+        last.fill_(0.3)
+        learned = body.heterogeneity(body.rest)
+    assert learned.abs().max() > 0.2
     body.freeze("prior_eta")
     body.thaw("prior")
     assert (body.heterogeneity(body.rest) == 0).all() and body.parts("prior")[2] is None
     body.thaw("prior_eta")
-    assert (body.heterogeneity(body.rest) == 0.3).all()
+    assert torch.equal(body.heterogeneity(body.rest), learned)
+    assert kind == "modes" or (learned == 0.3).all()

@@ -1,4 +1,4 @@
-"""A body of a few hundred particles that falls on the ground, its own rollouts as motion cues: what the fit's parts are tried on."""
+"""A body of 120 particles that falls on the ground, and its own rollouts as motion cues: what the fit's parts are tried on."""
 
 from types import SimpleNamespace
 
@@ -24,8 +24,8 @@ def lattice(counts=(6, 5, 4), spacing=DX / 2) -> torch.Tensor:
     return torch.cartesian_prod(*axes)
 
 
-def small_body(*, numbers=None, strain="green", adapter=True, modes=False, law="corotated", E=E, nu=NU, contact=False, counts=(6, 5, 4),
-               precision=64, on=True) -> Body:  # fmt: skip
+def small_body(*, numbers=None, strain="green", adapter=True, modes=False, law="corotated", E=E, nu=NU, contact=False,
+               counts=(6, 5, 4), precision=64, on=True) -> Body:  # fmt: skip
     """numbers: (19,) of the hyperelastic adapter, 0 where None; on: whether it is switched on, at E and nu."""
     rest = lattice(counts)
     n = len(rest)
@@ -69,4 +69,6 @@ def cues_of(rollout, rotation) -> MotionCues:
 def take_of(body: Body, begins: Start, frames: int, world: World = WORLD):
     """A sequence of the body as it is, with all that it has."""
     rollout = body.simulate(begins, world, frames, FRAME_DT)
-    return SimpleNamespace(start=begins, cues=cues_of(rollout, begins.rotation), frame_dt=FRAME_DT)
+    touched = (rollout.x[:, :, 1].amin(1) < 0.7 * DX).nonzero()  # a grid stops a body a fraction of a cell before it touches
+    first = int(touched[0]) if len(touched) else frames - 1
+    return SimpleNamespace(start=begins, cues=cues_of(rollout, begins.rotation), frame_dt=FRAME_DT, first_contact=first)

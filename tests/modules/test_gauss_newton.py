@@ -78,7 +78,8 @@ def test_a_curved_problem_ends_at_its_minimum():
     """a exp(-k t) and priors: the gradient of the cost, by central differences of a formula of its own, vanishes there."""
     t = torch.linspace(0, 3, 40, dtype=torch.float64)
     data = 2 * torch.exp(-1.3 * t) + 0.01 * drawn(40, seed=1)
-    blocks = [Block("a", torch.tensor([1.0]), torch.tensor([1.0]), 1e-6), Block("k", torch.tensor([0.3]), torch.tensor([0.5]), 1e-6)]
+    one = torch.ones(1)
+    blocks = [Block("a", one, one, 1e-6), Block("k", 0.3 * one, 0.5 * one, 1e-6)]
     tensors = [torch.ones(1).double(), torch.tensor([0.3]).double()]
     newton = GaussNewton(blocks, [Seat(tensors, lambda: (tensors[0] * torch.exp(-tensors[1] * t) - data) / 0.01)])
     costs = [newton.iterate(learn=False) for _ in range(12)]
@@ -187,11 +188,18 @@ def test_a_column_that_cannot_be_simulated_ends_the_fit_and_leaves_the_numbers()
         mistake.newton.iterate(learn=False)
     several = [Limited(), Limited(limit=0.0)]
     newton = GaussNewton(several[0].newton.blocks, [p.newton.seats[0] for p in several])
-    gate = threading.Barrier(2)
-    for problem in several:  # each takes one of the two columns
-        own = problem.residuals
-        newton.seats[several.index(problem)].residuals = lambda own=own: (threading.current_thread() is not main and gate.wait(30), own())[1]
-    main = threading.current_thread()
+    gate, main = threading.Barrier(2), threading.current_thread()
+
+    def together(own):
+        def residuals():
+            if threading.current_thread() is not main:
+                gate.wait(30)  # each takes one of the two columns
+            return own()
+
+        return residuals
+
+    for problem, seat in zip(several, newton.seats, strict=True):
+        seat.residuals = together(problem.residuals)
     with pytest.raises(SimulationDiverged, match="burst"):
         newton.iterate(learn=False)
     assert all((p.x == 0).all() for p in several)

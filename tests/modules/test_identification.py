@@ -1,0 +1,225 @@
+"""Identification of a small body from its own rollouts: what it finds, what it leaves alone, going on after a stop, threads."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from small_bodies import NU, WORLD, E, cues_of, small_body, start, take_of
+
+from mosa.analysis.anisotropy import dyads
+from mosa.analysis.stiffness import angle_between, stiffest
+from mosa.errors import ConfigError, SimulationDiverged
+from mosa.modules.criteria import Criterion
+from mosa.modules.gauss_newton import Seat
+from mosa.modules.hyperelastic import anisotropic_basis
+from mosa.modules.identification import Identification, IdentificationSettings, write_numbers
+from mosa.modules.stages import Stage
+
+FRAMES = 12
+AXIS = torch.nn.functional.normalize(torch.tensor([1.0, 0.6, 0.3], dtype=torch.float64), dim=0)
+
+
+def fibres(strength: float, axis: torch.Tensor = AXIS) -> torch.Tensor:
+    """(19,) numbers of a body that is stiffer along `axis`: strength times the anisotropic part of nnnn."""
+    N = dyads(axis[None])[0]
+    return strength * torch.einsum("kij,i,j->k", anisotropic_basis(torch.float64, torch.device("cpu")), N, N)
+
+
+def identification(body, takes, stage="joint", criterion=None, seats=1, kinds=(True, True, True), **settings) -> Identification:
+    return Identification(body, takes, WORLD, Stage(stage, 40, 0.1), criterion or Criterion("corrected"),
+                          IdentificationSettings(**settings), kinds, seats=seats)  # fmt: skip
+
+
+def run(found: Identification, most: int = 12) -> int:
+    for i in range(most):
+        report = found.iterate()
+        assert report["after"] <= report["before"]
+        if found.converged:
+            return i + 1
+    return most
+
+
+def values(body) -> dict[str, float]:
+    return {name: float(value.detach()) for name, value in body.material.physical().items()}
+
+
+def take_and_turn(body, angle, axis=(0.3, 0.5, 0.8)):
+    return take_of(body, start(turn=angle, axis=axis), FRAMES)
+
+
+@pytest.mark.parametrize("begins", [{"E": 1e4, "nu": 0.25}, {"E": 7e4, "nu": 0.44}])
+def test_a_calibration_finds_modulus_and_poisson_number_from_the_coarse_grid(begins):
+    """Its own rollouts have no noise but the floor that cues are given; what is found is exact to the tolerance of the steps."""
+    truth = small_body(adapter=False)
+    body = small_body(adapter=False, E=begins["E"], nu=begins["nu"])
+    found = identification(body, [take_and_turn(truth, 0.5)], "prior")
+    before = found.distance()
+    distance = found.search()
+    assert distance == found.distance() < before
+    assert body.material.begins["E"] == small_body(adapter=False, **begins).material.begins["E"]  # the prior's mean stays
+    run(found)
+    assert found.converged
+    assert values(body)["E"] == pytest.approx(E, rel=1e-3) and values(body)["nu"] == pytest.approx(NU, abs=1e-3)
+    assert found.distance() < 1e-5
+    posterior = found.posterior()
+    assert posterior.names == ["E", "nu"] and posterior.determined.min() > 0.99
+    away = found.rollout(body, 0).x - found.takes[0].cues.positions
+    seen = away[found.takes[0].first_contact :]
+    assert posterior.model_error == pytest.approx(float((seen**2).sum(-1).mean().sqrt()), rel=1e-9)
+    assert 0 < found.takes[0].first_contact < FRAMES - 3 and posterior.model_error < 1e-5
+
+
+def test_a_contact_offset_is_found_with_them():
+    truth = small_body(adapter=False, contact=True)
+    with torch.no_grad():
+        truth.contact.cells.fill_(0.42)
+    body = small_body(adapter=False, contact=True, E=2e4, nu=0.3)
+    found = identification(body, [take_and_turn(truth, 0.5), take_and_turn(truth, 1.5, (1.0, 0.0, 0.2))], "prior")
+    found.search()
+    run(found)
+    assert float(body.contact.cells.detach()) == pytest.approx(0.42, abs=0.01)
+    assert values(body)["E"] == pytest.approx(E, rel=0.02) and values(body)["nu"] == pytest.approx(NU, abs=0.01)
+
+
+@pytest.mark.parametrize("criterion", ["free", "corrected"])
+def test_the_stiff_direction_of_a_body_is_found_from_its_drops(criterion):
+    """It starts as the isotropic prior with the right E and nu; two drops on different sides."""
+    truth = small_body(numbers=fibres(0.6))
+    takes = [take_and_turn(truth, 0.5), take_and_turn(truth, 1.6, (1.0, 0.0, 0.2))]
+    body = small_body()
+    found = identification(body, takes, criterion=Criterion(criterion))
+    missed = found.distance()
+    run(found)
+    true_axis, true_ratio = stiffest(truth.adapter.stiffness().detach())
+    axis, ratio = stiffest(body.adapter.stiffness().detach())
+    assert float(angle_between(true_axis, AXIS)) < 1.5 and float(true_ratio) > 1.6
+    # directions are tried 1.5 degrees apart; the ratio is drawn towards 1 by the prior and the floor of the noise
+    assert float(angle_between(axis, AXIS)) < 6
+    assert 1 + 0.5 * (float(true_ratio) - 1) < float(ratio) < 1.1 * float(true_ratio)
+    assert values(body)["E"] == pytest.approx(E, rel=0.03)
+    assert found.distance() < 0.4 * missed
+    assert len(found.posterior().names) == 2 + 19
+
+
+def test_an_isotropic_body_stays_isotropic():
+    """Even from an anisotropic start: the evidence finds that there is nothing, and the numbers go to zero."""
+    take = take_and_turn(small_body(), 0.5)
+    body = small_body(numbers=fibres(0.3, torch.tensor([0.0, 0.6, 0.8]).double()))
+    found = identification(body, [take])
+    run(found)
+    ratio = stiffest(body.adapter.stiffness().detach())[1]
+    assert float(ratio) < 1.001
+    block = next(b for b in found.newton.blocks if b.name == "operator")
+    assert block.factor == block.limits[0]
+    assert found.posterior().determined[-19:].max() < 0.5
+
+
+def test_stiffness_modes_find_which_end_is_stiffer():
+    truth = small_body(adapter=False, modes=True)
+    with torch.no_grad():
+        truth.heterogeneity.coefficients[0] = 0.6
+    body = small_body(adapter=False, modes=True)
+    found = identification(body, [take_and_turn(truth, 0.5), take_and_turn(truth, 1.6, (1.0, 0.0, 0.2))], "prior_eta")
+    run(found)
+    factors = [b.factor_of.detach() for b in map(Factors, (truth, body))]
+    match = torch.corrcoef(torch.stack(factors))[0, 1]
+    assert float(match) > 0.9 and float(factors[0].std()) > 0.05
+
+
+class Factors:
+    def __init__(self, body):
+        self.factor_of = body.factor(body.heterogeneity)
+
+
+def anisotropic_problem(seats=1):
+    """Everything is learned: 2 + 1 + 19 numbers and the modes."""
+    body = small_body(E=2.5e4, nu=0.3, contact=True, modes=True)
+    truth = small_body(numbers=fibres(0.6), contact=True, modes=True)
+    return identification(body, [take_of(truth, start(height=0.07, turn=0.5), 7)], seats=seats)
+
+
+def numbers_of(found: Identification) -> torch.Tensor:
+    return found.newton.seats[0].read()
+
+
+@pytest.fixture(scope="module")
+def uninterrupted():
+    """(identification after five iterations, its reports, (state, numbers) before each)."""
+    whole, kept, reports = anisotropic_problem(), [], []
+    for _ in range(5):
+        kept.append((whole.state(), numbers_of(whole).clone()))
+        reports.append(whole.iterate())
+    return whole, reports, kept
+
+
+@pytest.mark.parametrize("after", [2, 4])
+def test_going_on_from_its_state_gives_the_numbers_of_a_run_without_a_stop(uninterrupted, after):
+    """Stopped within and after the iterations in which the noise is found."""
+    whole, reports, kept = uninterrupted
+    resumed = anisotropic_problem()
+    resumed.newton.seats[0].write(kept[after][1])
+    resumed.restore(kept[after][0])
+    assert [resumed.iterate() for _ in range(5 - after)] == reports[after:]
+    assert torch.equal(numbers_of(resumed), numbers_of(whole))
+    assert resumed.iteration == whole.iteration == 5 and resumed.converged == whole.converged
+    assert torch.equal(resumed.posterior().covariance, whole.posterior().covariance)
+    forgetful = anisotropic_problem()  # the control: without its state it goes elsewhere
+    forgetful.newton.seats[0].write(kept[after][1])
+    assert forgetful.iterate() != reports[after]
+
+
+def test_a_state_is_plain_and_survives_a_checkpoint(uninterrupted, tmp_path):
+    state = uninterrupted[0].state()
+    torch.save(state, tmp_path / "state.pt")
+    read = torch.load(tmp_path / "state.pt", weights_only=True)
+    assert read.keys() == state.keys() and read["iteration"] == 5 and read["factors"] == state["factors"]
+    assert all(torch.equal(a, b) for x, y in zip(read["noise"], state["noise"], strict=True) for a, b in zip(x, y, strict=True))
+
+
+def test_two_threads_find_what_one_does(uninterrupted):
+    """Bodies side by side: launches of both at once, one capture at a time. Bit for bit."""
+    two = anisotropic_problem(seats=2)
+    assert len(two.newton.seats) == 2
+    assert [two.iterate() for _ in range(2)] == uninterrupted[1][:2]
+    assert torch.equal(numbers_of(two), uninterrupted[2][2][1])
+
+
+def test_single_precision_finds_the_same_to_a_percent():
+    truth = small_body(adapter=False, precision=32)
+    begins = start(turn=0.5, dtype=torch.float32)
+    rollout = truth.simulate(begins, WORLD, FRAMES, 1 / 60)
+    take = take_of(truth, begins, FRAMES)
+    take.cues = cues_of(rollout, begins.rotation)
+    body = small_body(adapter=False, E=1e4, nu=0.25, precision=32)
+    found = identification(body, [take], "prior")
+    found.search()
+    run(found, 6)
+    assert values(body)["E"] == pytest.approx(E, rel=0.01) and values(body)["nu"] == pytest.approx(NU, abs=0.005)
+
+
+def test_write_numbers_sets_what_the_posterior_names():
+    body = small_body(contact=True, modes=True)
+    found = identification(body, [take_and_turn(body, 0.5)])
+    names = [b.name for b in found.newton.blocks]
+    assert names == ["E", "nu", "contact", "operator", "stiffness"]
+    drawn = numbers_of(found) + 0.01 * torch.arange(len(numbers_of(found)))
+    write_numbers(body, drawn)
+    assert torch.allclose(Seat(found.newton.seats[0].tensors, torch.empty).read(), drawn, rtol=0, atol=1e-15)
+
+
+def test_a_grid_without_a_start_that_can_be_simulated_is_an_error():
+    body = small_body(adapter=False)
+    take = take_and_turn(body, 0.5)
+    body.settings = replace(body.settings, max_substeps=1)
+    with pytest.raises(SimulationDiverged, match="none of the starts of the coarse grid"):
+        identification(body, [take], "prior").search()
+
+
+def test_what_it_refuses():
+    with pytest.raises(ConfigError, match="use fit=adam"):
+        body = small_body()
+        identification(body, [take_and_turn(body, 0.5)], kinds=(False, False, False))
+    for key, value in (("count", 0), ("operator_sd", -1.0), ("stiffness_sd", float("nan")), ("tolerance", True), ("threads", -1),
+                       ("threads", 1.5)):  # fmt: skip
+        with pytest.raises(ConfigError, match=rf"identification\.{key}: expected"):
+            IdentificationSettings(**{key: value})
