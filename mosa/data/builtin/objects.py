@@ -123,7 +123,7 @@ OBJECTS = {
         "rainbowball", 0.2, RAINBOWBALL,
         {"train": Drop(speed=2.5), "test_65": Drop(speed=2.8, axis=(0.7, -0.2, 0.6), degrees=65.0),
          "test_100": Drop(speed=3.2, axis=(-0.3, 0.5, 1.0), degrees=100.0)},
-        Footage(target=0.25), spacing=0.0065,
+        Footage(target=0.33), spacing=0.0065,
     ),
     "calf": BuiltinObject(
         "calf", 0.267, CALF,
