@@ -128,7 +128,7 @@ OBJECTS = {
     "calf": BuiltinObject(
         "calf", 0.267, CALF,
         {"train": Drop(speed=2.0), "test_55": Drop(speed=2.2, axis=(0.3, 0.4, 1.0), degrees=55.0, offset=(-0.02, 0.0)),
-         "test_75": Drop(speed=2.6, axis=(1.0, 0.3, 0.2), degrees=75.0, offset=(-0.01, 0.06))},
+         "test_75": Drop(speed=2.6, axis=(1.0, 0.3, 0.2), degrees=75.0, offset=(-0.07, -0.07))},
         Footage(target=0.24), spacing=0.0065,
     ),
     "ring": BuiltinObject(
