@@ -72,7 +72,8 @@ def reconstruct_scene(cfg: DictConfig, scene: Scene, device: str) -> tuple[Recon
 
     settings = build_settings(**plain(cfg.reconstruction))
     dx = cfg.simulation.dx
-    spacing = dx / 2 if dx is not None else spacing_for(scene, cfg.simulation.particles)
+    spacing = dx / 2 if dx is not None else spacing_for(scene, cfg.simulation.particles, settings, cache_dir=cache_folder(cfg),
+                                                        device=device)
     reconstruction = reconstruct(scene, settings=settings, spacing=spacing, cache_dir=cache_folder(cfg), seed=cfg.seed,
                                  device=device)
     return reconstruction, 2 * spacing

@@ -91,7 +91,8 @@ TRAINING: dict[str, Kind] = {
     "rendering.margin": whole(0),
     "reconstruction.resolution": whole(8),
     "reconstruction.ridge_passes": whole(0),
-    "reconstruction.carve": FLAG,
+    "reconstruction.geometry.source": one_of("images", "hull"),
+    "reconstruction.geometry.frames": COUNT,
     "reconstruction.points": whole(8),
     "reconstruction.neighbours": whole(4),  # fewer leave every deformation gradient open
     "reconstruction.margin": whole(0),
