@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from mosa import parallel
 from mosa.analysis.figures import side_by_side, write_strip, write_video
-from mosa.analysis.tables import parameter_table, results_table
+from mosa.analysis.tables import geometry_lines, parameter_table, results_table
 from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLast
 from mosa.config import build_body, build_stages, build_world, plain, rehearse, run_config, world_config
 from mosa.data.datamodule import MultiViewDataModule, training_observations
@@ -68,7 +68,8 @@ def run_folder() -> Path:
 
 def reconstruct_scene(cfg: DictConfig, scene: Scene, device: str) -> tuple[Reconstruction, float]:
     """Reconstruction of the training sequence and the grid spacing that goes with it [m]."""
-    from mosa.reconstruction.pipeline import build_settings, reconstruct, spacing_for
+    from mosa.reconstruction.pipeline import reconstruct, spacing_for
+    from mosa.reconstruction.settings import build_settings
 
     settings = build_settings(**plain(cfg.reconstruction))
     dx = cfg.simulation.dx
@@ -160,10 +161,11 @@ def train(cfg: DictConfig) -> float | None:
     with clock.measure("evaluation"):
         figures, kept = evaluate(body, sequences(body, scene, held_out, found), world,
                                  samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
-    figures |= identification(body, scene) | law_figures(body) | start_figures(found["train"])
+    figures |= identification(body, scene) | law_figures(body) | start_figures(found["train"]) | reconstruction.geometry
     if cfg.evaluation.floor:
         figures |= floor_figures(body, sequences(body, scene, held_out, found), world,
                                  samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
+        figures |= true_geometry(body, scene)
     figures |= clock.figures | cost(device) | {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
     if cfg.logger.enabled:
         log_outcome(folder, plain(cfg), figures)
@@ -200,7 +202,8 @@ def assemble_fit(
 
 def follow_scene(cfg, scene, first, reconstruction, body, start, device) -> Reconstruction:
     """Reconstruction of another sequence of the body that `reconstruction` found in the scene `first`."""
-    from mosa.reconstruction.pipeline import build_settings, follow
+    from mosa.reconstruction.pipeline import follow
+    from mosa.reconstruction.settings import build_settings
 
     return follow(scene, first, reconstruction, rotation=start.rotation, center=start.center, rest_center=body.center,
                   settings=build_settings(**plain(cfg.reconstruction)), cache_dir=cache_folder(cfg), seed=cfg.seed, device=device)
@@ -268,6 +271,13 @@ def fit(cfg, module: LitMosa, data: MultiViewDataModule, folder: Path, device: s
     module.body.to(device)
 
 
+def true_geometry(body: Body, scene: Scene) -> dict[str, float]:
+    """Figures of the body against the true shape, where that is known."""
+    from mosa.data.builtin.true_geometry import geometry_figures
+
+    return geometry_figures(body.rest, body.volume, scene) if scene.synthetic and scene.truth is not None else {}
+
+
 def start_figures(start: Start) -> dict[str, float]:
     names = ("x", "y", "z")
     return {f"id/v0_{n}": float(v) for n, v in zip(names, start.velocity)} | {
@@ -289,7 +299,7 @@ def write_outputs(folder: Path, cfg: DictConfig, body: Body, evaluated: list[Seq
         write_video(folder / "video.mp4", side_by_side(columns, enlarge), fps=6)
         rows = {f"{prefix}: {title}": images for prefix, each in pictures.items() for title, images in each.items()}
         write_strip(folder / "strip.png", rows, enlarge=max(1, enlarge - 1))
-    table = results_table(figures) + "\n\n" + parameter_table(figures)
+    table = "\n\n".join(part for part in (results_table(figures), parameter_table(figures), geometry_lines(figures)) if part)
     (folder / "results.md").write_text(table + "\n")
     write_figures(folder, figures)  # the last file: the run is complete
     print(f"\n{table}\n\nrun folder: {folder}")
@@ -345,6 +355,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     figures |= identification(body, scene) | law_figures(body)
     if cfg.evaluation.floor:
         figures |= floor_figures(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
+        figures |= true_geometry(body, scene)
     write_outputs(folder, cfg, body, evaluated, figures, kept)
     return optimized(figures, "test/rms_m")
 

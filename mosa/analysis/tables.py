@@ -38,6 +38,23 @@ def parameter_table(figures: Mapping[str, float]) -> str:
     return markdown(["parameter", "prior", "joint", "error of prior"], rows)
 
 
+def geometry_lines(figures: Mapping[str, float]) -> str:
+    """Sentences on the body that was filled: how surely its surface is known, and against the true shape where that is known."""
+    lines, get = [], lambda name: figures.get(f"geometry/{name}")
+    if get("uncertain_share") is not None:
+        lines.append(
+            f"Geometry: {get('carved_share'):.1%} of the visual hull is air. {get('uncertain_share'):.1%} of the surface is not told "
+            f"by the images to 0.7 particle spacings and is guessed between outlines; {get('free_frames'):.0f} free frames were used.")
+    elif get("carved_share") is not None:
+        lines.append(f"Geometry: the visual hull, {get('carved_share'):.1%} of it rounded away; no colours were asked.")
+    true = {name.rsplit("/", 1)[1]: value for name, value in figures.items() if name.startswith("floor/geometry/")}
+    if true:
+        lines.append(
+            f"Against the true shape: {true['outside_share']:.2%} of the particles outside, {true['missing_share']:.2%} of the "
+            f"body missing, volume {true['volume_error']:+.2%}, centre of mass {true['center_error_m'] * 1e3:.2f} mm off.")
+    return "\n".join(lines)
+
+
 def markdown(header: list[str], rows: list[list[str]]) -> str:
     """A padded markdown table."""
     widths = [max(len(str(r[i])) for r in [header, *rows]) for i in range(len(header))]

@@ -115,7 +115,12 @@ def find_geometry(scene: Scene, hull: Volume, settings: GeometrySettings, *, rid
     seen = [windows.of_frame(t) for t in frames]
     solid = Volume(solid.values.to(device), solid.origin.to(device), solid.pitch)
     bound = signed_distance(solid)
-    distance = signed_distance(carve(solid, seen[0], settings.carving))
+    start = carve(solid, seen[0], settings.carving)
+    if ridge_passes:
+        # of the whole hull: rounding would widen what was carved by mistake
+        rounded = shave_ridges(solid, scene.cameras.select(scene.training_cameras), passes=ridge_passes, sigma=sigma)
+        start = replace(start, values=torch.minimum(start.values, rounded.values))
+    distance = signed_distance(start)
     distance, _ = refine(distance, bound, seen[:1], settings.refinement, settings.first)
     motions = free_motions(scene, distance, seen)
     moved = [seen[0], *(motion.windows(views) for motion, views in zip(motions, seen[1:]))]

@@ -6,7 +6,7 @@ from __future__ import annotations
 import functools
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +18,15 @@ from mosa.data.splats import load_ply
 from mosa.errors import ConfigError, DataError
 from mosa.reconstruction.cache import StageCache
 from mosa.reconstruction.cues import gaussian_cues, neighbourhood, neighbourhood_cues
-from mosa.reconstruction.dynamic import DynamicSettings, Scaffold, fit_motion
+from mosa.reconstruction.dynamic import Scaffold, fit_motion
 from mosa.reconstruction.filling import Particles, body_volume, fill
-from mosa.reconstruction.geometry import Geometry, GeometrySettings, find_geometry
+from mosa.reconstruction.geometry import Geometry, find_geometry
 from mosa.reconstruction.hull import Volume, hull_bounds, hull_centroid, visual_hull
 from mosa.reconstruction.initial import inherited_colors
 from mosa.reconstruction.modes import deformation_modes
 from mosa.reconstruction.observed import Windows, object_windows
-from mosa.reconstruction.static import FitSettings, StaticSettings, fit_splats, start_splats
+from mosa.reconstruction.settings import ReconstructionSettings
+from mosa.reconstruction.static import fit_splats, start_splats
 from mosa.rendering.covariance import covariance_from, matrix_to_quaternion, quaternion_multiply
 from mosa.rendering.rasterizer import rasterize
 from mosa.threads import threaded
@@ -33,60 +34,6 @@ from mosa.types import MotionCues, Reconstruction, Scene, Splats
 
 CACHE_VERSION = 3
 """Raised when a stage computes something else from the same settings."""
-
-
-@dataclass(frozen=True)
-class ReconstructionSettings:
-    """resolution: voxels along the object's longest side in the hull; geometry: what of it is the body; ridge_passes: of
-    hull.shave_ridges, where geometry.source is hull; points: static Gaussians
-    (with static.densify=mcmc at the start); neighbours: of the least-squares deformation; cue: neighbourhood | gaussian
-    (docs/cues.md); margin: px of the windows around mattes; splats: 3DGS PLY file of the object at frame 0, in the scene's
-    world, that replaces the static stage (None: fit it)."""
-
-    resolution: int = 80
-    ridge_passes: int = 24
-    points: int = 3000
-    neighbours: int = 20
-    cue: str = "neighbourhood"
-    margin: int = 6
-    splats: str | None = None
-    geometry: GeometrySettings = field(default_factory=GeometrySettings)
-    static: StaticSettings = field(default_factory=StaticSettings)
-    appearance: FitSettings = field(default_factory=lambda: FitSettings(keep=1.0))
-    dynamic: DynamicSettings = field(default_factory=DynamicSettings)
-
-    def __post_init__(self) -> None:
-        if self.cue not in ("neighbourhood", "gaussian"):
-            raise ConfigError(f"reconstruction.cue: expected neighbourhood or gaussian, found {self.cue!r}")
-        if self.static.max_points is not None and self.static.max_points < self.points:
-            raise ConfigError(
-                f"reconstruction.static.max_points: expected at least reconstruction.points={self.points}, the number at the "
-                f"start, found {self.static.max_points}"
-            )
-        free = self.dynamic.free_shape or self.dynamic.model == "network"
-        if self.cue == "gaussian" and not free:
-            raise ConfigError(
-                "reconstruction.cue=gaussian reads the Gaussians' own scale and rotation: set "
-                "reconstruction.dynamic.free_shape=true or reconstruction.dynamic.model=network"
-            )
-
-
-def _section(cls: type, values: Mapping[str, Any], where: str) -> Any:
-    known = {f.name for f in fields(cls)}
-    unknown = sorted(set(values) - known)
-    if unknown:
-        raise ConfigError(f"{where}: unknown key {unknown[0]!r}, expected one of {', '.join(sorted(known))}")
-    return cls(**values)
-
-
-def build_settings(**keys: Any) -> ReconstructionSettings:
-    """Settings from the plain keys of conf/reconstruction; ConfigError names an unknown key."""
-    keys = dict(keys)
-    sections = {"geometry": GeometrySettings, "static": StaticSettings, "appearance": FitSettings, "dynamic": DynamicSettings}
-    for name, cls in sections.items():
-        if name in keys:
-            keys[name] = _section(cls, keys[name] or {}, f"reconstruction.{name}")
-    return _section(ReconstructionSettings, keys, "reconstruction")
 
 
 def _first_frame(scene: Scene) -> tuple[Tensor, Any]:

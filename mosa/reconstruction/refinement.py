@@ -9,8 +9,8 @@ The body is a distance on a grid, negative inside. Each round looks at one frame
   pixel's width.
 
 Both are added up over a neighbourhood of the surface, which then moves by its mean, as far as the information goes. Where there is
-little of it, the surface is made smooth: by (1 - G)^2, which flattens ridges and leaves a ball's curvature alone, unlike a motion by
-mean curvature.
+little of it, the surface is made smooth: by (1 - G)^2, which flattens ridges and leaves a ball's curvature alone, unlike a motion
+by mean curvature.
 """
 
 from __future__ import annotations
