@@ -43,8 +43,9 @@ def geometry_lines(figures: Mapping[str, float]) -> str:
     lines, get = [], lambda name: figures.get(f"geometry/{name}")
     if get("uncertain_share") is not None:
         lines.append(
-            f"Geometry: {get('carved_share'):.1%} of the visual hull is air. {get('uncertain_share'):.1%} of the surface is not told "
-            f"by the images to 0.7 particle spacings and is guessed between outlines; {get('free_frames'):.0f} free frames were used.")
+            f"Geometry: {get('carved_share'):.1%} of the visual hull is air. {get('uncertain_share'):.1%} of the surface is not "
+            "told by the images to 0.7 particle spacings and is guessed between outlines; "
+            f"{get('free_frames'):.0f} free frames were used.")
     elif get("carved_share") is not None:
         lines.append(f"Geometry: the visual hull, {get('carved_share'):.1%} of it rounded away; no colours were asked.")
     true = {name.rsplit("/", 1)[1]: value for name, value in figures.items() if name.startswith("floor/geometry/")}

@@ -17,10 +17,17 @@ from mosa.reconstruction.carving import CarvingSettings, carve, keep_silhouettes
 from mosa.reconstruction.flight import free_motions
 from mosa.reconstruction.hull import Volume, shave_ridges
 from mosa.reconstruction.observed import object_windows
-from mosa.reconstruction.refinement import BORDER, RefinementSettings, refine, signed_distance, voxels
+from mosa.reconstruction.refinement import (
+    BORDER,
+    RefinementSettings,
+    refine,
+    signed_distance,
+    surface_information,
+    voxels,
+)
 from mosa.types import Scene
 
-OPTIMISM = 2.5
+OPTIMISM = 1.3
 """Root mean square error of the surface over the standard deviation that its information alone gives: neighbouring pixels are not
 independent, and a neighbourhood does not move as one. Measured on the gorilla and the bowl."""
 
@@ -121,10 +128,11 @@ def find_geometry(scene: Scene, hull: Volume, settings: GeometrySettings, *, rid
         rounded = shave_ridges(solid, scene.cameras.select(scene.training_cameras), passes=ridge_passes, sigma=sigma)
         start = replace(start, values=torch.minimum(start.values, rounded.values))
     distance = signed_distance(start)
-    distance, _ = refine(distance, bound, seen[:1], settings.refinement, settings.first)
+    distance = refine(distance, bound, seen[:1], settings.refinement, settings.first)
     motions = free_motions(scene, distance, seen)
     moved = [seen[0], *(motion.windows(views) for motion, views in zip(motions, seen[1:]))]
-    distance, information = refine(distance, bound, moved, settings.refinement, settings.then)
+    distance = refine(distance, bound, moved, settings.refinement, settings.then)
+    information = surface_information(distance, moved, settings.refinement, settings.then[-1][1])
     inner = slice(BORDER, -BORDER)
     kept = keep_silhouettes(voxels(distance, solid).values > 0.5, solid, seen[0])
     deviation = OPTIMISM * information[inner, inner, inner].rsqrt()

@@ -24,6 +24,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from mosa.reconstruction.field import (
+    at,
     camera_rays,
     first_crossing,
     gradient,
@@ -36,6 +37,8 @@ from mosa.reconstruction.field import (
 from mosa.reconstruction.hull import Volume
 from mosa.reconstruction.observed import Windows
 
+LOCAL = 0.3
+"""Length on which a ray may touch a surface that it is to place, in radii of the grid: a ball's outline touches on 0.25 of them."""
 BORDER = 4
 """Cells added around a hull, so that its surface is nowhere at the grid's border."""
 
@@ -110,10 +113,13 @@ def _surface(distance: Volume, group: _Group) -> tuple[Tensor, Tensor]:
 
 
 def color_information(
-    distance: Volume, group: _Group, images: Tensor, points: Tensor, ways: Tensor, settings: RefinementSettings
-) -> tuple[Tensor, Tensor]:
-    """Information [1/m^2] and information times displacement [1/m] along the outward normal, (N,) each, of surface points (N,
-    3)."""
+    distance: Volume, group: _Group, images: Tensor, points: Tensor, ways: Tensor, settings: RefinementSettings, *,
+    doubt: bool = False,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Information [1/m^2] and information times displacement [1/m] along the outward normal, (N,) each, of surface points (N, 3).
+
+    doubt: divided by the square of the residual's chi^2, where that is larger than 1.
+    """
     cameras = group.views.cameras
     slopes = gradient(distance.values, distance.pitch)
     normal = F.normalize(sample(slopes, (points - distance.origin) / distance.pitch), dim=-1)
@@ -147,6 +153,10 @@ def color_information(
     change = change - (robust[..., None] * change).sum(0) / total
     # a point of the surface is met by the ray of every camera that sees it: its share of the information
     each = (robust / torch.stack(variances) / (weight > 0).sum(0).clamp(min=1))[..., None]
+    if doubt:
+        mean = (weight[..., None] * color).sum(0) / weight.sum(0).clamp(min=1e-6)[:, None]
+        squares = (weight * (color - mean).square().mean(-1) / torch.stack(variances)).sum(0) / weight.sum(0).clamp(min=1e-6)
+        each = each / squares.clamp(min=1).square()[:, None]
     return (each * change.square()).sum((0, 2)), -(each * change * residual).sum((0, 2))
 
 
@@ -175,8 +185,8 @@ def pixel_width(distance: Volume, views: Windows) -> float:
 
 def refine(
     distance: Volume, hull: Volume, frames: list[Windows], settings: RefinementSettings, schedule: list[tuple[int, float]]
-) -> tuple[Volume, Tensor]:
-    """The refined distance [m] and the information on its surface [1/m^2], (X, Y, Z).
+) -> Volume:
+    """The refined distance [m].
 
     distance: of where to start, hull: of what it has to stay within, both on one grid (`signed_distance`); frames: windows of each
     frame of free flight, with cameras that see the body where it is in frame 0: rounds take turns. schedule: rounds and blur [px].
@@ -185,7 +195,7 @@ def refine(
     width = pixel_width(distance, frames[0])
     floor = hull.values - settings.slack * width
     shape, area = tuple(distance.values.shape), 2 * math.pi * settings.patch**2
-    information, turn = [torch.zeros_like(distance.values)] * len(groups), 0
+    turn = 0
     for rounds, sigma in schedule:
         images = [blurred(views, sigma) for views in frames]
         for _ in range(rounds):
@@ -208,5 +218,39 @@ def refine(
                 slope = gradient(values, pitch).norm(dim=0).clamp(0.5, 2)
                 values = torch.where(values.abs() < 3 * pitch, values / slope, values)
             distance = replace(distance, values=values)
-            information[which] = known / pitch**2
-    return distance, torch.stack(information).sum(0)
+    return distance
+
+
+def surface_information(distance: Volume, frames: list[Windows], settings: RefinementSettings, blur: float) -> Tensor:
+    """Information [1/m^2] on the place of the surface, (X, Y, Z), of all frames together: what is not told is 0.
+
+    Colours that do not agree at the surface tell little, by the square of their chi^2. A ray of an outline tells where the
+    surface is only where it touches it in one place: along a flat side, or over a hollow that it spans, it tells how high and not
+    where. """
+    width, total = pixel_width(distance, frames[0]), torch.zeros_like(distance.values)
+    _, radius = span(distance)
+    patch, shape = 0.5 * settings.patch, tuple(distance.values.shape)  # half: nothing is said of what lies far from a rim
+    area = 2 * math.pi * patch**2
+    for views in frames:
+        group = _group(views)
+        ways, points = _surface(distance, group)
+        about, _ = color_information(distance, group, blurred(views, blur), points, ways, settings, doubt=True)
+        edges, edge_about, _ = outline_information(distance, group, width, settings)
+        window = group.outline.nonzero()[:, 0]
+        touching = _touching(distance, group.centres[window], group.directions[group.outline], edges, 0.5 * width)
+        edge_about = edge_about * (touching < LOCAL * radius)
+        index = (torch.cat([points, edges]) - distance.origin) / distance.pitch
+        values = torch.cat([about, edge_about])[:, None] * distance.pitch**2
+        total += area * smooth(scatter(shape, index, values), patch)[0]
+    return total / distance.pitch**2
+
+
+def _touching(distance: Volume, origin: Tensor, direction: Tensor, nearest: Tensor, within: float) -> Tensor:
+    """Length [m] of rays (M, 3) on which the distance is less than `within` [m] above the one at their nearest points (M, 3)."""
+    centre, radius = span(distance)
+    limit = at(distance, nearest) + within
+    middle = ((centre - origin) * direction).sum(-1)
+    count = torch.zeros_like(limit)
+    for k in range(int(2 * radius / distance.pitch) + 1):
+        count += at(distance, origin + (middle - radius + k * distance.pitch)[:, None] * direction) < limit
+    return count * distance.pitch
