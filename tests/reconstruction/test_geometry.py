@@ -21,7 +21,7 @@ from mosa.reconstruction.flight import Motion, free_motions
 from mosa.reconstruction.geometry import Geometry, GeometrySettings, find_geometry, surface_of
 from mosa.reconstruction.hull import Volume, visual_hull
 from mosa.reconstruction.observed import Windows, object_windows
-from mosa.reconstruction.refinement import refine, signed_distance
+from mosa.reconstruction.refinement import refine, signed_distance, surface_information
 from mosa.types import Ground, Scene
 
 SIZE, PITCH = 80, 0.006
@@ -41,12 +41,12 @@ def textured(points, rng):
 
 
 def scene_of(color, frames: int = 2) -> Scene:
-    """The bowl, filmed by 12 cameras as it falls by 0.1 m/s, with room for more below."""
+    """The bowl, filmed by 12 cameras as it falls at 2 m/s."""
     shape = Shape(bowl_distance, color, np.array([[-0.12, -0.01, -0.12], [0.12, 0.13, 0.12]]))
     surface = extract_surface(shape, 0.0035, np.random.default_rng(0))
     rig = ring_of_cameras(12, SIZE, target=(0, HEIGHT + 0.06, 0), distance=1.6, elevations=(0.16, 0.55, 0.95), field=0.16, turn=0.2)
     times = 0.02 * np.arange(frames)
-    pictures = [render_surface(surface, surface.vertices + [0, HEIGHT - 2.0 * t - 4.9 * t * t, 0], rig) for t in times]
+    pictures = [render_surface(surface, surface.vertices + np.array([0, HEIGHT - 2.0 * t - 4.9 * t * t, 0]), rig) for t in times]
     images, mattes = pictures_to_footage(np.stack(pictures, 1), (SIZE, SIZE))
     up = torch.tensor([0.0, 1.0, 0.0])
     return Scene(
@@ -78,30 +78,34 @@ def test_a_hollow_that_no_outline_shows_is_emptied_and_nothing_else(bowl):
     air, lost = compared(replace(hull, values=(hull.values > 0.5).float()))
     assert air > 0.3 and lost == 0
     air, lost = compared(geometry.body)
-    assert air < 0.05
+    assert air < 0.02
     assert lost < 0.002
     figures = geometry.figures(spacing=0.01)
     assert figures["geometry/free_frames"] == 2
     assert figures["geometry/carved_share"] > 0.2
-    assert figures["geometry/uncertain_share"] < 0.25  # the underside, seen by no camera, is an eighth of the surface
-    again = found(bowl)[1]
-    assert torch.equal(again.body.values, geometry.body.values) and torch.equal(again.deviation, geometry.deviation)
+    assert figures["geometry/uncertain_share"] < 0.03
 
 
-@pytest.mark.parametrize("kind", ["plain", "white", "glossy"])
+def test_equal_images_give_equal_bits(bowl):
+    short = {"first": ((1, 1.0),), "then": ((2, 0.6),)}
+    one, other = (found(bowl, **short)[1] for _ in range(2))
+    assert torch.equal(one.body.values, other.body.values) and torch.equal(one.deviation, other.deviation)
+
+
+@pytest.mark.parametrize("kind", ["white", "glossy"])
 def test_where_colours_say_nothing_no_matter_is_carved(bowl, kind):
-    """Of one colour, white as the background, or as different in every camera as a mirror: the hull stays, to its smoothing."""
+    """White as the background, or as different in every camera as a mirror: the hull stays, to its smoothing."""
     if kind == "glossy":
         gain = 0.4 + 0.6 * torch.rand(12, 1, 1, 1, 3, generator=torch.Generator().manual_seed(0))
         scene = replace(bowl, images=1 - (1 - bowl.images * gain) * bowl.mattes[..., None])
     else:
-        level = 0.5 if kind == "plain" else 1.0
-        scene = replace(bowl, images=1 - (1 - level) * bowl.mattes[..., None].expand_as(bowl.images))
-    hull, geometry = found(scene)
-    air, lost = compared(geometry.body)
-    assert lost < 0.005
-    assert geometry.body.occupied_volume() > 0.93 * geometry.hull_volume
-    assert geometry.figures(0.01)["geometry/uncertain_share"] > 0.1 if kind != "glossy" else True
+        scene = replace(bowl, images=torch.ones_like(bowl.images))
+    _, geometry = found(scene)
+    _, lost = compared(geometry.body)
+    assert lost < 0.002
+    assert geometry.body.occupied_volume() > 0.92 * geometry.hull_volume
+    # and it is said, if not for as much as is wrong: the lid that no outline touches begins some voxels from the rim
+    assert geometry.figures(0.01)["geometry/uncertain_share"] > 0.04
 
 
 def test_a_part_that_is_carved_by_mistake_is_given_back():
@@ -114,7 +118,9 @@ def test_a_part_that_is_carved_by_mistake_is_given_back():
     views = Windows(torch.zeros(6, 64, 64, 3), torch.ones(6, 64, 64), rig, torch.arange(6), torch.zeros(6, dtype=torch.long))
     without = keep_silhouettes(ball, body, views)
     lost = stalk & ~ball & ~without
-    assert lost.sum() < 0.25 * (stalk & ~ball).sum()  # what hides behind the ball's rim
+    assert lost.sum() < 0.5 * (stalk & ~ball).sum()  # its root, within a bin of the ball in every picture
+    tip = stalk & (points[..., 2] > 0.066)
+    assert (without & tip).sum() == tip.sum()
     hole = ball & ~((points - torch.tensor([0.04, 0.0, 0.0])).norm(dim=-1) < 0.02) | stalk
     assert (keep_silhouettes(hole, body, views) & ~hole).sum() < 0.2 * (body.values.bool() & ~hole).sum()
     matte_of_nothing = replace(views, mattes=torch.zeros(6, 64, 64))
@@ -122,24 +128,23 @@ def test_a_part_that_is_carved_by_mistake_is_given_back():
 
 
 def test_the_surface_moves_to_where_colours_and_outlines_put_it(squashed):
-    """From an ellipsoid blown up by 6 mm to the true one, within a fifth of a pixel (5 mm); the outlines alone do not get there."""
+    """From the hull of eight views to the true ellipsoid, within a fifth of a pixel (5 mm)."""
     still = object_windows(squashed, list(range(8)), [0]).of_frame(0)
     hull = visual_hull(squashed.mattes[:, 0], squashed.cameras, squashed.box, pitch=0.0036)
     hull = replace(hull, values=(hull.values > 0.5).float())
     centre = torch.tensor(squashed_body.forward(np.zeros((1, 3)), 0.0, 1.0)[0], dtype=torch.float32)
-    rest = squashed.truth.positions[0][:: 7]
+    rest = squashed.truth.positions[0][::7]
     settings = GeometrySettings()
     start = signed_distance(hull)
-    distance, information = refine(start, start, [still], settings.refinement, settings.first + settings.then)
+    distance = refine(start, start, [still], settings.refinement, settings.first + settings.then)
+    information = surface_information(distance, [still], settings.refinement, 0.4)
     directions = torch.nn.functional.normalize(rest - centre, dim=1)
     radii = torch.tensor(squashed_body.RADII, dtype=torch.float32)
     surface = centre + directions / (directions / radii).norm(dim=1, keepdim=True)
-    errors = [
-        sample(d.values[None], (surface - d.origin) / d.pitch)[:, 0] / (5e-3) for d in (start, distance)
-    ]  # in pixels
+    errors = [sample(d.values[None], (surface - d.origin) / d.pitch)[:, 0] / 5e-3 for d in (start, distance)]  # in pixels
     assert errors[1].square().mean().sqrt() < 0.2
     assert errors[1].square().mean().sqrt() < 0.5 * errors[0].square().mean().sqrt()
-    assert errors[1].mean().abs() < 0.06
+    assert errors[1].mean().abs() < errors[0].mean().abs()
     known = sample(information[None], (surface - distance.origin) / distance.pitch)[:, 0]
     assert (known > 0).float().mean() > 0.8
 
@@ -151,7 +156,7 @@ def test_free_flight_is_followed_and_ends_where_the_body_deforms(squashed):
     distance = signed_distance(replace(hull, values=(hull.values > 0.5).float()))
     motions = free_motions(squashed, distance, frames)
     moved = motions[0].points(squashed.truth.positions[0])
-    assert (moved - squashed.truth.positions[1]).norm(dim=1).max() < 1.5e-3  # 0.3 px; the body moves by 36 mm and turns by 7 degrees
+    assert (moved - squashed.truth.positions[1]).norm(dim=1).max() < 1.5e-3  # 0.3 px of a way of 36 mm and 7 degrees
     assert len(motions) <= 2
     assert len(free_motions(replace(squashed, last_free_frame=4), distance, frames)) == 4
     assert len(free_motions(replace(squashed, ground=Ground(0.25)), distance, frames)) == 0
