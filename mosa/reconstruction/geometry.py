@@ -109,8 +109,8 @@ def find_geometry(scene: Scene, hull: Volume, settings: GeometrySettings, *, rid
                   device: torch.device | str) -> Geometry:
     """The body of `scene` inside its visual hull (occupancy of frame 0, training cameras only), read from training frames alone.
 
-    ridge_passes, sigma: of `shave_ridges`, where source is hull; margin: px around the mattes.
-    """
+    ridge_passes, sigma: of `shave_ridges`, which gives the body where source is hull, and else a start; margin: px around the
+    mattes. """
     solid = replace(hull, values=(hull.values > 0.5).float())
     volume = solid.occupied_volume()
     if settings.source == "hull":

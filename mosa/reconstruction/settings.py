@@ -15,7 +15,7 @@ from mosa.reconstruction.static import FitSettings, StaticSettings
 @dataclass(frozen=True)
 class ReconstructionSettings:
     """resolution: voxels along the object's longest side in the hull; geometry: what of it is the body; ridge_passes: of
-    hull.shave_ridges, where geometry.source is hull; points: static Gaussians
+    hull.shave_ridges: the body where geometry.source is hull, else where its refinement starts; points: static Gaussians
     (with static.densify=mcmc at the start); neighbours: of the least-squares deformation; cue: neighbourhood | gaussian
     (docs/cues.md); margin: px of the windows around mattes; splats: 3DGS PLY file of the object at frame 0, in the scene's
     world, that replaces the static stage (None: fit it)."""
