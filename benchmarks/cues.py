@@ -31,7 +31,8 @@ from mosa.data.builtin import load_builtin
 from mosa.data.builtin.objects import drop_named
 from mosa.modules.observer import observe
 from mosa.reconstruction.cues import neighbourhood, neighbourhood_cues
-from mosa.reconstruction.pipeline import ReconstructionSettings, build_settings, reconstruct, spacing_for
+from mosa.reconstruction.pipeline import reconstruct, spacing_for
+from mosa.reconstruction.settings import ReconstructionSettings, build_settings
 from mosa.rendering.covariance import covariance_from
 from mosa.types import MotionCues, Reconstruction, Scene
 

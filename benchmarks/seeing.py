@@ -47,7 +47,8 @@ from mosa.pipeline import body_of, reconstruct_scene, scenes
 from mosa.reconstruction.cues import neighbourhood, polar
 from mosa.reconstruction.filling import body_volume
 from mosa.reconstruction.hull import hull_bounds, visual_hull
-from mosa.reconstruction.pipeline import ReconstructionSettings, build_settings, object_hull
+from mosa.reconstruction.pipeline import object_geometry
+from mosa.reconstruction.settings import ReconstructionSettings, build_settings
 from mosa.reconstruction.starts import first_contact, sequence_start
 from mosa.rendering.cameras import crop_boxes, crop_images, project
 from mosa.rendering.covariance import covariance_from
@@ -170,7 +171,7 @@ def volume_figures(seen: Seen, published: dict) -> dict:
     """Volumes [m^3] at frame 0: particles, what they are filled from, visual hulls, and that of the scene's folder."""
     scene, settings = seen.scene, seen.settings
     result = {"published_hull": published["frames"][0]["volume"], "particles": float(seen.result.volume.sum()),
-              "filled_hull": body_volume(object_hull(scene, settings))}  # fmt: skip
+              "filled_hull": body_volume(object_geometry(scene, settings).body)}  # fmt: skip
     for name, cameras in (("hull_training_cameras", scene.training_cameras), ("hull_all_cameras", list(range(len(scene.cameras))))):
         mattes, views = scene.mattes[cameras, 0], scene.cameras.select(cameras)
         bounds = hull_bounds(mattes, views, scene.box)

@@ -23,7 +23,8 @@ from mosa.modules.observer import observe
 from mosa.pipeline import scenes
 from mosa.reconstruction.hull import Volume
 from mosa.reconstruction.observed import object_windows
-from mosa.reconstruction.pipeline import ReconstructionSettings, build_settings, object_hull
+from mosa.reconstruction.pipeline import object_geometry
+from mosa.reconstruction.settings import ReconstructionSettings, build_settings
 from mosa.reconstruction.static import fit_splats, start_splats
 from mosa.rendering.covariance import covariance_from
 from mosa.types import Scene
@@ -78,7 +79,7 @@ def main() -> None:
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for name in args.scenes:
         scene, settings = settings_of(name, args.overrides)
-        hull = object_hull(scene, settings)
+        hull = object_geometry(scene, settings).body
         for line in LINES:
             _, settings = settings_of(name, [f"reconstruction.{key}" for key in line] + args.overrides)
             found = [figures(scene, HELD[name], hull, settings, seed) for seed in args.seeds]

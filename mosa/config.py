@@ -136,7 +136,7 @@ def build_heterogeneity(config: Mapping[str, Any], low: Tensor, high: Tensor) ->
 
 def rehearse(cfg: Mapping[str, Any]) -> None:
     """Build what needs no data and drop it: a mistake then shows before the reconstruction. Errors: ConfigError naming the key."""
-    from mosa.reconstruction.pipeline import build_settings
+    from mosa.reconstruction.settings import build_settings
 
     build_settings(**cfg["reconstruction"])
     low, high = torch.zeros(3), torch.ones(3)

@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mosa import __version__, parallel
 from mosa.analysis.comparison import compare, write_comparisons
-from mosa.analysis.tables import determined_text, parameter_table, results_table
+from mosa.analysis.tables import determined_text, geometry_lines, parameter_table, results_table
 from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLast, Pace, StageNotes
 from mosa.checkpoints import check_same, read_checkpoint
 from mosa.config import build_body, build_fit, build_world, plain, run_config, world_config
@@ -85,11 +85,13 @@ def run_folder() -> Path:
 
 def reconstruct_scene(cfg: DictConfig, scene: Scene, device: str) -> tuple[Reconstruction, float]:
     """Reconstruction of the training sequence and the grid spacing that goes with it [m]."""
-    from mosa.reconstruction.pipeline import build_settings, reconstruct, spacing_for
+    from mosa.reconstruction.pipeline import reconstruct, spacing_for
+    from mosa.reconstruction.settings import build_settings
 
     settings = build_settings(**plain(cfg.reconstruction))
     dx = cfg.simulation.dx
-    spacing = dx / 2 if dx is not None else spacing_for(scene, cfg.simulation.particles)
+    spacing = dx / 2 if dx is not None else spacing_for(scene, cfg.simulation.particles, settings, cache_dir=cache_folder(cfg),
+                                                        device=device)
     reconstruction = reconstruct(scene, settings=settings, spacing=spacing, cache_dir=cache_folder(cfg), seed=cfg.seed,
                                  device=device)
     return reconstruction, 2 * spacing
@@ -163,8 +165,8 @@ def train(cfg: DictConfig) -> float | None:
     body = body_of(reconstruction, config).to(device)
     resolved = resolution(body.rest, dx / 2)
     if not resolved.enough:
-        warnings.warn(f"simulation.particles: the thin parts of this body are {resolved.cells:.1f} cells across, fewer than {ENOUGH:g}: the "
-                      "grid stiffens them, and the law that is found makes up for it; about "
+        warnings.warn(f"simulation.particles: the thin parts of this body are {resolved.cells:.1f} cells across, fewer than "
+                      f"{ENOUGH:g}: the grid stiffens them, and the law that is found makes up for it; about "
                       f"{resolved.particles} particles would resolve them", stacklevel=1)
     with clock.measure("starts"):
         found = shared_starts(cfg, folder, lambda: starts(body, reconstruction, scene, held_out, taught), body)
@@ -186,11 +188,12 @@ def train(cfg: DictConfig) -> float | None:
     with clock.measure("evaluation"):
         evaluated = sequences(body, scene, held_out, found)
         figures, kept = evaluate(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
-    figures |= identification(body, scene) | law_figures(body) | start_figures(found["train"])
+    figures |= identification(body, scene) | law_figures(body) | start_figures(found["train"]) | reconstruction.geometry
     figures |= hidden_figures(body, scene, figures) | posterior_figures(body, module.posterior, evaluated, world, folder)
     figures |= {f"id_prior/compared/{law}_m": distance for law, distance in module.compared.items()}
     if cfg.evaluation.floor:
         figures |= floor_figures(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
+        figures |= true_geometry(body, scene)
     figures |= clock.figures | cost(device) | {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
     figures["geometry/cells_across"] = resolved.cells
     log_outcome(plain(cfg.logger), folder, plain(cfg), figures)
@@ -233,7 +236,8 @@ def assemble_fit(
 
 def follow_scene(cfg, scene, first, reconstruction, body, start, device) -> Reconstruction:
     """Reconstruction of another sequence of the body that `reconstruction` found in the scene `first`."""
-    from mosa.reconstruction.pipeline import build_settings, follow
+    from mosa.reconstruction.pipeline import follow
+    from mosa.reconstruction.settings import build_settings
 
     return follow(scene, first, reconstruction, rotation=start.rotation, center=start.center, rest_center=body.center,
                   settings=build_settings(**plain(cfg.reconstruction)), cache_dir=cache_folder(cfg), seed=cfg.seed, device=device)
@@ -306,6 +310,13 @@ def fit(cfg, module: LitMosa, data: MultiViewDataModule, folder: Path, device: s
     module.body.to(device)
 
 
+def true_geometry(body: Body, scene: Scene) -> dict[str, float]:
+    """Figures of the body against the true shape, where that is known."""
+    from mosa.data.builtin.true_geometry import geometry_figures
+
+    return geometry_figures(body.rest, body.volume, scene) if scene.synthetic and scene.truth is not None else {}
+
+
 def start_figures(start: Start) -> dict[str, float]:
     names = ("x", "y", "z")
     return {f"id/v0_{n}": float(v) for n, v in zip(names, start.velocity)} | {
@@ -322,7 +333,8 @@ def write_outputs(folder: Path, cfg: DictConfig, body: Body, evaluated: list[Seq
     if cfg.evaluation.video:
         shown = [s for s in evaluated if s.prefix.startswith("test")] or evaluated[-1:]
         write_comparisons(folder, {s.prefix: compare(body, s, kept[s.prefix]) for s in shown})
-    table = "\n\n".join(filter(None, (results_table(figures), parameter_table(figures), determined_text(figures))))
+    parts = (results_table(figures), parameter_table(figures), determined_text(figures), geometry_lines(figures))
+    table = "\n\n".join(filter(None, parts))
     (folder / "results.md").write_text(table + "\n")
     write_figures(folder, figures)  # the last file: the run is complete
     log.info("\n%s\n\nrun folder: %s", table, folder)
@@ -374,6 +386,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     figures |= hidden_figures(body, scene, figures) | posterior_figures(body, twin.posterior, evaluated, world, folder)
     if cfg.evaluation.floor:
         figures |= floor_figures(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
+        figures |= true_geometry(body, scene)
     write_outputs(folder, cfg, body, evaluated, figures, kept)
     return optimized(figures, "test/rms_m")
 

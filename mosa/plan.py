@@ -1,6 +1,7 @@
 """Which drop to film next: starts ranked by how much they would tell about the learned law.
 
-Where the laws that are still possible predict different motions, seeing the motion tells them apart. For laws drawn from the posterior
+Where the laws that are still possible predict different motions, seeing the motion tells them apart. For laws drawn from the
+posterior
 the expected information of a drop is that of the linear Gaussian model, 1/2 log det(I + K), K the draws' covariance in units of the
 noise (Chaloner and Verdinelli, Bayesian experimental design: a review, Statistical Science 10, 1995).
 """
@@ -37,7 +38,7 @@ class Candidate:
 
 def information(drawn: Tensor, noise: float) -> float:
     """1/2 log det(I + K) [nats] of positions (D, T, N, 3) [m] under D drawn laws; noise [m]: of a particle's position."""
-    draws, frames, particles = drawn.shape[:3]
+    draws, _, particles = drawn.shape[:3]
     away = (drawn - drawn.mean(0)).reshape(draws, -1).double()
     # neighbouring particles are one datum: each counts as INDEPENDENT/N of one, and noise is over three components
     share = min(1.0, INDEPENDENT / particles) * 3 / noise**2 / (draws - 1)
@@ -96,6 +97,6 @@ def plan_text(ranked: list[Candidate]) -> str:
     for i, each in enumerate(ranked):
         x, y, z, degrees = each.rotation
         speed = ", ".join(f"{v:.2f}" for v in each.velocity)
-        lines.append(f"{i + 1}. {each.gain:6.2f} nats: turned by {degrees:3.0f} degrees about ({x:.2f}, {y:.2f}, {z:.2f}), lowest point "
-                     f"{each.height:.3f} m above the ground, thrown at ({speed}) m/s")
+        lines.append(f"{i + 1}. {each.gain:6.2f} nats: turned by {degrees:3.0f} degrees about ({x:.2f}, {y:.2f}, {z:.2f}), lowest "
+                     f"point {each.height:.3f} m above the ground, thrown at ({speed}) m/s")
     return "\n".join(lines)

@@ -65,7 +65,8 @@ WIDEST = 4096
 """Of a layer of a network: many times what any run has used, and far below what memory would not hold."""
 
 SECTIONS = ("scene", "prior", "adapter", "reconstruction", "simulation", "fit", "rendering", "trainer", "logger", "evaluation",
-            "heterogeneity", "losses", "world", "criterion", "identification", "fit.prior", "fit.prior_eta", "fit.joint", "reconstruction.static",
+            "heterogeneity", "losses", "world", "criterion", "identification",
+            "fit.prior", "fit.prior_eta", "fit.joint", "reconstruction.static",
             "reconstruction.appearance", "reconstruction.dynamic")  # fmt: skip
 
 FIGURE = Kind("a figure's name like test/rms_m (docs/figures.md)",
@@ -138,7 +139,8 @@ TRAINING: dict[str, Kind] = {
     "reconstruction.dynamic.model": one_of("modes", "network"),
     "reconstruction.dynamic.carriers": one_of("static", "particles"),
     "reconstruction.ridge_passes": whole(0),
-    "reconstruction.carve": FLAG,
+    "reconstruction.geometry.source": one_of("images", "hull"),
+    "reconstruction.geometry.frames": COUNT,
     "reconstruction.points": whole(8, 10**8),
     "reconstruction.neighbours": whole(4),  # fewer leave every deformation gradient open
     "reconstruction.margin": whole(0),

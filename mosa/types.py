@@ -135,13 +135,15 @@ class MotionCues:
 @dataclass(frozen=True)
 class Reconstruction:
     """Particles P_0 with their appearance at frame 0 and the motion cues. spacing [m]; volume: (N,) [m^3] initial volume;
-    static: Gaussians of the static stage, which carry the images where other sequences of the body are followed."""
+    static: Gaussians of the static stage, which carry the images where other sequences of the body are followed; geometry: figures
+    of the body that was filled (`mosa.reconstruction.geometry`)."""
 
     splats: Splats
     spacing: float
     volume: Tensor
     cues: MotionCues
     static: Splats | None = None
+    geometry: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,5 @@
-"""No module of the physics imports another that imports it, not even inside of a function: a reader can go through them in order."""
+"""No module of the physics imports another that imports it, not even inside of a function: a reader can go through them in
+order."""
 
 import ast
 from pathlib import Path
@@ -9,7 +10,8 @@ ROOT = Path(mosa.__file__).parent
 
 
 def imports(below: str) -> dict[str, set[str]]:
-    """Of every module of mosa, the modules of mosa it imports anywhere in its file (not for types alone), those in `below` alone."""
+    """Of every module of mosa, the modules of mosa it imports anywhere in its file (not for types alone), those in `below`
+    alone."""
     files = {".".join(p.relative_to(ROOT.parent).with_suffix("").parts).removesuffix(".__init__"): p for p in ROOT.rglob("*.py")}
     graph = {}
     for name, path in files.items():

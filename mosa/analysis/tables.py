@@ -70,8 +70,8 @@ def determined_text(figures: Mapping[str, float]) -> str:
         if ratio < NOTICEABLE:
             lines.append(f"- No anisotropy: largest over smallest Young's modulus {spread}; the law predicts as its prior.")
         elif half > SURE_DEGREES:
-            lines.append(f"- Some anisotropy (largest over smallest Young's modulus {spread}), but its direction is *not* determined: "
-                         f"the 95 % cone about ({axis}) has a half angle of {half:.0f} degrees. Another drop would tell.")
+            lines.append(f"- Some anisotropy (largest over smallest Young's modulus {spread}), but its direction is *not* "
+                         f"determined: the 95 % cone about ({axis}) has a half angle of {half:.0f} degrees.")
         else:
             lines.append(f"- The stiffest direction is ({axis}), within {half:.0f} degrees (95 %); the largest over the smallest "
                          f"Young's modulus is {spread}.")
@@ -80,8 +80,27 @@ def determined_text(figures: Mapping[str, float]) -> str:
             lines.append(f"- Of {figures[f'posterior/{name}_numbers']:.0f} {what} the data determine "
                          f"{figures[f'posterior/{name}_determined']:.1f}; the rest is where the prior has it.")
     if "posterior/test/sd_m" in figures:
-        lines.append(f"- Held-out positions after contact are predicted to {figures['posterior/test/sd_m'] * 1e3:.1f} mm (rms)" + (f"; {figures['posterior/test/coverage']:.0%} of the errors lie within two standard deviations."
-                        if "posterior/test/coverage" in figures else "."))
+        sure = figures.get("posterior/test/coverage")
+        lines.append(f"- Held-out positions after contact are predicted to {figures['posterior/test/sd_m'] * 1e3:.1f} mm (rms)"
+                     + ("." if sure is None else f"; {sure:.0%} of the errors lie within two standard deviations."))
+    return "\n".join(lines)
+
+
+def geometry_lines(figures: Mapping[str, float]) -> str:
+    """Sentences on the body that was filled: how surely its surface is known, and against the true shape where that is known."""
+    lines, get = [], lambda name: figures.get(f"geometry/{name}")
+    if get("uncertain_share") is not None:
+        lines.append(
+            f"Geometry: {get('carved_share'):.1%} of the visual hull is air. {get('uncertain_share'):.1%} of the surface is not "
+            "told by the images to 0.7 particle spacings and is guessed between outlines; "
+            f"{get('free_frames'):.0f} free frames were used.")
+    elif get("carved_share") is not None:
+        lines.append(f"Geometry: the visual hull, {get('carved_share'):.1%} of it rounded away; no colours were asked.")
+    true = {name.rsplit("/", 1)[1]: value for name, value in figures.items() if name.startswith("floor/geometry/")}
+    if true:
+        lines.append(
+            f"Against the true shape: {true['outside_share']:.2%} of the particles outside, {true['missing_share']:.2%} of the "
+            f"body missing, volume {true['volume_error']:+.2%}, centre of mass {true['center_error_m'] * 1e3:.2f} mm off.")
     return "\n".join(lines)
 
 

@@ -239,8 +239,8 @@ class Identification:
             if distance < best[0]:
                 best = (distance, row)
         if not math.isfinite(best[0]):
-            raise SimulationDiverged("fit.prior: none of the starts of the coarse grid can be simulated; set prior.parameters nearer "
-                                     "to the body's, or raise simulation.max_substeps")
+            raise SimulationDiverged("fit.prior: none of the starts of the coarse grid can be simulated; set prior.parameters "
+                                     "nearer to the body's, or raise simulation.max_substeps")
         self._set(best[1])
         return best[0]
 

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from mosa.errors import DataError
 from mosa.reconstruction.hull import Volume
-from mosa.types import Cameras
 
 SMALLEST_PIECE = 0.02
 """Connected pieces below this part of the largest one are debris of the hull (ghosts seen by every matte) and are dropped."""
@@ -26,26 +25,6 @@ class Particles:
     volume: Tensor
     surface: Tensor
     spacing: float
-
-
-def carve(volume: Volume, depth: Tensor, alpha: Tensor, cameras: Cameras, *, tolerance: float, votes: int = 2) -> Volume:
-    """Empties voxels that at least `votes` views see in front of the rendered surface by more than `tolerance` [m].
-
-    depth: (V, H, W) [m] along the optical axis; alpha: (V, H, W), pixels below 0.9 are not trusted.
-    """
-    points = volume.points().reshape(-1, 3)
-    against = torch.zeros(len(points), device=points.device)
-    for v in range(len(cameras)):
-        seen = points @ cameras.w2c[v, :3, :3].T + cameras.w2c[v, :3, 3]
-        pixel = seen @ cameras.K[v].T
-        column = (pixel[:, 0] / seen[:, 2]).floor().long()
-        row = (pixel[:, 1] / seen[:, 2]).floor().long()
-        inside = (column >= 0) & (column < cameras.width) & (row >= 0) & (row < cameras.height) & (seen[:, 2] > 0)
-        column, row = column.clamp(0, cameras.width - 1), row.clamp(0, cameras.height - 1)
-        trusted = inside & (alpha[v, row, column] > 0.9)
-        against += trusted & (seen[:, 2] < depth[v, row, column] - tolerance)
-    keep = (against < votes).reshape(volume.values.shape)
-    return Volume(torch.where(keep, volume.values, torch.zeros_like(volume.values)), volume.origin, volume.pitch)
 
 
 def _body(volume: Volume, threshold: float) -> np.ndarray:

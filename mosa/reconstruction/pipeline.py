@@ -1,11 +1,12 @@
-"""Reconstruction of a sequence: hull -> static Gaussians -> filling -> appearance -> motion -> cues; every stage is cached."""
+"""Reconstruction of a sequence: hull -> geometry -> static Gaussians -> filling -> appearance -> motion -> cues; stages are
+cached."""
 
 from __future__ import annotations
 
 import functools
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,75 +18,22 @@ from mosa.errors import ConfigError, DataError
 from mosa.progress import tqdm
 from mosa.reconstruction.cache import StageCache
 from mosa.reconstruction.cues import gaussian_cues, neighbourhood, neighbourhood_cues
-from mosa.reconstruction.dynamic import DynamicSettings, Scaffold, fit_motion
-from mosa.reconstruction.filling import Particles, body_volume, carve, fill
-from mosa.reconstruction.hull import Volume, hull_bounds, hull_centroid, shave_ridges, visual_hull
+from mosa.reconstruction.dynamic import Scaffold, fit_motion
+from mosa.reconstruction.filling import Particles, body_volume, fill
+from mosa.reconstruction.geometry import Geometry, find_geometry
+from mosa.reconstruction.hull import Volume, hull_bounds, hull_centroid, visual_hull
 from mosa.reconstruction.initial import inherited_colors
 from mosa.reconstruction.modes import deformation_modes
 from mosa.reconstruction.observed import Windows, object_windows
-from mosa.reconstruction.static import FitSettings, StaticSettings, fit_splats, start_splats
+from mosa.reconstruction.settings import ReconstructionSettings
+from mosa.reconstruction.static import fit_splats, start_splats
 from mosa.rendering.covariance import covariance_from, matrix_to_quaternion, quaternion_multiply
-from mosa.rendering.rasterizer import expected_depth, rasterize
+from mosa.rendering.rasterizer import rasterize
 from mosa.threads import threaded
 from mosa.types import MotionCues, Reconstruction, Scene, Splats
 
-CACHE_VERSION = 2
+CACHE_VERSION = 3
 """Raised when a stage computes something else from the same settings."""
-
-
-@dataclass(frozen=True)
-class ReconstructionSettings:
-    """resolution: voxels along the object's longest side in the hull; ridge_passes: hull.shave_ridges; carve: empty what
-    lies in front of the static Gaussians' depth by more than carve_tolerance [spacings]; points: static Gaussians
-    (with static.densify=mcmc at the start); neighbours: of the least-squares deformation; cue: neighbourhood | gaussian
-    (docs/cues.md); margin: px of the windows around mattes; splats: 3DGS PLY file of the object at frame 0, in the scene's
-    world, that replaces the static stage (None: fit it)."""
-
-    resolution: int = 80
-    ridge_passes: int = 24
-    carve: bool = False
-    carve_tolerance: float = 0.75
-    points: int = 3000
-    neighbours: int = 20
-    cue: str = "neighbourhood"
-    margin: int = 6
-    splats: str | None = None
-    static: StaticSettings = field(default_factory=StaticSettings)
-    appearance: FitSettings = field(default_factory=lambda: FitSettings(keep=1.0))
-    dynamic: DynamicSettings = field(default_factory=DynamicSettings)
-
-    def __post_init__(self) -> None:
-        if self.cue not in ("neighbourhood", "gaussian"):
-            raise ConfigError(f"reconstruction.cue: expected neighbourhood or gaussian, found {self.cue!r}")
-        if self.static.max_points is not None and self.static.max_points < self.points:
-            raise ConfigError(
-                f"reconstruction.static.max_points: expected at least reconstruction.points={self.points}, the number at the "
-                f"start, found {self.static.max_points}"
-            )
-        free = self.dynamic.free_shape or self.dynamic.model == "network"
-        if self.cue == "gaussian" and not free:
-            raise ConfigError(
-                "reconstruction.cue=gaussian reads the Gaussians' own scale and rotation: set "
-                "reconstruction.dynamic.free_shape=true or reconstruction.dynamic.model=network"
-            )
-
-
-def _section(cls: type, values: Mapping[str, Any], where: str) -> Any:
-    known = {f.name for f in fields(cls)}
-    unknown = sorted(set(values) - known)
-    if unknown:
-        raise ConfigError(f"{where}: unknown key {unknown[0]!r}, expected one of {', '.join(sorted(known))}")
-    return cls(**values)
-
-
-def build_settings(**keys: Any) -> ReconstructionSettings:
-    """Settings from the plain keys of conf/reconstruction; ConfigError names an unknown key."""
-    keys = dict(keys)
-    sections = {"static": StaticSettings, "appearance": FitSettings, "dynamic": DynamicSettings}
-    for name, cls in sections.items():
-        if name in keys:
-            keys[name] = _section(cls, keys[name] or {}, f"reconstruction.{name}")
-    return _section(ReconstructionSettings, keys, "reconstruction")
 
 
 def _first_frame(scene: Scene) -> tuple[Tensor, Any]:
@@ -95,26 +43,53 @@ def _first_frame(scene: Scene) -> tuple[Tensor, Any]:
 
 
 def object_hull(scene: Scene, settings: ReconstructionSettings) -> Volume:
-    """Visual hull of the first frame with its ridges rounded; training cameras only."""
+    """Visual hull of the first frame, occupancy in [0, 1]; training cameras only."""
     mattes, cameras = _first_frame(scene)
     bounds = hull_bounds(mattes, cameras, scene.box)
     pitch = float((bounds[1] - bounds[0]).max()) / settings.resolution
-    hull = visual_hull(mattes, cameras, scene.box, pitch=pitch)
-    return (
-        shave_ridges(hull, cameras, passes=settings.ridge_passes, sigma=settings.resolution / 40)
-        if settings.ridge_passes
-        else hull
-    )
+    return visual_hull(mattes, cameras, scene.box, pitch=pitch)
 
 
-def spacing_for(scene: Scene, particles: int, settings: ReconstructionSettings | None = None) -> float:
+def object_geometry(
+    scene: Scene,
+    settings: ReconstructionSettings,
+    *,
+    cache_dir: str | Path | None = None,
+    device: torch.device | str = "cpu",
+) -> Geometry:
+    """The body inside the visual hull, by settings.geometry; cached apart from the stages that depend on the particles' spacing.
+
+    Errors: DataError (empty mattes, empty hull).
+    """
+    parts = {"resolution": settings.resolution, "ridge_passes": settings.ridge_passes, "margin": settings.margin}
+    cache = _open_cache(cache_dir, scene, parts | {"geometry": asdict(settings.geometry)}, 0, free=scene.last_free_frame)
+
+    def stage() -> dict[str, Any]:
+        found = find_geometry(
+            scene, object_hull(scene, settings), settings.geometry, ridge_passes=settings.ridge_passes,
+            sigma=settings.resolution / 40, margin=settings.margin, device=device,
+        )  # fmt: skip
+        return found.stored()
+
+    return Geometry.read(cache.stage("geometry", stage))
+
+
+def spacing_for(
+    scene: Scene,
+    particles: int,
+    settings: ReconstructionSettings | None = None,
+    *,
+    cache_dir: str | Path | None = None,
+    device: torch.device | str = "cpu",
+) -> float:
     """Particle spacing [m] that fills the object of `scene` with about `particles` particles."""
     if particles < 8:
         raise ConfigError(f"simulation.particles: expected at least 8, found {particles}")
-    return (body_volume(object_hull(scene, settings or ReconstructionSettings())) / particles) ** (1 / 3)
+    geometry = object_geometry(scene, settings or ReconstructionSettings(), cache_dir=cache_dir, device=device)
+    return (body_volume(geometry.body) / particles) ** (1 / 3)
 
 
-def _open_cache(cache_dir: str | Path | None, scene: Scene, settings: ReconstructionSettings, seed: int, **more: Any) -> StageCache:
+def _open_cache(cache_dir: str | Path | None, scene: Scene, settings: Mapping[str, Any], seed: int, **more: Any) -> StageCache:
     """The cache of what is computed from the training views and frames of `scene`; more: whatever else the results depend on."""
     key = {
         "version": CACHE_VERSION,
@@ -123,7 +98,7 @@ def _open_cache(cache_dir: str | Path | None, scene: Scene, settings: Reconstruc
         "views": scene.training_cameras,
         "frames": scene.training_frames,
         "seed": seed,
-        "settings": asdict(settings),
+        "settings": settings,
         "box": scene.box.tolist(),
     }
     return StageCache(Path(cache_dir) if cache_dir is not None else None, key | more)
@@ -163,17 +138,6 @@ def _render_still(splats: Splats, windows: Windows, background: Tensor) -> Tenso
         )[0]
 
 
-def fill_body(hull: Volume, static: Splats, windows: Windows, settings: ReconstructionSettings, spacing: float) -> Particles:
-    """Particles inside the hull, after carving by the static Gaussians' depth where asked for."""
-    if settings.carve:
-        state = torch.zeros(len(windows), dtype=torch.long, device=static.means.device)
-        depth, alpha = expected_depth(
-            static.means[None], covariance_from(static.scales, static.rotations)[None], static.opacities, windows.cameras, state
-        )
-        hull = carve(hull, depth, alpha, windows.cameras, tolerance=settings.carve_tolerance * spacing)
-    return fill(hull, spacing=spacing)
-
-
 def reconstruct(
     scene: Scene,
     *,
@@ -198,8 +162,8 @@ def reconstruct(
     if settings.splats is not None:
         imported = imported_splats(settings.splats, scene)
         more["splats"] = hashlib.sha256(Path(settings.splats).read_bytes()).hexdigest()[:16]
-    cache = _open_cache(cache_dir, scene, settings, seed, **more)
-    hull = Volume(**cache.stage("hull", lambda: _volume_tensors(object_hull(scene, settings))))
+    cache = _open_cache(cache_dir, scene, asdict(settings), seed, **more)
+    geometry = object_geometry(scene, settings, cache_dir=cache_dir, device=device)
     windows = object_windows(scene, views, frames, margin=settings.margin).to(device)
     still, background = windows.of_frame(0), scene.background.to(device)
 
@@ -211,7 +175,7 @@ def reconstruct(
         if settings.splats is not None:
             cache.strip("static", still, _render_still(imported.to(device), still, background))
             return _tensors(imported)
-        start = start_splats(hull, still, settings.static, count=settings.points, seed=seed)
+        start = start_splats(geometry.body, still, settings.static, count=settings.points, seed=seed)
         with bar("static Gaussians", settings.static.iterations) as steps:
             fitted = fit_splats(start, still, background, settings.static, move=True, seed=seed, progress=steps.update)
         cache.strip("static", still, _render_still(fitted, still, background))
@@ -219,7 +183,7 @@ def reconstruct(
 
     def appearance_stage() -> dict[str, Tensor]:
         static = Splats(**cache.stage("static", static_stage)).to(device)
-        particles = fill_body(hull, static, still, settings, spacing)
+        particles = fill(geometry.body, spacing=spacing)
         start = scaffold_splats(particles, static, device)
         with bar("appearance of the particles", settings.appearance.iterations) as steps:
             fitted = fit_splats(start, still, background, settings.appearance, move=False, seed=seed, progress=steps.update)
@@ -236,7 +200,7 @@ def reconstruct(
 
     motion = cache.stage("motion", motion_stage, (len(frames), len(splats.means)))
     static = Splats(**cache.stage("static", static_stage))
-    return Reconstruction(splats, spacing, volume, cues_of(motion, splats, settings), static)
+    return Reconstruction(splats, spacing, volume, cues_of(motion, splats, settings), static, geometry.figures(spacing))
 
 
 def cues_of(motion: dict[str, Tensor], splats: Splats, settings: ReconstructionSettings) -> MotionCues:
@@ -278,7 +242,7 @@ def follow(
     _first_frame(scene)
     pose = (rotation, center, rest_center)
     cache = _open_cache(
-        cache_dir, scene, settings, seed,
+        cache_dir, scene, asdict(settings), seed,
         body=[first.fingerprint, first.training_cameras, first.training_frames, reconstruction.spacing],
         pose=[[round(v, 6) for v in part.flatten().tolist()] for part in pose],
     )  # fmt: skip
@@ -295,10 +259,6 @@ def follow(
 
     motion = cache.stage("motion", motion_stage, (len(frames), len(splats.means)))
     return Reconstruction(splats, reconstruction.spacing, reconstruction.volume, cues_of(motion, splats, settings), static)
-
-
-def _volume_tensors(volume: Volume) -> dict[str, Any]:
-    return {"values": volume.values.cpu(), "origin": volume.origin.cpu(), "pitch": volume.pitch}
 
 
 def scaffold_splats(particles: Particles, static: Splats, device: torch.device | str) -> Splats:

@@ -13,8 +13,8 @@ from scipy import ndimage
 from torch import Tensor
 
 ENOUGH = 2.0
-"""Cells across below which a run is warned. A free-free bar vibrates at 0.988 of its true frequency with 4 cells and at 0.998 with 8
-(docs/verification.md); the rabbit's ears have 2."""
+"""Cells across below which a run is warned. A free-free bar vibrates at 0.988 of its true frequency with 4 cells and at 0.998
+with 8 (docs/verification.md); the rabbit's ears have 2."""
 THIN = 0.1
 """Share of the body that has to be thinner for its thin parts to count."""
 MOST = 5.0

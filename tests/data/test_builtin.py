@@ -8,9 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 
 from mosa.data.builtin import sequences, takes
-from mosa.data.builtin.drop import CONTACT_CELLS, COURANT
+from mosa.data.builtin.drop import CONTACT_CELLS, COURANT, place
 from mosa.data.builtin.floor import floor_rollout
 from mosa.data.builtin.objects import OBJECTS
 from mosa.data.builtin.renderer import render_surface, ring_of_cameras
@@ -59,8 +60,47 @@ def test_shapes_have_their_height_and_closed_surfaces(name):
     assert volume == pytest.approx(len(fill(SHAPES[name], 0.004, np.random.default_rng(0))) * 0.004**3, rel=0.01)
 
 
-def test_colours_do_not_repeat_under_mirroring_so_that_a_pose_can_be_told():
-    surface = extract_surface(SHAPES["rabbit"], 0.006, np.random.default_rng(0))
+SECOND_FIVE = ("gorilla", "calf", "chick2", "rainbowball", "ring")
+
+
+@pytest.mark.parametrize("name", SECOND_FIVE)
+def test_limbs_are_two_cells_of_the_truth_s_grid_thick(name):
+    """Opened by a ball of one cell, a body loses nothing but the creases of its joints."""
+    body = OBJECTS[name]
+    pitch, radius = 0.004, 2 * body.spacing
+    points = fill(SHAPES[body.shape], pitch, np.random.default_rng(0))
+    deep = points[SHAPES[body.shape].distance(points) < -radius]
+    lost = cKDTree(deep).query(points)[0] > radius + pitch  # a lattice point may lie a pitch off the ball's centre
+    assert lost.mean() < 2e-3
+
+
+def test_the_ring_is_a_torus_of_a_material_without_directions():
+    """Pappus: 2 pi^2 R r^2; lattice points inside of it are that volume to the surface's share of a half cell, averaged out."""
+    volume = len(fill(SHAPES["ring"], 0.003, np.random.default_rng(0))) * 0.003**3
+    assert volume == pytest.approx(2 * math.pi**2 * 0.088 * 0.023**2, rel=0.01)
+    material = OBJECTS["ring"].material
+    assert material.summary()["E_along"] == pytest.approx(material.summary()["E_across"])
+    assert material.parameters(torch.rand(5, 3))["mu"].std() == 0
+
+
+def test_the_second_five_differ_in_material_and_start_above_the_ground_in_every_drop():
+    fibres = [np.asarray(OBJECTS[n].material.fibre) for n in SECOND_FIVE if n != "ring"]
+    fibres = [f / np.linalg.norm(f) for f in fibres]
+    for i, a in enumerate(fibres):
+        for b in fibres[:i]:
+            assert abs(a @ b) < math.cos(math.radians(20))
+    for name in SECOND_FIVE:
+        body, points = OBJECTS[name], fill(SHAPES[OBJECTS[name].shape], 0.012, np.random.default_rng(0))
+        assert len(body.drops) == 3
+        for drop in body.drops.values():
+            start, _ = place(points, points.mean(0) * [0, 1, 0], drop, points)
+            # two whole frames of free flight
+            assert start[:, 1].min() > drop.speed * 0.04 + 0.5 * 9.8 * 0.04**2
+
+
+@pytest.mark.parametrize("name", ["rabbit", "gorilla", "calf", "chick2", "rainbowball"])
+def test_colours_do_not_repeat_under_mirroring_so_that_a_pose_can_be_told(name):
+    surface = extract_surface(SHAPES[name], 0.006, np.random.default_rng(0))
     mirrored = surface.vertices * [1, 1, -1]
     nearest = np.linalg.norm(surface.vertices[None, ::7] - mirrored[::7, None], axis=-1).argmin(1)
     assert np.abs(surface.colors[::7] - surface.colors[::7][nearest]).mean() > 0.1

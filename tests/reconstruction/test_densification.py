@@ -16,7 +16,7 @@ from mosa.reconstruction.gaussians import FreeGaussians, Rates
 from mosa.reconstruction.hull import visual_hull
 from mosa.reconstruction.initial import random_splats
 from mosa.reconstruction.observed import object_windows
-from mosa.reconstruction.pipeline import build_settings
+from mosa.reconstruction.settings import build_settings
 from mosa.reconstruction.static import StaticSettings, fit_splats, start_splats
 from mosa.rendering.covariance import covariance_from, matrix_to_quaternion, quaternion_to_matrix
 from mosa.rendering.rasterizer import rasterize

@@ -10,7 +10,7 @@ import squashed_body
 import torch
 
 from mosa.errors import DataError
-from mosa.reconstruction.filling import body_volume, carve, fill
+from mosa.reconstruction.filling import body_volume, fill
 from mosa.reconstruction.hull import (
     Volume,
     hull_bounds,
@@ -130,15 +130,3 @@ def test_debris_goes_and_cavities_close():
     values[middle, middle, middle] = 0
     values[1, 1, 1] = 1
     assert body_volume(Volume(values, volume.origin, volume.pitch)) == pytest.approx(body_volume(volume))
-
-
-def test_carving_empties_what_two_views_see_through(hull, squashed):
-    """Depth one centimetre behind the near side in every view: about that much is carved off; without views nothing is."""
-    cameras = squashed.cameras
-    centre = (CENTRE @ cameras.w2c[:, :3, :3].transpose(1, 2) + cameras.w2c[:, :3, 3])[:, 2]
-    depth = centre[:, None, None].expand_as(squashed.mattes[:, 0]) - 0.05
-    alpha = (squashed.mattes[:, 0] > 0.5).float()
-    carved = carve(hull, depth, alpha, cameras, tolerance=0.005)
-    assert body_volume(carved) < 0.8 * body_volume(hull)
-    assert body_volume(carve(hull, depth, 0 * alpha, cameras, tolerance=0.005)) == body_volume(hull)
-    assert body_volume(carve(hull, depth - 0.1, alpha, cameras, tolerance=0.005)) == body_volume(hull)

@@ -11,7 +11,8 @@ from mosa.data.splats import load_ply, save_ply
 from mosa.reconstruction.cues import neighbourhood
 from mosa.reconstruction.modes import deformation_modes
 from mosa.reconstruction.motion import ModalMotion
-from mosa.reconstruction.pipeline import build_settings, posed, reconstruct, spacing_for
+from mosa.reconstruction.pipeline import posed, reconstruct, spacing_for
+from mosa.reconstruction.settings import build_settings
 from mosa.rendering.covariance import covariance_from
 from mosa.types import Splats
 
@@ -30,7 +31,7 @@ def elongated(count=60):
 
 @pytest.mark.parametrize("static, appearance, more", [
     ({"start": "random"}, {}, {}),
-    ({"densify": "mcmc", "max_points": 200, "refine_every": 2}, {}, {"carve": True}),
+    ({"densify": "mcmc", "max_points": 200, "refine_every": 2}, {}, {"geometry": {"source": "hull"}}),
     ({"shape": "anisotropic"}, {"shape": "anisotropic"}, {"cue": "gaussian"}),
     ({"start": "random", "densify": "mcmc", "max_points": 200, "refine_every": 2, "shape": "anisotropic"}, {}, {}),
 ])  # fmt: skip

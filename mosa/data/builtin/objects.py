@@ -75,6 +75,15 @@ CLAY = HiddenYield(
     period=0.125,
 )  # fmt: skip
 CHICK = HiddenMaterial(E=2.2e5, nu=0.28, ratio=1.8, fibre=(0.3, -0.2, 1.0), amplitude=0.15, period=0.13, axis=(0.0, 1.0, 0.3))
+# the second five: shapes, materials and drops were fixed together, before anything was fitted on them
+GORILLA = HiddenMaterial(E=3e5, nu=0.3, ratio=1.75, fibre=(0.3, 1.0, 0.4), amplitude=0.2, period=0.15, axis=(0.6, 0.7, 0.3))
+CHICK2 = HiddenMaterial(E=2.4e5, nu=0.27, ratio=2.0, fibre=(0.5, 0.6, -0.7), amplitude=0.25, period=0.12, axis=(0.3, -0.4, 0.9))
+RAINBOWBALL = HiddenMaterial(
+    E=1.8e5, nu=0.36, ratio=1.5, fibre=(-0.6, 0.5, 0.6), amplitude=0.18, period=0.11, axis=(0.6, 0.2, -0.7)
+)  # fmt: skip
+CALF = HiddenMaterial(E=3.5e5, nu=0.33, ratio=1.65, fibre=(1.0, 0.2, 0.35), amplitude=0.22, period=0.17, axis=(0.9, 0.2, 0.4))
+# no directions, one stiffness: what is learned of it has to be nothing
+RING = HiddenMaterial(E=2.5e5, nu=0.34, ratio=1.0, fibre=(1.0, 0.0, 0.0), amplitude=0.0, period=0.1)
 
 DROPS = {
     "train": Drop(speed=2.5),
@@ -98,6 +107,36 @@ OBJECTS = {
         Footage(target=0.28), spacing=0.0065,
     ),
     "chick1": BuiltinObject("chick1", 0.22, CHICK, DROPS, Footage(target=0.31), spacing=0.007),
+    "gorilla": BuiltinObject(
+        "gorilla", 0.258, GORILLA,
+        {"train": Drop(speed=2.2), "test_50": Drop(speed=2.4, axis=(0.2, 0.5, 1.0), degrees=50.0, offset=(-0.03, 0.0)),
+         "test_70": Drop(speed=2.8, axis=(1.0, -0.3, 0.4), degrees=70.0, offset=(-0.01, 0.05))},
+        Footage(target=0.24), spacing=0.007,
+    ),
+    "chick2": BuiltinObject(
+        "chick2", 0.24, CHICK2,
+        {"train": Drop(speed=2.4), "test_80": Drop(speed=2.4, axis=(0.4, 0.3, -1.0), degrees=80.0, offset=(0.03, 0.0)),
+         "test_45": Drop(speed=3.0, axis=(-1.0, 0.5, 0.3), degrees=45.0, offset=(0.0, -0.03))},
+        Footage(target=0.24), spacing=0.0065,
+    ),
+    "rainbowball": BuiltinObject(
+        "rainbowball", 0.2, RAINBOWBALL,
+        {"train": Drop(speed=2.5), "test_65": Drop(speed=2.8, axis=(0.7, -0.2, 0.6), degrees=65.0),
+         "test_100": Drop(speed=3.2, axis=(-0.3, 0.5, 1.0), degrees=100.0)},
+        Footage(target=0.33), spacing=0.0065,
+    ),
+    "calf": BuiltinObject(
+        "calf", 0.267, CALF,
+        {"train": Drop(speed=2.0), "test_55": Drop(speed=2.2, axis=(0.3, 0.4, 1.0), degrees=55.0, offset=(-0.02, 0.0)),
+         "test_75": Drop(speed=2.6, axis=(1.0, 0.3, 0.2), degrees=75.0, offset=(-0.07, -0.07))},
+        Footage(target=0.24), spacing=0.0065,
+    ),
+    "ring": BuiltinObject(
+        "ring", 0.184, RING,
+        {"train": Drop(speed=2.2), "test_60": Drop(speed=2.5, axis=(0.2, 0.3, 1.0), degrees=60.0),
+         "test_110": Drop(speed=2.8, axis=(1.0, 0.2, -0.4), degrees=110.0)},
+        Footage(target=0.24), spacing=0.005, pitch=0.002,
+    ),
     # the rabbit, small and short, for tests and sweeps: every stage of the program, none of its accuracy
     "tiny": BuiltinObject(
         "rabbit", 0.25, RABBIT,

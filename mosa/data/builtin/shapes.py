@@ -1,93 +1,12 @@
-"""Bodies of the built-in scenes: signed distances of their parts, smoothly joined, and the colours painted on them.
-
-A shape lives in its own frame: y up, the ground at y = 0, looking along +x; lengths in metres. Distances are exact for spheres
-and capsules, first order near the surface for ellipsoids, and grow a little inside a blend.
-"""
+"""Bodies of the built-in scenes: parts smoothly joined, and the colours painted on them. Those with gaps between limbs, which no
+silhouette shows from all sides, are in `open_shapes.py`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import numpy as np
 
-Field = Callable[[np.ndarray], np.ndarray]
-
-
-@dataclass(frozen=True)
-class Shape:
-    """distance: points (M, 3) [m] to signed distance (M,) [m], negative inside; color: points and a generator to (M, 3) RGB in
-    [0, 1]; bounds: (2, 3) box that holds it [m]."""
-
-    distance: Field
-    color: Callable[[np.ndarray, np.random.Generator], np.ndarray]
-    bounds: np.ndarray
-
-
-def ellipsoid(points: np.ndarray, center, radii) -> np.ndarray:
-    """Distance to an axis-parallel ellipsoid: level k over its gradient's length, k (k - 1)/|grad k|."""
-    r = points - np.asarray(center)
-    radii = np.asarray(radii)
-    level = np.linalg.norm(r / radii, axis=-1)
-    slope = np.linalg.norm(r / radii**2, axis=-1)
-    inner = level < 1e-6
-    return np.where(inner, -radii.min(), level * (level - 1) / np.where(inner, 1.0, slope))
-
-
-def sphere(points: np.ndarray, center, radius: float) -> np.ndarray:
-    return np.linalg.norm(points - np.asarray(center), axis=-1) - radius
-
-
-def capsule(points: np.ndarray, start, end, radius: float, end_radius: float | None = None) -> np.ndarray:
-    """Distance to a capsule; with `end_radius` its radius changes linearly along the axis."""
-    start, axis = np.asarray(start), np.asarray(end) - np.asarray(start)
-    along = np.clip((points - start) @ axis / (axis @ axis), 0, 1)
-    end_radius = radius if end_radius is None else end_radius
-    return np.linalg.norm(points - start - along[:, None] * axis, axis=-1) - (radius + along * (end_radius - radius))
-
-
-def join(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
-    """Union with a fillet where both distances differ by less than `width` [m] (quadratic smooth minimum)."""
-    h = np.maximum(width - np.abs(a - b), 0) / width
-    return np.minimum(a, b) - 0.25 * width * h * h
-
-
-def mirrored(points: np.ndarray) -> np.ndarray:
-    """Points with their z made positive, for parts that come in pairs."""
-    return points * np.array([1, 1, 0]) + np.abs(points) * np.array([0, 0, 1])
-
-
-def step(value: np.ndarray, edge: float, width: float) -> np.ndarray:
-    """0 below `edge` - width/2, 1 above `edge` + width/2, smooth between."""
-    t = np.clip((value - edge) / width + 0.5, 0, 1)
-    return t * t * (3 - 2 * t)
-
-
-def blend(color: np.ndarray, other, amount: np.ndarray) -> np.ndarray:
-    """Colour (M, 3) moved towards `other` by `amount` (M,) in [0, 1]."""
-    return color + amount[:, None] * (np.asarray(other) - color)
-
-
-def waves(points: np.ndarray, rng: np.random.Generator, wavelength: float, count: int = 24) -> np.ndarray:
-    """Smooth random field (M,) of unit variance: a sum of plane waves of about that wavelength [m]."""
-    directions = rng.normal(size=(count, 3))
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    numbers = directions * (2 * np.pi / wavelength) * rng.uniform(0.75, 1.25, (count, 1))
-    phases = rng.uniform(0, 2 * np.pi, count)
-    return np.sqrt(2 / count) * np.cos(points @ numbers.T + phases).sum(-1)
-
-
-def coat(
-    points: np.ndarray, rng: np.random.Generator, base, first, second, *, patch: float, grain: float
-) -> np.ndarray:
-    """Patches of two colours on a base, with a finer mottle over all: a texture in which every turn and stretch shows."""
-    color = np.broadcast_to(np.asarray(base, dtype=float), points.shape).copy()
-    color = blend(color, first, step(waves(points, rng, patch), 0.45, 0.35))
-    color = blend(color, second, step(waves(points, rng, 0.8 * patch), 0.85, 0.35))
-    shade = 0.10 * waves(points, rng, grain) + 0.07 * waves(points, rng, 1.6 * grain)
-    tint = np.stack([waves(points, rng, 1.3 * grain) for _ in range(3)], -1)
-    return color * (1 + np.clip(shade, -0.3, 0.3))[:, None] + 0.03 * tint
-
+from mosa.data.builtin.open_shapes import calf_color, calf_distance, gorilla_color, gorilla_distance, ring_color, ring_distance
+from mosa.data.builtin.parts import Shape, blend, capsule, coat, ellipsoid, join, mirrored, sphere, step, waves
 
 # --- rabbit ---------------------------------------------------------------------------------------------------------------
 
@@ -225,9 +144,69 @@ def chick_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.clip(color, 0.02, 1.0)
 
 
+# --- second chick ---------------------------------------------------------------------------------------------------------
+
+
+def chick2_distance(points: np.ndarray) -> np.ndarray:
+    """A standing chick, 0.24 m high: round belly, small head on a neck, wings held out unequally, two feet, a raised tail."""
+    body = ellipsoid(points, (0.0, 0.098, 0.0), (0.078, 0.066, 0.068))
+    neck = capsule(points, (0.035, 0.125, 0.0), (0.062, 0.176, 0.006), 0.042, 0.032)
+    body = join(join(body, neck, 0.022), sphere(points, (0.066, 0.195, 0.008), 0.045), 0.014)
+    body = join(body, capsule(points, (0.100, 0.190, 0.012), (0.124, 0.182, 0.014), 0.022, 0.019), 0.010)
+    for tip, side in (((-0.030, 0.075, 0.118), 0.056), ((-0.020, 0.128, -0.116), -0.056)):
+        body = join(body, capsule(points, (0.012, 0.112, side), tip, 0.029, 0.022), 0.014)
+    for ankle, toe in (((0.000, 0.026, 0.038), (0.038, 0.022, 0.044)), ((-0.014, 0.026, -0.038), (0.020, 0.022, -0.046))):
+        leg = capsule(points, (ankle[0], 0.060, ankle[2]), ankle, 0.026, 0.024)
+        body = join(body, join(leg, capsule(points, ankle, toe, 0.024, 0.022), 0.010), 0.014)
+    return join(body, capsule(points, (-0.060, 0.105, 0.0), (-0.108, 0.158, 0.006), 0.030, 0.021), 0.016)
+
+
+def chick2_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Pale down with brown and russet patches, red beak and feet, one dark wing tip, eyes of two sizes."""
+    color = coat(points, rng, (0.93, 0.86, 0.66), (0.62, 0.40, 0.22), (0.80, 0.52, 0.24), patch=0.085, grain=0.026)
+    red = (0.86, 0.30, 0.16)
+    color = blend(color, red, step(-capsule(points, (0.108, 0.188, 0.013), (0.128, 0.181, 0.014), 0.024), 0.0, 0.005))
+    color = blend(color, red, step(0.030 - points[:, 1], 0.0, 0.006))
+    color = blend(color, (0.22, 0.17, 0.15), step(-sphere(points, (-0.024, 0.130, -0.122), 0.030), 0.0, 0.006))
+    for center, radius in (((0.092, 0.216, 0.040), 0.012), ((0.094, 0.214, -0.026), 0.010)):
+        color = blend(color, (0.06, 0.05, 0.06), step(-sphere(points, center, radius), 0.0, 0.003))
+    return np.clip(color, 0.02, 1.0)
+
+
+# --- rainbow ball ---------------------------------------------------------------------------------------------------------
+
+RAINBOW = ((0.86, 0.16, 0.16), (0.95, 0.55, 0.12), (0.96, 0.86, 0.20), (0.24, 0.66, 0.28), (0.18, 0.44, 0.80), (0.48, 0.24, 0.62))
+
+
+def rainbowball_distance(points: np.ndarray) -> np.ndarray:
+    """A ball of 0.2 m."""
+    return sphere(points, (0.0, 0.100, 0.0), 0.100)
+
+
+def rainbowball_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Six segments of a leaning ball, each of another width, lightly mottled, with a white cap and a dark patch on one side."""
+    arm = points - np.array([0.0, 0.100, 0.0])
+    axis = np.array([0.35, 0.85, 0.40]) / np.linalg.norm([0.35, 0.85, 0.40])
+    side = np.cross(axis, [1.0, 0.0, 0.0]) / np.linalg.norm(np.cross(axis, [1.0, 0.0, 0.0]))
+    turn = np.arctan2(arm @ np.cross(axis, side), arm @ side) + 0.25 * waves(points, rng, 0.09)
+    turn = np.mod(turn + 0.4 * np.sin(turn), 2 * np.pi) / (2 * np.pi) * len(RAINBOW)
+    color = np.broadcast_to(np.asarray(RAINBOW[0]), points.shape).copy()
+    for k in range(1, len(RAINBOW)):
+        color = blend(color, RAINBOW[k], step(turn, float(k), 0.08))
+    color = color * (1 + np.clip(0.09 * waves(points, rng, 0.028) + 0.06 * waves(points, rng, 0.045), -0.3, 0.3))[:, None]
+    color = blend(color, (0.96, 0.96, 0.94), step(arm @ axis, 0.084, 0.006))
+    color = blend(color, (0.14, 0.14, 0.20), step(-sphere(points, (-0.06, 0.05, 0.07), 0.030), 0.0, 0.005))
+    return np.clip(color, 0.02, 1.0)
+
+
 SHAPES = {
     "rabbit": Shape(rabbit_distance, rabbit_color, np.array([[-0.15, -0.01, -0.10], [0.13, 0.27, 0.10]])),
     "peanut": Shape(peanut_distance, peanut_color, np.array([[-0.15, -0.03, -0.09], [0.15, 0.16, 0.09]])),
     "mandarin": Shape(mandarin_distance, mandarin_color, np.array([[-0.13, -0.02, -0.12], [0.13, 0.21, 0.12]])),
     "chick1": Shape(chick_distance, chick_color, np.array([[-0.16, -0.02, -0.12], [0.15, 0.24, 0.12]])),
+    "chick2": Shape(chick2_distance, chick2_color, np.array([[-0.14, -0.01, -0.15], [0.15, 0.25, 0.15]])),
+    "rainbowball": Shape(rainbowball_distance, rainbowball_color, np.array([[-0.11, -0.01, -0.11], [0.11, 0.21, 0.11]])),
+    "gorilla": Shape(gorilla_distance, gorilla_color, np.array([[-0.15, -0.01, -0.16], [0.19, 0.28, 0.16]])),
+    "calf": Shape(calf_distance, calf_color, np.array([[-0.17, -0.01, -0.11], [0.19, 0.28, 0.11]])),
+    "ring": Shape(ring_distance, ring_color, np.array([[-0.13, -0.01, -0.13], [0.13, 0.22, 0.13]])),
 }
