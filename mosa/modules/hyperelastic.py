@@ -1,7 +1,7 @@
 """The default adapter: an anisotropic stiffness added to the prior's energy, so that the learned law has an energy at every strain.
 
-psi(F) = psi_prior(F) + mu E : S : E, E a strain in the material frame (`physics.strain`), mu the prior's shear modulus at the
-particle. At small strain the prior's stiffness 2 mu C0 becomes 2 mu (C0 + S). S follows from numbers A as
+psi(F) = beta psi_prior(F) + mu E : (S + (1 - beta) C0) : E, E a strain in the material frame (`physics.strain`), mu the shear
+modulus at the particle. At small strain the prior's stiffness 2 mu C0 becomes 2 mu (C0 + S). S follows from numbers A as
 
     C0 + S = C0^(1/2) exp(A) C0^(1/2),      A symmetric, orthogonal to the two isotropic tensors,
 
@@ -24,6 +24,8 @@ from mosa.modules.stiffening import ADAPTER_MARGIN, acoustic_stiffening
 from mosa.physics.asking import AdapterOperator, MaterialState
 from mosa.physics.strain import STRAINS
 
+SHARPNESS = 60.0
+"""Of the smoothed smallest eigenvalue: it is above the true one by at most log(6)/60."""
 NUMBERS = 19
 """Symmetric 6 x 6 matrices have 21 numbers, of which two are isotropic: the prior's own."""
 
@@ -59,7 +61,7 @@ class HyperelasticAdapter(Adapter):
     strain: hencky | biot | green, the measure E. Errors: ConfigError for an unknown one; `switch_on` refuses fluids.
     """
 
-    def __init__(self, *, strain: str = "hencky") -> None:
+    def __init__(self, *, strain: str = "green") -> None:
         super().__init__()
         if strain not in STRAINS:
             raise ConfigError(f"adapter.strain: expected one of {', '.join(STRAINS)}, found {strain!r}")
@@ -73,6 +75,15 @@ class HyperelasticAdapter(Adapter):
     @property
     def steady(self) -> bool:
         return True
+
+    def share(self) -> Tensor:
+        """beta () float64: how much of the prior's energy the law keeps, 1 at the prior, with its graph.
+
+        The smallest eigenvalue of exp(A), smoothed: what is then added, C0 + S - beta C0, is positive but for 3 %, so that no
+        direction loses its stiffness where the strain measure grows faster than the prior (Green's in tension)."""
+        A = torch.einsum("k,kij->ij", self.numbers.double(), anisotropic_basis(torch.float64, self.numbers.device))
+        values = torch.linalg.eigvalsh(A)
+        return torch.exp((math.log(len(values)) - torch.logsumexp(-SHARPNESS * values, 0)) / SHARPNESS)
 
     def follow(self, poisson: Tensor) -> None:
         """The prior's Poisson number now, (), with its graph: C0 is that of the law in use, so that C0 + S stays positive."""
@@ -116,12 +127,15 @@ class HyperelasticAdapter(Adapter):
         return (self.correction(poisson) @ torch.linalg.inv(C0)) * scale / scale[:, None]
 
     def forward(self, state: MaterialState) -> AdapterOperator:
-        """G: S for every particle, (N, 6, 6) in Mandel scaling and units of 2 mu; h: zeros. Errors: ConfigError before
-        `switch_on`."""
+        """G: C0 + S - beta C0 for every particle, (N, 6, 6) in Mandel scaling and units of 2 mu; h: (beta - 1, 0, ...), see
+        `share`.
+
+        Errors: ConfigError before `switch_on`."""
         self.check_on()
-        n = len(state.w)
-        S = self.correction().to(state.w)
-        return AdapterOperator(S.expand(n, 6, 6).contiguous(), state.w.new_zeros(n, 6))
+        n, less = len(state.w), self.share() - 1
+        added = self.correction() - less * isotropic_stiffness(self._poisson().double())
+        h = torch.cat([less.reshape(1), less.new_zeros(5)])
+        return AdapterOperator(added.to(state.w).expand(n, 6, 6).contiguous(), h.to(state.w).expand(n, 6).contiguous())
 
     def statistics(self) -> OperatorStatistics:
         """mean_abs_C: mean |entry| of S C0^-1, which is what the paper's C does to the stress at small strain; mean: the

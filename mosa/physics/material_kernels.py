@@ -62,8 +62,8 @@ def field_types(scalar):
 def stress_kernel(stress, uses_rotation: bool, scalar, adapted: bool, strain: str | None = None, shear: int = 0):
     """tau(F) [Pa]; adapted: + R mat(G vech(R^T tau R) + h) R^T with the operator held in the material frame.
 
-    strain: a name of `STRAINS`; the operator is then a stiffness in units of 2 mu, G in Mandel scaling (h is not read), and what is
-    added is the stress of the energy mu E : G : E. shear: place of mu among the law's parameters.
+    strain: a name of `STRAINS`; the operator is then a stiffness in units of 2 mu, G in Mandel scaling, and what is
+    added is the stress of the energy mu E : G : E, to 1 + h[0] times the prior's. shear: place of mu among the law's parameters.
     """
     field33, field6, field66, fieldp = field_types(scalar)
     energetic = adapted and strain is not None
@@ -84,6 +84,7 @@ def stress_kernel(stress, uses_rotation: bool, scalar, adapted: bool, strain: st
         T = stress(Fi, R, own.matrix33(C_affine, i), p)
         if wp.static(energetic):
             modulus = wp.float64(2.0) * p[wp.static(shear)]
+            T = (wp.float64(1.0) + own.vector6(h, i)[0]) * T
             if wp.static(factorised):
                 U, S, V = svd(Fi)
                 E = mandel(material_strain(wp.static(measure), Fi, S, V))
