@@ -98,7 +98,12 @@ def redistribution_response(jacobian: Tensor, directions: Tensor) -> Tensor:
 
 
 def response_of(states: States, adapter: Adapter | None) -> Callable[[Tensor], Tensor]:
-    """Corrected stress (M, 6) [Pa] as a function of the Hencky strain (M, 6): both Mandel, in the material frame."""
+    """Corrected stress (M, 6) [Pa] as a function of the Hencky strain (M, 6): both Mandel, in the material frame.
+
+    Errors: ConfigError for the default adapter, whose operator is a stiffness."""
+    if getattr(adapter, "strain", None) is not None:
+        raise ConfigError("anisotropy: expected an adapter whose operator acts on the prior's stress; a stiffness has its moduli in "
+                          "mosa.analysis.stiffness")
     adapter = None if adapter is None else in_double(adapter)
 
     def response(strain: Tensor) -> Tensor:

@@ -77,24 +77,3 @@ def whitened(found: list[Fields], noise: list[tuple[Tensor, Tensor, Tensor]], co
         for field, scale, count in zip(each, scales, numbers):
             parts.append((field * ((count / field.shape[1]) ** 0.5 / scale)[:, None, None]).flatten())
     return torch.cat(parts)
-
-
-def independent(field: Tensor, largest: float = 30.0) -> float:
-    """How many independent vectors a frame of a residual field (T, M, 3) holds, by its own correlations; at least 1.
-
-    Participation ratios (tr K)^2/tr K^2 of the correlations between particles (over frames and components) and between frames
-    (over particles and components), of fields whose frames are scaled alike: their product over the number of frames.
-    """
-    frames, particles = field.shape[:2]
-    scaled = field / field.square().sum(-1).mean(-1).sqrt().clamp(min=1e-12)[:, None, None]
-    rows = scaled.reshape(frames, -1)
-    in_time = _participation(rows)
-    modes = scaled.transpose(0, 1).reshape(particles, -1)
-    in_space = _participation(modes)
-    return float(min(max(in_space * in_time / frames, 1.0), largest))
-
-
-def _participation(rows: Tensor) -> float:
-    """(tr K)^2/tr K^2 of K = rows rows^T, from the smaller of the two Gram matrices."""
-    gram = rows @ rows.T if rows.shape[0] <= rows.shape[1] else rows.T @ rows
-    return float(gram.diagonal().sum() ** 2 / gram.square().sum().clamp(min=1e-30))

@@ -9,6 +9,7 @@ from scipy.optimize import brentq
 from mosa.analysis import anisotropy
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.modules.adapter import Adapter, StressAdapter
+from mosa.modules.hyperelastic import HyperelasticAdapter
 from mosa.modules.material import material_states
 from mosa.modules.microplane import MANDEL
 from mosa.physics.asking import AdapterOperator
@@ -243,3 +244,10 @@ def test_directions():
 def test_an_adapter_that_was_never_on_is_refused(states):
     with pytest.raises(ConfigError, match="switch_on"):
         anisotropy.directional_modulus(states, StressAdapter(), DIRECTIONS[:1])
+
+
+def test_an_adapter_that_is_a_stiffness_is_refused():
+    adapter = HyperelasticAdapter()
+    adapter.switch_on(1e5, 0.3)
+    with pytest.raises(ConfigError, match=r"analysis\.stiffness"):
+        anisotropy.response_of(material_states("neo_hookean", {"mu": 1.0, "lam": 1.0}), adapter)

@@ -79,17 +79,3 @@ def test_the_sample_is_spread_evenly(particles):
     assert len(chosen) == min(particles, residuals.SAMPLES) and chosen[0] == 0 and chosen[-1] < particles
     gaps = chosen.diff()
     assert len(chosen) == 1 or (gaps.min() >= 1 and gaps.max() - gaps.min() <= 1)
-
-
-def test_independent_data_of_known_fields():
-    """A pattern that all particles share in every frame is one datum; m orthogonal patterns in space, each with a course in time of
-    its own, all of one power, are m * m/T; white noise is as much as is allowed."""
-    T, n, m = 8, 300, 8
-    assert residuals.independent(torch.ones(T, n, 3).double()) == pytest.approx(1.0)
-    in_time = torch.linalg.qr(torch.randn(T, T, generator=torch.Generator().manual_seed(3), dtype=torch.float64)).Q
-    in_space = torch.linalg.qr(torch.randn(n, m, generator=torch.Generator().manual_seed(4), dtype=torch.float64)).Q
-    field = torch.zeros(T, n, 3).double()
-    field[:, :, 0] = in_time @ in_space.T  # rows of equal length: every frame has the same power
-    assert residuals.independent(field) == pytest.approx(m * m / T, rel=1e-9)
-    white = torch.randn(200, n, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    assert residuals.independent(white) == 30.0 and residuals.independent(white, largest=1e9) > 100
