@@ -31,8 +31,8 @@ POISSON_STEPS = (0.2, 0.32, 0.42)
 NOISE_ITERATIONS = 3
 """Iterations in which the noise is found again; later its scale stays, so that costs can be compared."""
 STIFFNESS_LIMITS = (0.5, 5.0)
-"""Of the factor that the evidence finds for the stiffness modes. A first step with a small posterior would else close them for good:
-on chick1 the held-out error was then 0.93 of the prior's in place of 0.79."""
+"""Of the factor that the evidence finds for the stiffness modes. A first step with a small posterior would else close them for
+good: on chick1 the held-out error was then 0.93 of the prior's in place of 0.79."""
 MOST_THREADS = 8
 ROUNDED = 8
 """Substeps are held fixed within an iteration, at a multiple of this above what the time step bound asks for at its start."""
