@@ -102,7 +102,7 @@ def response_of(states: States, adapter: Adapter | None) -> Callable[[Tensor], T
 
     Errors: ConfigError for the default adapter, whose operator is a stiffness."""
     if getattr(adapter, "strain", None) is not None:
-        raise ConfigError("anisotropy: expected an adapter whose operator acts on the prior's stress; a stiffness has its moduli in "
+        raise ConfigError("anisotropy: expected an adapter whose operator acts on the prior's stress; a stiffness has its in "
                           "mosa.analysis.stiffness")
     adapter = None if adapter is None else in_double(adapter)
 

@@ -123,13 +123,13 @@ class GaussNewton:
         steps, highest = self._vector(lambda b: b.step), self._vector(lambda b: b.bounds[1])
         steps = torch.where(numbers + steps > highest, -steps, steps)
         J = torch.empty(len(numbers), len(r), dtype=r.dtype, device=r.device)
-        left, lock = iter(range(len(numbers))), threading.Lock()
+        left, lock, over = iter(range(len(numbers))), threading.Lock(), threading.Event()
 
         def work(seat: Seat) -> None:
             while True:
                 with lock:
                     i = next(left, None)
-                if i is None:
+                if i is None or over.is_set():
                     return
                 moved = numbers.clone()
                 moved[i] += steps[i]
@@ -144,8 +144,11 @@ class GaussNewton:
                 work(self.seats[0])
             else:
                 with ThreadPoolExecutor(len(self.seats)) as pool:
-                    for future in [pool.submit(work, seat) for seat in self.seats]:
-                        future.result()
+                    try:
+                        for future in [pool.submit(work, seat) for seat in self.seats]:
+                            future.result()
+                    finally:  # after an error or Ctrl-C the others end with the column they are at
+                        over.set()
         finally:
             for seat in self.seats:
                 seat.write(numbers)
