@@ -19,7 +19,7 @@ class StiffnessModes(nn.Module):
     Errors: ConfigError naming the key.
     """
 
-    def __init__(self, low: Tensor, high: Tensor, amplitude: float = 0.2, wavelength: float = 0.33, most: int = 80) -> None:
+    def __init__(self, low: Tensor, high: Tensor, amplitude: float = 0.2, wavelength: float = 0.33, most: int = 50) -> None:
         super().__init__()
         if not 0 < amplitude < 1:
             raise ConfigError(f"heterogeneity.amplitude: expected a number between 0 and 1, found {amplitude}")
