@@ -17,7 +17,7 @@ from mosa.modules.identification import read_numbers, write_numbers
 from mosa.progress import tqdm
 
 DRAWS = 16
-INFLATION = 1.5
+INFLATION = 1.75
 """Factor of the draws' standard deviation. Frames of a motion are less independent than the likelihood takes them to be; chosen
 on the
 held-out drops of rabbit, chick1, mandarin and peanut, so that 80 to 99 % of the errors lie within two standard deviations."""
