@@ -1,4 +1,4 @@
-"""Time of one step of each stage of the fit, by part, and beside another version of the program in one run.
+"""Time of one step of Adam in each stage of the fit, by part, and beside another version of the program in one run.
 
     OMP_NUM_THREADS=1 python benchmarks/fit.py [--device cpu|cuda] [--repeats 5] [KEY=VALUE ...]
     OMP_NUM_THREADS=1 python benchmarks/fit.py --against COMMIT [--rounds 2] [KEY=VALUE ...]

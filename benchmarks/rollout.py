@@ -6,10 +6,11 @@
     python benchmarks/rollout.py --check           a small CPU run against benchmarks/rollout_ratios.json; --store rewrites it
 
 A block of corotated material falls for `--frames` intervals of `--substeps` (five on CUDA, one on a CPU where not given): what a
-rollout costs once, whatever its length, is spread over all of them. Variants: `none`; `constant`, the default adapter (one operator
-for the whole body); `stride1`, `mosa`: the paper's networks asked at every substep, at the default stride. Forward is timed without
-a graph; forward + backward gives gradients with respect to modulus, velocity and all weights, the networks' activations recomputed
-(`--store-activations` keeps them). Milliseconds per substep: median (least to most) of the repeats, wall time between
+rollout costs once, whatever its length, is spread over all of them. Variants: `none`; `operator`, the default adapter (a stiffness
+added to the energy of the whole body); `constant`, adapter=linear (one operator on the stress of the whole body); `stride1`,
+`mosa`: the paper's networks asked at every substep, at the default stride. Forward is timed without a graph; forward + backward
+gives gradients with respect to modulus, velocity and all weights, the networks' activations recomputed (`--store-activations` keeps
+them). Milliseconds per substep: median (least to most) of the repeats, wall time between
 synchronisations on CUDA, CPU time on one thread elsewhere. Memory: most that torch and Warp held at once on CUDA, most that the
 process held beyond its start on a CPU. The first runs compile kernels and capture graphs; they are not counted.
 
@@ -40,10 +41,10 @@ from pathlib import Path
 
 import torch
 import warp as wp
-from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from substep import body
 
+from mosa.config import build_adapter
 from mosa.modules.body import SimulationSettings
 from mosa.physics import workspace
 from mosa.physics.rollout import Simulator
@@ -55,7 +56,8 @@ ALLOWED = 1.25
 """Factor by which a ratio may exceed the stored one."""
 DX, DT, DENSITY, MU, LAM = 1 / 32, 1e-4, 1000.0, 4e4, 6e4
 STRIDE = SimulationSettings.stride
-VARIANTS = {"none": (None, 1), "constant": ("operator", None), "stride1": ("mosa", 1), "mosa": ("mosa", STRIDE)}
+VARIANTS = {"none": (None, 1), "operator": ("operator", None), "constant": ("linear", None), "stride1": ("mosa", 1),
+            "mosa": ("mosa", STRIDE)}
 """Name: (file of conf/adapter, substeps between evaluations, None for one evaluation in all)."""
 ORDERS = ("lattice", "cell", "shuffled")
 """Of the particles in memory: as a filling makes them, by the cell they lie in, by chance."""
@@ -69,7 +71,7 @@ def adapter_of(name: str | None, device: str, settings: dict) -> torch.nn.Module
     config = OmegaConf.load(HERE.parent / "conf" / "adapter" / f"{name}.yaml")
     config = config.get("adapter", config)
     known = {key: value for key, value in settings.items() if name == "mosa" or key in config}
-    adapter = instantiate({**OmegaConf.to_container(config), **known})
+    adapter = build_adapter({**OmegaConf.to_container(config), **known})
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for p in adapter.parameters():

@@ -68,7 +68,8 @@ def test_an_unknown_key_is_refused_with_the_nearest(override, nearest):
 
 
 @pytest.mark.parametrize("key", ["seed", "scene", "adapter", "fit", "fit.views", "fit.prior", "world.colliders", "losses",
-                                 "trainer", "simulation.stride", "rendering.backend", "logger.enabled", "resume"])
+                                 "trainer", "simulation.stride", "rendering.backend", "identification.tolerance",
+                                 "logger", "resume"])
 def test_a_key_that_was_deleted_is_named(key):
     values = copy.deepcopy(composed())
     *above, last = key.split(".")

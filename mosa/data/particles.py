@@ -10,8 +10,8 @@ import torch
 from plyfile import PlyData, PlyParseError
 from torch import Tensor
 
-from mosa.data.ply import check_ply
 from mosa.errors import DataError
+from mosa.ply import check_ply
 
 
 def read_ply(path: Path) -> Tensor:

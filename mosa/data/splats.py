@@ -13,8 +13,8 @@ import torch
 from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
-from mosa.data.ply import check_ply
 from mosa.errors import DataError
+from mosa.ply import check_ply
 from mosa.rendering.covariance import scales_and_rotations
 from mosa.rendering.spherical_harmonics import DEGREES, constant_coefficients, degree_of, mean_colors
 from mosa.types import Splats

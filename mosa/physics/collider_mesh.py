@@ -161,7 +161,7 @@ def _read_obj(path: Path) -> tuple[np.ndarray, list]:
 def _read_ply(path: Path) -> tuple[np.ndarray, list]:
     from plyfile import PlyData
 
-    from mosa.data.ply import check_ply
+    from mosa.ply import check_ply
 
     check_ply(path)
     data = PlyData.read(str(path))

@@ -19,18 +19,21 @@ from mosa.rendering.cameras import crop_cameras, crop_images, rays
 from .conftest import WORLD, block_scene
 
 
-def ball_scene(center=(0.1, 0.3, 0.0), size=48, radius=0.15, samples=4, **camera):
-    """A grey ball seen by six cameras; mattes are coverages of samples x samples points a pixel."""
+def ball_scene(center=(0.1, 0.3, 0.0), size=48, radius=0.15, samples=4, frames=3, **camera):
+    """A grey ball seen by six cameras as it falls from rest; mattes are coverages of samples x samples points a pixel."""
     from mosa.data.builtin.renderer import ring_of_cameras
 
-    scene = block_scene(6, 3)
+    scene = block_scene(6, frames)
     options = {"target": (0, 0.3, 0), "distance": 1.5, "elevations": (0.2, 0.6), "field": 0.6, "turn": 0.4}
     fine = ring_of_cameras(6, size * samples, **(options | camera))
     origins, directions = rays(fine)
-    arm = torch.tensor(center) - origins[:, None, None]
-    hit = ((arm - (arm * directions).sum(-1, keepdim=True) * directions).norm(dim=-1) < radius).float()
-    mattes = torch.nn.functional.avg_pool2d(hit, samples)[:, None].expand(-1, 3, -1, -1)
-    return replace(scene, cameras=ring_of_cameras(6, size, **(options | camera)), mattes=mattes, times=scene.times[:3],
+    centers = torch.tensor(center) + 0.5 * scene.gravity * scene.times[:, None] ** 2
+    hits = []
+    for place in centers:
+        arm = place - origins[:, None, None]
+        hits.append((arm - (arm * directions).sum(-1, keepdim=True) * directions).norm(dim=-1) < radius)
+    mattes = torch.nn.functional.avg_pool2d(torch.stack(hits, 1).float(), samples)
+    return replace(scene, cameras=ring_of_cameras(6, size, **(options | camera)), mattes=mattes,
                    images=1 - 0.5 * mattes[..., None].expand(-1, -1, -1, -1, 3))
 
 
@@ -64,12 +67,12 @@ def mixed(folder, layout, whole, other, cameras):
     return load_scene(format=layout, path=str(folder), **WORLD)
 
 
-def hull(scene):
-    return visual_hull(scene.mattes[:, 0], scene.cameras, torch.tensor([[-0.3, 0.0, -0.3], [0.5, 0.6, 0.4]]), pitch=0.02)
+def hull(scene, frame=0):
+    return visual_hull(scene.mattes[:, frame], scene.cameras, torch.tensor([[-0.3, 0.0, -0.3], [0.5, 0.6, 0.4]]), pitch=0.02)
 
 
-def same_hull(found, expected):
-    a, b = hull(found), hull(expected)
+def same_hull(found, expected, frame=0):
+    a, b = hull(found, frame), hull(expected, frame)
     return a.values.shape == b.values.shape and float((a.values - b.values).abs().max()) < 0.01  # mattes are kept in 8 bits
 
 
@@ -101,19 +104,19 @@ def test_finer_images_are_reduced(tmp_path, caplog):
 
 
 def test_an_object_that_is_cut_stays_cut(tmp_path):
-    """The ball runs over the lower border of cameras 1 and 4, about which their narrower images say nothing: the hull keeps it."""
-    ball = ball_scene(center=(0.0, 0.3, 0.0), radius=0.25)
-    last = int((ball.mattes[:, 0] > 0.5).any(2).nonzero()[:, 1].amax())
+    """The ball falls over the lower border of all cameras, below which the narrower ones say nothing: the hull keeps it."""
+    ball = ball_scene(center=(0.0, 0.38, 0.0), radius=0.2, frames=5, samples=5)  # no coverage is a half, which 8 bits would move
+    last = int((ball.mattes[:, 4] > 0.5).any(2).nonzero()[:, 1].amax())
     whole = cut(ball, bottom=ball.cameras.height - last + 3)
-    assert all(bool((whole.mattes[v, 0, -1] > 0.5).any()) for v in range(6))
+    assert all(bool((whole.mattes[v, 4, -1] > 0.5).any()) for v in range(6))
     scene = mixed(tmp_path, "transforms", whole, cut(whole, top=6), (1, 4))
-    assert scene.cameras.height == whole.cameras.height and same_hull(scene, whole)
-    assert lines_of_sight(scene, 0)[0] == lines_of_sight(whole, 0)[0] == []
+    assert scene.cameras.height == whole.cameras.height and same_hull(scene, whole) and same_hull(scene, whole, 4)
+    assert lines_of_sight(scene, 4)[0] == lines_of_sight(whole, 4)[0] == []
     # put into the middle instead, an empty matte below the border would say that nothing is there
     middle = torch.cat([whole.mattes[:, :, 3:], torch.zeros_like(whole.mattes[:, :, :3])], 2)
     K = whole.cameras.K.clone()
     K[:, 1, 2] -= 3
-    assert not same_hull(replace(whole, mattes=middle, cameras=replace(whole.cameras, K=K)), whole)
+    assert not same_hull(replace(whole, mattes=middle, cameras=replace(whole.cameras, K=K)), whole, 4)
 
 
 def test_a_camera_that_says_nothing_on_both_sides_is_refused(tmp_path):

@@ -16,7 +16,7 @@ def benchmark(monkeypatch):
 
 
 def test_every_part_of_every_stage_is_timed(benchmark, cache, capsys):
-    figures, about = benchmark.measure(["scene=tiny", "prior=corotated", "fit=tiny", f"scene.cache={cache}"], "cpu", 2)
+    figures, about = benchmark.measure(["debug=default", "prior=corotated", f"scene.cache={cache}"], "cpu", 2)
     assert list(figures) == ["prior", "prior_eta", "joint"] and "1 views" in about
     for parts in figures.values():
         assert list(parts) == list(benchmark.PARTS) and all(len(each) == 2 and min(each) > 0 for each in parts.values())

@@ -55,6 +55,16 @@ def run(tmp_path_factory, cache):
     return folder
 
 
+@pytest.fixture(scope="module")
+def stepped(tmp_path_factory, cache):
+    """A run of Adam in all stages, with steps of two cells of the contact offset."""
+    folder = tmp_path_factory.mktemp("stepped")
+    adam = [f"+fit.{stage}.optimizer=adam" for stage in ("prior", "prior_eta", "joint")]
+    result = call("train.py", folder, cache, *adam, "fit.prior.lr_contact=2", "logger=[tensorboard,csv]", "evaluation.video=false")
+    assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
+    return folder
+
+
 def test_a_run_leaves_its_outputs(run):
     figures = json.loads((run / "metrics.json").read_text(), parse_constant=pytest.fail)  # strict JSON
     for key in ("train/rms_m", "prior/test/rms_m", "prior_eta/test/rms_m", "test/rms_m", "floor/test/rms_m", "test/psnr_crop",
@@ -90,22 +100,42 @@ def test_progress_in_a_file_is_lines(run):
     assert screen.count("fit joint:   0% 0/2") == screen.count("fit joint: 100% 2/2") == 1
 
 
-def test_rates_times_and_pictures_are_logged(run):
-    events = EventAccumulator(str(run / "tensorboard"))
+def events_of(folder: Path) -> EventAccumulator:
+    events = EventAccumulator(str(folder / "tensorboard"))
     events.Reload()
+    return events
+
+
+def table_of(folder: Path) -> list[dict[str, str]]:
+    """Rows of the table of the run, all of whose columns docs/figures.md describes."""
+    with open(folder / "csv" / "version_0" / "metrics.csv") as file:
+        rows = list(csv.DictReader(file))
+    for tag in (t for t in rows[0] if t not in ("epoch", "step")):
+        group = tag.rpartition("/")[0]
+        assert f"`{tag}`" in FIGURES or f"`{group}/<" in FIGURES, f"docs/figures.md does not describe {tag}"
+    return rows
+
+
+def test_steps_times_and_pictures_are_logged(run):
+    events, rows = events_of(run), table_of(run)
+    seconds = [event.value for event in events.Scalars("time/step_s")]
+    assert len(seconds) == 5 and all(0 < s < 400 for s in seconds)
+    shares = [event.value for event in events.Scalars("newton/share")]
+    assert len(shares) == 5 and all(0 <= s <= 1 for s in shares) and max(shares) > 0
+    assert [float(row["newton/share"]) for row in rows] == pytest.approx(shares)
+    assert not any(tag.startswith("lr/") for tag in events.Tags()["scalars"])  # no optimiser of torch has stepped
+    pictures = events.Images("real_above_rendered_below")
+    assert [p.step for p in pictures] == [2, 4] and all(p.height >= 320 for p in pictures)
+
+
+def test_rates_of_adam_are_logged(stepped):
+    events, rows = events_of(stepped), table_of(stepped)
     seconds = [event.value for event in events.Scalars("time/step_s")]
     assert len(seconds) == 5 and all(0 < s < 400 for s in seconds)
     rates = [event.value for event in events.Scalars("lr/material")]  # conf/fit/tiny.yaml with the decay of mosa/modules/stages.py
     assert rates == pytest.approx([0.1, 0.1, 0.02, 0.01, 0.01])
     assert [event.value for event in events.Scalars("lr/adapter")] == pytest.approx([2e-3, 2e-3])
-    pictures = events.Images("real_above_rendered_below")
-    assert [p.step for p in pictures] == [2, 4] and all(p.height >= 320 for p in pictures)
-    with open(run / "csv" / "version_0" / "metrics.csv") as file:
-        rows = list(csv.DictReader(file))
     assert [float(row["lr/material"]) for row in rows] == pytest.approx(rates)
-    for tag in (t for t in rows[0] if t not in ("epoch", "step")):
-        group = tag.split("/")[0]
-        assert f"`{tag}`" in FIGURES or f"`{group}/<" in FIGURES, f"docs/figures.md does not describe {tag}"
 
 
 def test_a_module_comes_back_from_its_checkpoint_and_is_tested(run):
@@ -156,12 +186,9 @@ def test_the_twin_simulates_from_a_new_start(run, cache, tmp_path):
     assert (tmp_path / "simulation.mp4").stat().st_size > 1000
 
 
-def test_the_contact_offset_stays_where_a_grid_can_put_it(cache, tmp_path):
+def test_the_contact_offset_stays_where_a_grid_can_put_it(stepped):
     """Steps of two cells: without the limits it would end far outside."""
-    result = call("train.py", tmp_path, cache, "fit.prior.lr_contact=2", "adapter=none", "heterogeneity.enabled=false",
-                  "evaluation.video=false")
-    assert result.returncode == 0, result.stderr[-3000:]
-    figures = json.loads((tmp_path / "metrics.json").read_text())
+    figures = json.loads((stepped / "metrics.json").read_text())
     assert min(abs(figures["id/contact_offset_m"] / figures["dx_m"] - limit) for limit in ContactOffset.LIMITS) < 1e-5
 
 

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_a_step_descends_the_mean_over_the_sequences(cache):
-    _, _, module = assembled(cache, taught=["test_60"])
+    _, _, module = assembled(cache, "+fit.prior.optimizer=adam", taught=["test_60"])
     assert len(module.takes) == 2
     parameters = list(module.body.material.parameters())
     stage, views = module.stages[0], [0, 1]

@@ -81,6 +81,20 @@ def test_a_contact_offset_is_found_with_them():
     assert values(body)["E"] == pytest.approx(E, rel=0.02) and values(body)["nu"] == pytest.approx(NU, abs=0.01)
 
 
+def test_what_two_sequences_say_adds_up():
+    """Minus the logarithm of the likelihood, and the precision of the numbers that it brings, are sums over the sequences."""
+    truth = small_body(adapter=False)
+    takes = [take_and_turn(truth, 0.5), take_and_turn(truth, 1.6, (1.0, 0.0, 0.2))]
+    costs, precisions = [], []
+    for some in (takes[:1], takes[1:], takes):
+        found = identification(small_body(adapter=False, E=2e4, nu=0.3), some, "prior")
+        costs.append(found.iterate()["before"])  # the first iteration begins at the prior's mean, which costs nothing
+        precisions.append(found.newton.data)
+    assert costs[2] == pytest.approx(costs[0] + costs[1], rel=1e-9) and min(costs) > 0
+    assert torch.allclose(precisions[2], precisions[0] + precisions[1], rtol=1e-9, atol=0)
+    assert not torch.allclose(precisions[0], precisions[1], rtol=1e-2, atol=0)
+
+
 @pytest.mark.parametrize("criterion", ["free", "corrected"])
 def test_the_stiff_direction_of_a_body_is_found_from_its_drops(criterion):
     """It starts as the isotropic prior with the right E and nu; two drops on different sides."""
