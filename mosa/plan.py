@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from mosa.errors import ConfigError, SimulationDiverged
-from mosa.modules.identification import read_numbers, write_numbers
+from mosa.modules.identification import each_law
 from mosa.progress import tqdm
 from mosa.twin import Twin
 
@@ -71,21 +71,17 @@ def plan(twin: Twin, *, count: int = 8, draws: int = 16, frames: int = 15, seed:
     lowest = float((twin.body.rest.cpu() @ up).min())
     height = max(0.02, lowest - (ground.height if ground is not None else 0.0))
     numbers = twin.posterior.draws(draws, torch.Generator().manual_seed(seed))
-    kept, ranked = read_numbers(twin.body), []
-    try:
-        for rotation in tqdm(drawn_starts(count, seed), "candidate drops"):
-            motions = []
-            for drawn in numbers:
-                write_numbers(twin.body, drawn)
-                try:
-                    motions.append(twin.simulate(rotation=rotation, height=height, velocity=speed, frames=frames).x.cpu())
-                except SimulationDiverged:
-                    continue
-            if len(motions) >= LEAST_DRAWS:
-                gain = information(torch.stack(motions), max(twin.posterior.model_error, 1e-3))
-                ranked.append(Candidate(rotation, height, speed, gain))
-    finally:
-        write_numbers(twin.body, kept)
+    ranked = []
+    for rotation in tqdm(drawn_starts(count, seed), "candidate drops"):
+        motions = []
+        for _ in each_law(twin.body, numbers):
+            try:
+                motions.append(twin.simulate(rotation=rotation, height=height, velocity=speed, frames=frames).x.cpu())
+            except SimulationDiverged:
+                continue
+        if len(motions) >= LEAST_DRAWS:
+            gain = information(torch.stack(motions), max(twin.posterior.model_error, 1e-3))
+            ranked.append(Candidate(rotation, height, speed, gain))
     if not ranked:
         raise ConfigError("plan: none of the candidate starts can be simulated: the body leaves the box of the scene")
     return sorted(ranked, key=lambda each: -each.gain)

@@ -13,7 +13,7 @@ from mosa.evaluation import Sequence, true_motion
 from mosa.modules.body import Body, World
 from mosa.modules.gauss_newton import Posterior
 from mosa.modules.hyperelastic import HyperelasticAdapter
-from mosa.modules.identification import read_numbers, write_numbers
+from mosa.modules.identification import each_law
 from mosa.progress import tqdm
 
 DRAWS = 16
@@ -37,19 +37,15 @@ def predicted_spread(
     posterior/<prefix>/coverage: the share of the particles' errors within two standard deviations.
     """
     generator = torch.Generator().manual_seed(seed)
-    kept, found = read_numbers(body), {s.prefix: [] for s in sequences}
+    found: dict[str, list[Tensor]] = {s.prefix: [] for s in sequences}
     base = {s.prefix: _positions(body, s, world) for s in sequences}
-    try:
-        for numbers in tqdm(posterior.draws(draws, generator), "draws of the posterior", leave=False):
-            write_numbers(body, numbers)
-            try:
-                rollouts = {s.prefix: _positions(body, s, world) for s in sequences}
-            except MosaError:
-                continue
-            for prefix, x in rollouts.items():
-                found[prefix].append(x)
-    finally:
-        write_numbers(body, kept)
+    for _ in tqdm(each_law(body, posterior.draws(draws, generator)), "draws of the posterior", total=draws, leave=False):
+        try:
+            rollouts = {s.prefix: _positions(body, s, world) for s in sequences}
+        except MosaError:
+            continue
+        for prefix, x in rollouts.items():
+            found[prefix].append(x)
     figures: dict[str, float] = {"posterior/draws": float(len(found[sequences[0].prefix])), "posterior/model_error_m":
                                  posterior.model_error}
     spreads: dict[str, Tensor] = {}
@@ -98,18 +94,14 @@ def determined(body: Body, posterior: Posterior, *, draws: int = 400, seed: int 
             figures[f"posterior/{name}_numbers"] = float(len(index))
             figures[f"posterior/{name}_determined"] = float(posterior.determined[index].sum())
     if isinstance(body.adapter, HyperelasticAdapter) and body.adapter.is_on:
-        kept, generator = read_numbers(body), torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(seed)
         axis, _ = stiffest(body.adapter.stiffness().cpu())
         stiffnesses = []
-        try:
-            # wider draws than the likelihood's own, as predictions have them
-            for numbers in posterior.mean + INFLATION * (posterior.draws(draws, generator) - posterior.mean):
-                write_numbers(body, numbers)
-                body.adapter.follow(body.material.poisson())
-                stiffnesses.append(body.adapter.stiffness().cpu())
-        finally:
-            write_numbers(body, kept)
+        # wider draws than the likelihood's own, as predictions have them
+        for _ in each_law(body, posterior.mean + INFLATION * (posterior.draws(draws, generator) - posterior.mean)):
             body.adapter.follow(body.material.poisson())
+            stiffnesses.append(body.adapter.stiffness().cpu())
+        body.adapter.follow(body.material.poisson())
         axes, ratios = stiffest(torch.stack(stiffnesses))
         figures["posterior/stiffest_cone_deg"] = cone(axis, axes)
         figures["posterior/stiffness_ratio_sd"] = float(ratios.std())

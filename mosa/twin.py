@@ -25,7 +25,7 @@ from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
 from mosa.limits import machine_memory
 from mosa.modules.body import VARIANTS, Body, Start, World
 from mosa.modules.gauss_newton import Posterior
-from mosa.modules.identification import read_numbers, write_numbers
+from mosa.modules.identification import each_law, read_numbers
 from mosa.modules.observer import deformed_covariances, observe
 from mosa.npz import write_npz
 from mosa.physics.collider_overlap import check_clear
@@ -73,16 +73,12 @@ class Twin:
         """
         if self.posterior is None:
             raise ConfigError("predict: this run kept no posterior; a fit by Gauss-Newton does (fit.joint.optimizer=auto)")
-        rollout, found, kept = self.simulate(**start), [], read_numbers(self.body)
-        try:
-            for numbers in self.posterior.draws(draws, torch.Generator().manual_seed(seed)):
-                write_numbers(self.body, numbers)
-                try:
-                    found.append(self.simulate(**start).x)
-                except SimulationDiverged:
-                    continue
-        finally:
-            write_numbers(self.body, kept)
+        rollout, found = self.simulate(**start), []
+        for _ in each_law(self.body, self.posterior.draws(draws, torch.Generator().manual_seed(seed))):
+            try:
+                found.append(self.simulate(**start).x)
+            except SimulationDiverged:
+                continue
         if len(found) < 2:
             raise ConfigError(f"predict: expected at least two of {draws} draws of the law that can be simulated from this start, "
                               f"found {len(found)}")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -110,6 +110,17 @@ def write_numbers(body: Body, numbers: Tensor) -> None:
 def read_numbers(body: Body) -> Tensor:
     """What `write_numbers` sets, (D,)."""
     return Seat(tensors_of(body, adapter=_learned(body.adapter), heterogeneity=_learned(body.heterogeneity)), torch.empty).read()
+
+
+def each_law(body: Body, numbers: Tensor) -> Iterator[Tensor]:
+    """Goes through laws (D, numbers): at each turn `body` is that law; afterwards, whatever happens, what it was before."""
+    kept = read_numbers(body)
+    try:
+        for law in numbers:
+            write_numbers(body, law)
+            yield law
+    finally:
+        write_numbers(body, kept)
 
 
 def _learned(module) -> bool:

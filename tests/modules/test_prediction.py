@@ -1,0 +1,75 @@
+"""Draws of a posterior in use: what they predict, what a drop would tell, and that the body is afterwards what it was."""
+
+import math
+
+import pytest
+import torch
+from small_bodies import WORLD, small_body, start
+
+from mosa.errors import ConfigError
+from mosa.modules.gauss_newton import Posterior
+from mosa.modules.identification import each_law, read_numbers
+from mosa.plan import drawn_starts, information, plan
+from mosa.prediction import INFLATION, total_spread
+from mosa.twin import Twin
+
+
+def posterior_of(body, sd: float, model_error: float = 0.004) -> Posterior:
+    mean = read_numbers(body)
+    names, one = [f"n{i}" for i in range(len(mean))], torch.ones(len(mean)).double()
+    return Posterior(names, mean, sd**2 * torch.diag(one), one, model_error)
+
+
+def twin_of(sd: float) -> Twin:
+    body = small_body(numbers=0.1 * torch.ones(19))
+    return Twin(body, WORLD, 0.01, {}, start(height=0.05, speed=-1.0), posterior_of(body, sd))
+
+
+def test_the_body_is_what_it_was_also_after_an_error():
+    body = small_body(numbers=0.1 * torch.ones(19))
+    before = read_numbers(body)
+    laws = before + torch.arange(1, 4).double()[:, None] * 1e-2
+    seen = [read_numbers(body) for _ in each_law(body, laws)]
+    assert torch.allclose(torch.stack(seen), laws, atol=1e-6) and torch.equal(read_numbers(body), before)
+    with pytest.raises(RuntimeError, match="half way"):
+        for i, _ in enumerate(each_law(body, laws)):
+            if i == 1:
+                raise RuntimeError("half way")
+    assert torch.equal(read_numbers(body), before)
+
+
+def test_spread_of_known_draws():
+    """Two draws 2 a apart along x have a variance of 2 a^2; what the model gets wrong is added."""
+    a, wrong = 0.003, 0.004
+    drawn = torch.zeros(2, 1, 1, 3)
+    drawn[0, ..., 0], drawn[1, ..., 0] = -a, a
+    assert float(total_spread(drawn, wrong)) == pytest.approx(math.hypot(INFLATION * a * 2**0.5, wrong), rel=1e-6)
+
+
+def test_a_sure_law_is_off_by_the_models_error_alone_and_an_unsure_one_by_more():
+    sure, unsure = (twin_of(sd) for sd in (1e-7, 0.05))
+    rollout, sd = sure.predict(draws=4, frames=6)
+    assert sd.shape == rollout.x.shape[:2] and float((sd - 0.004).abs().max()) < 1e-5
+    before = read_numbers(unsure.body)
+    _, wider = unsure.predict(draws=4, frames=6)
+    assert float(wider[-1].mean()) > 0.0041 and torch.equal(read_numbers(unsure.body), before)
+    with pytest.raises(ConfigError, match="no posterior"):
+        Twin(sure.body, WORLD, 0.01, {}, start(height=0.05, speed=-1.0)).predict(frames=3)
+
+
+def test_information_of_known_draws():
+    """One direction of variance k in units of the noise tells 1/2 log(1 + k); equal motions tell nothing."""
+    moved = torch.zeros(2, 1, 10, 3)
+    moved[0, ..., 1], moved[1, ..., 1] = -1e-3, 1e-3
+    k = 10 * 3 * (2e-3 / 2) ** 2 * 2 / 2e-3**2  # particles, components of the noise, two draws
+    assert information(moved, 2e-3) == pytest.approx(0.5 * math.log1p(k), rel=1e-6)
+    assert information(torch.ones(5, 2, 10, 3), 2e-3) == 0.0
+
+
+def test_candidates_begin_with_the_rest_pose_and_the_most_telling_is_first():
+    found = drawn_starts(6, seed=3)
+    assert found[0] == (0.0, 1.0, 0.0, 0.0) and found == drawn_starts(6, seed=3)
+    assert all(math.hypot(*each[:3]) == pytest.approx(1) and 0 <= each[3] <= 180 for each in found)
+    ranked = plan(twin_of(0.05), count=3, draws=4, frames=5)
+    assert len(ranked) == 3 and [r.gain for r in ranked] == sorted((r.gain for r in ranked), reverse=True)
+    assert ranked[-1].gain > 0 and plan(twin_of(1e-7), count=2, draws=4, frames=5)[0].gain < 1e-3
