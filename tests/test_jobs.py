@@ -79,6 +79,7 @@ def test_a_long_name_is_cut_and_stays_its_own():
 PROGRAM = """
     import os, signal, sys
     from mosa.jobs import attempt
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell that put pytest into the background had it ignored
     def job(cfg):
         os.kill(os.getpid(), signal.SIG{name})
     attempt(job, None)
