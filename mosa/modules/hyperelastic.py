@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from mosa.errors import ConfigError
 from mosa.modules.adapter import Adapter, OperatorStatistics
-from mosa.modules.microplane import isotropic_stiffness
+from mosa.modules.microplane import MANDEL, isotropic_stiffness
 from mosa.modules.stiffening import ADAPTER_MARGIN, acoustic_stiffening
 from mosa.physics.asking import AdapterOperator, MaterialState
 from mosa.physics.strain import STRAINS
@@ -58,7 +58,8 @@ def root_stiffness(poisson: Tensor) -> Tensor:
 class HyperelasticAdapter(Adapter):
     """A constant anisotropic stiffness with an energy. `numbers`: (19,) coordinates of A in `anisotropic_basis`, 0 at the prior.
 
-    strain: hencky | biot | green, the measure E. Errors: ConfigError for an unknown one; `switch_on` refuses fluids.
+    strain: hencky | biot | green, the measure E. Errors: ConfigError for an unknown one. Fluids have no shear modulus that it could
+    be a multiple of: `mosa.config.fitting` leaves it out there.
     """
 
     def __init__(self, *, strain: str = "green") -> None:
@@ -81,8 +82,7 @@ class HyperelasticAdapter(Adapter):
 
         The smallest eigenvalue of exp(A), smoothed: what is then added, C0 + S - beta C0, is positive but for 3 %, so that no
         direction loses its stiffness where the strain measure grows faster than the prior (Green's in tension)."""
-        A = torch.einsum("k,kij->ij", self.numbers.double(), anisotropic_basis(torch.float64, self.numbers.device))
-        values = torch.linalg.eigvalsh(A)
+        values = torch.linalg.eigvalsh(self._matrix())
         return torch.exp((math.log(len(values)) - torch.logsumexp(-SHARPNESS * values, 0)) / SHARPNESS)
 
     def follow(self, poisson: Tensor) -> None:
@@ -92,10 +92,13 @@ class HyperelasticAdapter(Adapter):
     def _poisson(self) -> Tensor:
         return self.poisson if self._live is None else self._live.to(self.numbers.device)
 
+    def _matrix(self) -> Tensor:
+        """A (6, 6) float64."""
+        return torch.einsum("k,kij->ij", self.numbers.double(), anisotropic_basis(torch.float64, self.numbers.device))
+
     def _exponential(self) -> Tensor:
         """exp(A) (6, 6) float64."""
-        A = torch.einsum("k,kij->ij", self.numbers.double(), anisotropic_basis(torch.float64, self.numbers.device))
-        return torch.linalg.matrix_exp(A)
+        return torch.linalg.matrix_exp(self._matrix())
 
     def stiffness(self) -> Tensor:
         """C0 + S (6, 6) float64 in Mandel scaling and units of 2 mu, with its graph; positive definite."""
@@ -123,7 +126,7 @@ class HyperelasticAdapter(Adapter):
         `correction`."""
         poisson = self._poisson().double() if poisson is None else poisson
         C0 = isotropic_stiffness(poisson)
-        scale = torch.tensor([1.0, 1, 1, 2**0.5, 2**0.5, 2**0.5], dtype=torch.float64, device=C0.device)
+        scale = torch.tensor(MANDEL, dtype=torch.float64, device=C0.device)
         return (self.correction(poisson) @ torch.linalg.inv(C0)) * scale / scale[:, None]
 
     def forward(self, state: MaterialState) -> AdapterOperator:

@@ -77,8 +77,6 @@ class LitMosa(Restorable, L.LightningModule):
         self.saved_identification: dict | None = None  # its state in the checkpoint that the fit goes on from
         self.posterior: Posterior | None = None
         self.compared: dict[str, float] = {}  # mean distance [m] of the calibrated candidates for the backbone
-        self.column = lambda: None
-        """Called after each column of a Jacobian: these are what takes long."""
 
     # ---------------------------------------------------------------- state
     @property
@@ -191,8 +189,7 @@ class LitMosa(Restorable, L.LightningModule):
     def identifying(self, stage: Stage) -> Identification:
         """A stage's identification on the takes, from where the body stands."""
         kinds = tuple(self.weights.get(name, 0.0) != 0 for name in ("position", "rotation", "stretch"))
-        return Identification(self.body, self.takes, self.world, stage, self.criterion, self.settings, kinds,
-                              progress=lambda: self.column())
+        return Identification(self.body, self.takes, self.world, stage, self.criterion, self.settings, kinds)
 
     def settle_law(self) -> None:
         """What is written from now on is a run of the law that was chosen."""

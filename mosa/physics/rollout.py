@@ -48,8 +48,8 @@ class Simulator:
     chained: whether the evaluations of an adapter that is a torch module and the segments between them run as chains (chain.py);
     None: on CUDA, where a chain is one captured graph. Not with colliders or adaptive substeps, which are cut in segments.
     Gradients through a chain reach the adapter's parameters, not other tensors that it may use.
-    strain: hencky | biot | green: what adapters answer is a stiffness S in units of 2 mu, of the energy mu E : S : E that is
-    added to the prior's; None: an operator on the prior's stress.
+    strain: hencky | biot | green: what adapters answer is a stiffness G in units of 2 mu, of the energy mu E : G : E that is added
+    to 1 + h[0] times the prior's; None: an operator on the prior's stress.
     Errors: ConfigError naming the argument. Not safe for use by two threads: buffers are shared between rollouts.
     """
 
