@@ -45,7 +45,7 @@ from mosa.physics.memory import KEPT_ON_CPU
 from mosa.plan import plan, plan_text
 from mosa.prediction import determined, predicted_spread
 from mosa.progress import tqdm
-from mosa.reconstruction.resolution import ENOUGH, resolution
+from mosa.reconstruction.resolution import ENOUGH, grid_spacing, resolution
 from mosa.reconstruction.starts import first_contact, sequence_start, splats_of
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import use_backend
@@ -63,6 +63,10 @@ from mosa.twin import Twin, save_observed, save_rollout, save_spread, save_truth
 from mosa.types import MotionCues, Reconstruction, Scene
 
 log = logging.getLogger(__name__)
+
+
+MOST_PARTICLES = {"cpu": 6000, "cuda": 30000}
+"""Of simulation.particles=auto: what a machine identifies in the time that a user waits for a first result."""
 
 
 class Clock:
@@ -89,12 +93,15 @@ def reconstruct_scene(cfg: DictConfig, scene: Scene, device: str) -> tuple[Recon
     from mosa.reconstruction.settings import build_settings
 
     settings = build_settings(**plain(cfg.reconstruction))
-    dx = cfg.simulation.dx
-    spacing = dx / 2 if dx is not None else spacing_for(scene, cfg.simulation.particles, settings, cache_dir=cache_folder(cfg),
-                                                        device=device)
+    dx, particles, per_cell = cfg.simulation.dx, cfg.simulation.particles, cfg.simulation.particles_per_cell
+    if dx is not None:
+        spacing = dx / grid_spacing(1.0, per_cell)
+    else:
+        spacing = spacing_for(scene, None if particles == "auto" else particles, settings, per_cell=per_cell,
+                              most=MOST_PARTICLES["cpu" if device == "cpu" else "cuda"], cache_dir=cache_folder(cfg), device=device)
     reconstruction = reconstruct(scene, settings=settings, spacing=spacing, cache_dir=cache_folder(cfg), seed=cfg.seed,
                                  device=device)
-    return reconstruction, 2 * spacing
+    return reconstruction, grid_spacing(spacing, per_cell)
 
 
 def cache_folder(cfg: DictConfig) -> Path:
@@ -163,7 +170,7 @@ def train(cfg: DictConfig) -> float | None:
     log.info("body: %d particles, %.4g cm^3, grid spacing %.4g m", len(volume), 1e6 * float(volume.sum()), dx)
     config = run_config(plain(cfg), scene, dx)
     body = body_of(reconstruction, config).to(device)
-    resolved = resolution(body.rest, dx / 2)
+    resolved = resolution(body.rest, reconstruction.spacing, dx)
     if not resolved.enough:
         warnings.warn(f"simulation.particles: the thin parts of this body are {resolved.cells:.1f} cells across, fewer than "
                       f"{ENOUGH:g}: the grid stiffens them, and the law that is found makes up for it; about "

@@ -46,6 +46,10 @@ def or_null(kind: Kind) -> Kind:
     return Kind(f"{kind.described}, or null", lambda v: v is None or kind.fits(v))
 
 
+def or_auto(kind: Kind) -> Kind:
+    return Kind(f"{kind.described}, or auto", lambda v: v == "auto" or kind.fits(v))
+
+
 def is_sequence(value: Any) -> bool:
     """A sequence as scene.also_train and scene.test name it (mosa/data/sequences.py)."""
     return isinstance(value, str) or (isinstance(value, Mapping) and isinstance(value.get("path"), str))
@@ -93,6 +97,7 @@ TRAINING: dict[str, Kind] = {
     "criterion.name": one_of("free", "corrected", "both"),
     "criterion.gain": number(0, 1, above=True),
     "identification.count": POSITIVE,
+    "identification.grid_error": number(0, 10),
     "identification.model_error": number(0, 1),
     "identification.operator_sd": POSITIVE,
     "identification.stiffness_sd": POSITIVE,
@@ -115,7 +120,8 @@ TRAINING: dict[str, Kind] = {
     "adapter.hidden": whole(1, WIDEST),
     **{f"adapter.{name}": FLAG for name in ("rest_free", "plastic", "major_symmetry", "recompute", "no_C", "no_pre", "no_post",
                                             "no_prior_stress")},
-    "simulation.particles": whole(8, 10**8),
+    "simulation.particles": or_auto(whole(8, 10**8)),
+    "simulation.particles_per_cell": number(1, 64),
     "simulation.dx": or_null(POSITIVE),
     "simulation.courant": number(0, 1, above=True),  # beyond, an explicit step is unstable
     "simulation.adaptive": FLAG,

@@ -18,11 +18,15 @@ from torch import Tensor
 
 from mosa.errors import MosaError, SimulationDiverged
 
+EVIDENCE_PASSES = 20
+"""Of the fixed point for the sizes of the blocks: each costs one inverse of a matrix of all numbers."""
+
 
 @dataclass
 class Block:
     """Numbers of one kind. mean, sd: of their prior, (n,); step: of differences; bounds: they are held within; learned: whether
-    evidence finds the common factor of the sd, within `limits`."""
+    evidence finds the common factor of the sd, within `limits`; nuisance: they are no part of the model, and the posterior is
+    that of the others whatever these are."""
 
     name: str
     mean: Tensor
@@ -32,6 +36,7 @@ class Block:
     bounds: tuple[float, float] = (-math.inf, math.inf)
     limits: tuple[float, float] = (0.03, 5.0)
     factor: float = 1.0
+    nuisance: bool = False
 
     def __post_init__(self) -> None:
         self.mean, self.sd = (t.detach().double().cpu().flatten() for t in (self.mean, self.sd))
@@ -173,7 +178,7 @@ class GaussNewton:
             raise SimulationDiverged("Gauss-Newton: a column of the Jacobian is not finite; start from a softer or stiffer prior")
         away = numbers - self.mean()
         if learn:
-            self._evidence(away, H)
+            self._evidence(away, H, g)
         precision = self.precision()
         M = H + torch.diag(precision)
         direction = torch.linalg.solve(M, -(g + precision * away))
@@ -198,15 +203,25 @@ class GaussNewton:
         return {"before": before, "after": after, "share": taken, "length": length} | {
             f"sd/{b.name}": b.factor * float(b.sd.mean()) for b in self.blocks if b.learned}
 
-    def _evidence(self, away: Tensor, H: Tensor) -> None:
-        """MacKay's update of each learned block's factor: theta^2/sd^2 should sum to the number of well determined directions."""
-        variance = torch.linalg.inv(H + torch.diag(self.precision())).diagonal()
+    def _evidence(self, away: Tensor, H: Tensor, g: Tensor) -> None:
+        """MacKay's fixed point of each learned block's factor: theta^2/sd^2 sums to the number of well determined directions.
+
+        theta is where the linear problem leads under the factors, not where the iteration stands, and the search begins at 1: a
+        block that has not moved yet, or that an earlier noise had closed, is judged by what the data say now.
+        """
         sizes = [b.size for b in self.blocks]
-        for b, spread, moved in zip(self.blocks, variance.split(sizes), away.split(sizes)):
-            determined = float((1 - spread / (b.sd * b.factor) ** 2).sum())
-            size = float((moved / b.sd).square().sum())
-            if b.learned and determined > 1e-6 and size > 0:
-                b.factor = min(max((size / determined) ** 0.5, b.limits[0]), b.limits[1])
+        for b in self.blocks:
+            b.factor = 1.0 if b.learned else b.factor
+        for _ in range(EVIDENCE_PASSES):
+            precision = self.precision()
+            covariance = torch.linalg.inv(H + torch.diag(precision))
+            theta = away - covariance @ (g + precision * away)
+            variance = covariance.diagonal()
+            for b, spread, moved in zip(self.blocks, variance.split(sizes), theta.split(sizes)):
+                determined = float((1 - spread / (b.sd * b.factor) ** 2).sum())
+                size = float((moved / b.sd).square().sum())
+                if b.learned and determined > 1e-6 and size > 0:
+                    b.factor = min(max((size / determined) ** 0.5, b.limits[0]), b.limits[1])
 
     def posterior(self) -> Posterior:
         """Laplace's, from the last iteration's matrix. Errors: ValueError before the first."""
@@ -216,4 +231,5 @@ class GaussNewton:
         covariance = torch.linalg.inv(self.matrix)
         covariance = 0.5 * (covariance + covariance.T)
         determined = (1 - covariance.diagonal() * self.precision()).clamp(0, 1)
-        return Posterior(names, self.seats[0].read(), covariance, determined)
+        kept = [i for i, nuisance in enumerate(self._vector(lambda b: float(b.nuisance)).tolist()) if not nuisance]
+        return Posterior([names[i] for i in kept], self.seats[0].read()[kept], covariance[kept][:, kept], determined[kept])

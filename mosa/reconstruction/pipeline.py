@@ -25,6 +25,7 @@ from mosa.reconstruction.hull import Volume, hull_bounds, hull_centroid, visual_
 from mosa.reconstruction.initial import inherited_colors
 from mosa.reconstruction.modes import deformation_modes
 from mosa.reconstruction.observed import Windows, object_windows
+from mosa.reconstruction.resolution import PER_CELL, particles_for
 from mosa.reconstruction.settings import ReconstructionSettings
 from mosa.reconstruction.static import fit_splats, start_splats
 from mosa.rendering.covariance import covariance_from, matrix_to_quaternion, quaternion_multiply
@@ -74,19 +75,32 @@ def object_geometry(
     return Geometry.read(cache.stage("geometry", stage))
 
 
+FEW = 4000
+"""Particles that a run has at least where their number is left to it: the fits that the noise was settled on had as many."""
+
+
 def spacing_for(
     scene: Scene,
-    particles: int,
+    particles: int | None,
     settings: ReconstructionSettings | None = None,
     *,
+    per_cell: float = PER_CELL,
+    most: int = FEW,
     cache_dir: str | Path | None = None,
     device: torch.device | str = "cpu",
 ) -> float:
-    """Particle spacing [m] that fills the object of `scene` with about `particles` particles."""
-    if particles < 8:
+    """Particle spacing [m] that fills the object of `scene` with about `particles` particles.
+
+    particles: None for as many as resolve its thin parts on a grid of `per_cell` particles to a cell (`resolution`), from `FEW` to
+    `most`."""
+    if particles is not None and particles < 8:
         raise ConfigError(f"simulation.particles: expected at least 8, found {particles}")
-    geometry = object_geometry(scene, settings or ReconstructionSettings(), cache_dir=cache_dir, device=device)
-    return (body_volume(geometry.body) / particles) ** (1 / 3)
+    body = object_geometry(scene, settings or ReconstructionSettings(), cache_dir=cache_dir, device=device).body
+    volume = body_volume(body)
+    if particles is None:
+        particles = particles_for(lambda spacing: fill(body, spacing=spacing).positions, volume, per_cell=per_cell, least=FEW,
+                                  most=max(most, FEW))
+    return (volume / particles) ** (1 / 3)
 
 
 def _open_cache(cache_dir: str | Path | None, scene: Scene, settings: Mapping[str, Any], seed: int, **more: Any) -> StageCache:

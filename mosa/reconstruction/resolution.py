@@ -6,19 +6,24 @@ high and an operator where there is nothing to find; no fit repairs that.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
 from torch import Tensor
 
-ENOUGH = 2.0
+ENOUGH = 2.5
 """Cells across below which a run is warned. A free-free bar vibrates at 0.988 of its true frequency with 4 cells and at 0.998
-with 8 (docs/verification.md); the rabbit's ears have 2."""
+with 8 (docs/verification.md); the rabbit's ears have 2.5."""
+PER_CELL = 4.0
+"""Particles to a cell, unless told otherwise. With 8 of them the true laws of rabbit, chick1, mandarin, peanut and calf are 1.3 to
+2.5 times as far from the truth on held-out drops as the same particles are with 4; with fewer than 3 thin parts have empty cells.
+"""
 THIN = 0.1
 """Share of the body that has to be thinner for its thin parts to count."""
 MOST = 5.0
-"""Cells across beyond which nobody looks."""
+"""Cells of two layers across beyond which nobody looks."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +38,13 @@ class Resolution:
         return self.cells >= ENOUGH
 
 
-def resolution(rest: Tensor, spacing: float) -> Resolution:
-    """Of particles at rest (N, 3) [m] on a lattice of `spacing` [m], two to a cell and axis.
+def grid_spacing(spacing: float, per_cell: float = PER_CELL) -> float:
+    """dx [m] of the grid on which particles that are `spacing` [m] apart fill a cell with `per_cell`."""
+    return per_cell ** (1 / 3) * spacing
+
+
+def resolution(rest: Tensor, spacing: float, dx: float) -> Resolution:
+    """Of particles at rest (N, 3) [m] on a lattice of `spacing` [m], simulated on a grid of dx [m].
 
     The local thickness of a particle is the diameter of the largest ball of lattice cells that holds it and lies within the body.
     """
@@ -51,6 +61,15 @@ def resolution(rest: Tensor, spacing: float) -> Resolution:
         covered = ndimage.distance_transform_edt(inside < radius) < radius
         thickness[covered & fine] = radius  # half cells, of which the diameter has twice as many
     layers = thickness[tuple(2 * index.T)]
-    cells = float(np.quantile(layers, THIN)) / 2
+    cells = float(np.quantile(layers, THIN)) * spacing / dx
     needed = len(points) * max(1.0, ENOUGH / max(cells, 0.5)) ** 3
     return Resolution(cells, int(needed))
+
+
+def particles_for(fill: Callable[[float], Tensor], volume: float, *, per_cell: float, least: int, most: int) -> int:
+    """How many particles resolve a body of `volume` [m^3], at least `least` and at most `most`.
+
+    fill: positions (N, 3) [m] of the body's particles at a spacing [m]."""
+    spacing = (volume / least) ** (1 / 3)
+    wanted = resolution(fill(spacing), spacing, grid_spacing(spacing, per_cell)).particles
+    return min(max(wanted, least), most) if wanted > 1.1 * least else least

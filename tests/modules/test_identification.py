@@ -215,10 +215,10 @@ def test_write_numbers_sets_what_the_posterior_names():
     body = small_body(contact=True, modes=True)
     found = identification(body, [take_and_turn(body, 0.5)])
     names = [b.name for b in found.newton.blocks]
-    assert names == ["E", "nu", "contact", "operator", "stiffness"]
-    drawn = numbers_of(found) + 0.01 * torch.arange(len(numbers_of(found)))
+    assert names == ["E", "nu", "contact", "operator", "stiffness", "grid"]
+    drawn = numbers_of(found)[:-1] + 0.01 * torch.arange(len(numbers_of(found)) - 1)  # the grid's multiple is no part of a law
     write_numbers(body, drawn)
-    assert torch.allclose(Seat(found.newton.seats[0].tensors, torch.empty).read(), drawn, rtol=0, atol=1e-15)
+    assert torch.allclose(Seat(found.newton.seats[0].tensors[:-1], torch.empty).read(), drawn, rtol=0, atol=1e-15)
 
 
 def test_a_grid_without_a_start_that_can_be_simulated_is_an_error():
@@ -234,6 +234,6 @@ def test_what_it_refuses():
         body = small_body()
         identification(body, [take_and_turn(body, 0.5)], kinds=(False, False, False))
     for key, value in (("count", 0), ("operator_sd", -1.0), ("stiffness_sd", float("nan")), ("tolerance", True), ("threads", -1),
-                       ("threads", 1.5)):  # fmt: skip
+                       ("threads", 1.5), ("grid_error", -1.0), ("model_error", 2)):  # fmt: skip
         with pytest.raises(ConfigError, match=rf"identification\.{key}: expected"):
             IdentificationSettings(**{key: value})
