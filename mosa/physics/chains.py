@@ -111,12 +111,12 @@ class Chains:
         """How many frames, `count` at most, the next chain goes over: as many as keep its window not much larger than one frame's,
         and as there is room for the states of."""
         bounds, size = solver.bounds(state), sum(t.nbytes for t in state)
-        if count <= 1 or not all(math.isfinite(b) for b in bounds):
+        if count <= 1 or not all(math.isfinite(b) for b in bounds[0]):
             return 1
 
         def nodes(count: int) -> int:
             time = count * substeps * self.numerics.dt
-            reach = fallen(bounds, self.numerics.gravity, time)
+            reach = fallen(bounds[0], self.numerics.gravity, time)
             return math.prod(window_of(reach, self.numerics.dx, time, MARGIN)[1])
 
         # a state is in the graph and in the answer

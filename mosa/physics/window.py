@@ -21,8 +21,8 @@ TURNED = 0.5
 
 
 def extent(x: Tensor, v: Tensor) -> Tensor:
-    """(12,): lowest and highest x (N, 3), lowest and highest v (N, 3). NaN stays."""
-    return torch.cat([*torch.aminmax(x, dim=0), *torch.aminmax(v, dim=0)])
+    """(..., 12): lowest and highest x (..., N, 3), lowest and highest v (..., N, 3). NaN stays."""
+    return torch.cat([*torch.aminmax(x, dim=-2), *torch.aminmax(v, dim=-2)], -1)
 
 
 def fallen(bounds: Sequence[float], gravity: Sequence[float], time: float) -> list[float]:

@@ -13,8 +13,8 @@ from mosa.physics import chain as chain_module
 from mosa.physics import chains as chains_module
 from mosa.physics.asking import AdapterOperator
 from mosa.physics.capturing import ATTEMPTS
-from mosa.physics.chains import Plan, chain_length, grouped
-from mosa.physics.rollout import SEGMENT, Simulator
+from mosa.physics.chains import SEGMENT, Plan, chain_length, grouped
+from mosa.physics.rollout import Simulator
 from mosa.types import Ground, ParticleState
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
@@ -362,9 +362,9 @@ def test_buffers_that_could_not_be_made_are_made_later(make_block, monkeypatch):
     with pytest.raises(torch.OutOfMemoryError):
         run(30)
     monkeypatch.setattr(torch, "zeros", zeros)
-    chain.full.set_window((0, 0, 0), (60, 60, 60))
+    chain.full.set_window(((0, 0, 0), (60, 60, 60)))
     assert chain.full.fields.shape[2] >= 60**3
-    chain.full.set_window((0, 0, 0), (6, 6, 6))  # not needed any more
+    chain.full.set_window(((0, 0, 0), (6, 6, 6)))  # not needed any more
     assert torch.equal(run(1), expected) and chain.full.capacity == capacity and not chain._graphs
 
 

@@ -129,7 +129,7 @@ def test_segments_recomputed_give_the_gradient_of_one_segment(law, make_block, m
     run_again, advance = [], Workspace.advance
     monkeypatch.setattr(Workspace, "advance", lambda work: (run_again.append(work.with_adjoint), advance(work)))
     for length, kept, expected in ((32, 0, 2), (32, 10_000, 0), (7, 36, 7), (7, 7, 8), (7, 0, 8), (1, 10_000, 0)):
-        monkeypatch.setattr("mosa.physics.rollout.SEGMENT", length)
+        monkeypatch.setattr("mosa.physics.stepping.SEGMENT", length)
         monkeypatch.setattr("mosa.physics.memory.KEPT_ON_CPU", kept * each)
         state = make_block()
         leaves = [t.clone().requires_grad_() for t in (state.x, state.v, state.C_affine, state.F)]
