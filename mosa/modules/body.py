@@ -20,6 +20,7 @@ from mosa.modules.material import Material
 from mosa.modules.stiffness_modes import StiffnessModes
 from mosa.physics.adaptive import StepControl
 from mosa.physics.boundary import Plane
+from mosa.physics.collider_motion import Motion, Trajectory
 from mosa.physics.colliders import Collider, reach
 from mosa.physics.rollout import Simulator
 from mosa.physics.time_step import required_substeps
@@ -60,6 +61,25 @@ class World:
     box: Tensor
     planes: tuple[Plane, ...] = ()
     colliders: tuple[Collider, ...] = ()
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A body at its start, and what a simulation of it takes.
+
+    state: in the simulator's type, higher by `lift` (3,) [m], the contact's offset, than where the body is seen; arguments: of
+    `Simulator.rollout`; timing: those of substeps that vary, {} where they are fixed.
+    """
+
+    simulator: Simulator
+    state: ParticleState
+    lift: Tensor
+    arguments: dict
+    timing: dict
+
+    def motions(self, colliders: Sequence[Collider]) -> list[Motion | Trajectory]:
+        """Of the colliders, where the simulator sees them: the offset is the ground's, they keep their place."""
+        return [collider.motion.shifted(self.lift) for collider in colliders]
 
 
 EVEN = 4
@@ -262,6 +282,28 @@ class Body(nn.Module):
         towards what was seen (`criteria.corrected_rollout`). substeps: of every frame, where differences hold them fixed; None: as
         many as the time step bound asks for. Errors: SimulationDiverged, ConfigError (time step).
         """
+        ready = self.ready(
+            start, world, frames, frame_dt, variant=variant, with_adapter=with_adapter, with_heterogeneity=with_heterogeneity,
+            counts=counts, substeps=substeps,
+        )  # fmt: skip
+        roll = partial(ready.simulator.rollout, **ready.arguments, collect=collect, motions=ready.motions(world.colliders))
+        if observed is None:
+            rollout = roll(ready.state, frames=frames, progress=progress, **ready.timing)
+        else:
+            if ready.timing:
+                raise ConfigError("simulation.adaptive: expected false where a criterion corrects the prediction frame by frame")
+            seen = (observed[:frames] + ready.lift.detach()).to(ready.state.x.dtype)
+            rollout = corrected_rollout(roll, ready.state, seen, gain, frame_dt)
+        taken = rollout.counts
+        self.last_substeps = -(-sum(taken) // len(taken)) if taken else ready.simulator.substeps
+        fields = {name: getattr(rollout, name).to(self.rest.dtype) for name in ("x", "v", "F", "F_tot")}
+        return replace(rollout, **{**fields, "x": fields["x"] - ready.lift})
+
+    def ready(
+        self, start: Start, world: World, frames: int, frame_dt: float, *, variant: str = "adapted", with_adapter: bool = True,
+        with_heterogeneity: bool = True, counts: Sequence[int] | None = None, substeps: int | None = None,
+    ) -> Ready:  # fmt: skip
+        """The body at `start`, ready to be simulated; arguments and errors as `simulate`."""
         material, contact, heterogeneity, adapter = self.parts(variant)
         if not with_heterogeneity:
             heterogeneity = None
@@ -293,25 +335,16 @@ class Body(nn.Module):
                 float(material.max_viscosity(factor.detach())),
             )  # fmt: skip
             state = self.initial_state(start, frame_dt / substeps, gravity)
-        simulator = self.simulator(material.law, substeps, frame_dt, world, getattr(adapter, "strain", None))
         lift = contact() * up
         state = replace(state, x=state.x + lift)
         state = ParticleState(*(getattr(state, name).to(dtype) for name in ("x", "v", "C_affine", "F", "F_tot")))
-        stride = None if adapter is not None and adapter.steady else self.settings.stride
-        roll = partial(
-            simulator.rollout, parameters={k: p.to(dtype) for k, p in parameters.items()}, volume=self.volume.to(dtype),
-            density=self.density, adapter=adapter, stride=stride, collect=collect,
-            motions=[c.motion.shifted(lift) for c in world.colliders],  # the offset is the ground's: they keep their place
-        )  # fmt: skip
-        if observed is None:
-            rollout = roll(state, frames=frames, progress=progress, **timing)
-        else:
-            if timing:
-                raise ConfigError("simulation.adaptive: expected false where a criterion corrects the prediction frame by frame")
-            rollout = corrected_rollout(roll, state, (observed[:frames] + lift.detach()).to(dtype), gain, frame_dt)
-        self.last_substeps = -(-sum(rollout.counts) // len(rollout.counts)) if rollout.counts else substeps
-        fields = {name: getattr(rollout, name).to(self.rest.dtype) for name in ("x", "v", "F", "F_tot")}
-        return replace(rollout, **{**fields, "x": fields["x"] - lift})
+        arguments = {
+            "parameters": {k: p.to(dtype) for k, p in parameters.items()}, "volume": self.volume.to(dtype),
+            "density": self.density, "adapter": adapter,
+            "stride": None if adapter is not None and adapter.steady else self.settings.stride,
+        }  # fmt: skip
+        simulator = self.simulator(material.law, substeps, frame_dt, world, getattr(adapter, "strain", None))
+        return Ready(simulator, state, lift, arguments, timing)
 
     def simulator(self, law: str, substeps: int, frame_dt: float, world: World, strain: str | None = None) -> Simulator:
         """The simulator of `law` in `world`, one per time step (kernels are compiled once per law and precision).

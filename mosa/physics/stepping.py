@@ -122,11 +122,11 @@ def flat(state: ParticleState) -> tuple[Tensor, ...]:
 
 class Moment(NamedTuple):
     """Where a motion is that is advanced step by step. state: (N, ...) or, of B worlds, (B, N, ...); substeps: done since its
-    start; time [s]; lag [s]: the last substep's dt, 0 before the first, for steps whose substeps are chosen."""
+    start, in how many frames; lag [s]: the last substep's dt, 0 before the first, for steps whose substeps are chosen."""
 
     state: ParticleState
     substeps: int = 0
-    time: float = 0.0
+    frames: int = 0
     lag: float = 0.0
 
 
@@ -158,17 +158,20 @@ class Stepper:
         """[s] of a substep where their count is fixed."""
         return self.frame_dt / self.count
 
-    def step(self, moment: Moment, poses: Poses | None = None) -> Step:
+    def step(
+        self, moment: Moment, poses: Poses | Callable[[int, float], Poses] | None = None, speed: float | None = None
+    ) -> Step:
         """One step on from `moment`, which is left as it is; differentiable in it, in poses, and in what `Simulator.stepper` got.
 
-        poses: of K colliders at the step's S substeps, (S, K, ...) or, of B worlds, (S, B, K, ...); None: of their own motions.
-        Errors: SimulationDiverged naming substep and particle; ConfigError.
+        poses: of K colliders at the step's S substeps, (S, K, ...) or, of B worlds, (S, B, K, ...), or a function of S and their
+        dt [s]; None: of their own motions. speed: bound of the colliders' speeds [m/s] for substeps that are chosen, None for
+        that of their own motions. Errors: SimulationDiverged naming substep and particle; ConfigError.
         """
         prepared, variable = self.prepared, self.chooser is not None
         state = flat(moment.state) if self.worlds is not None else tuple(getattr(moment.state, name) for name in STATE)
         if not prepared.numerics.law.plastic:
             state = (*state[:4], state[3])
-        count = self.chooser.choose(1 + round(moment.time / self.frame_dt), *state[1:4]) if variable else self.count
+        count = self.chooser.choose(moment.frames + 1, *state[1:4], speed) if variable else self.count
         dt = self.frame_dt / count
         if moment.substeps == 0:
             state = prepared.first_advance(state, dt)
@@ -181,21 +184,27 @@ class Stepper:
             forces = forces.unflatten(1, (self.worlds, -1)) if self.worlds is not None else forces
         if self.worlds is not None:
             state = tuple(t.unflatten(0, (self.worlds, -1)) for t in state)
-        after = Moment(ParticleState(*state), moment.substeps + count, moment.time + self.frame_dt, dt)
+        after = Moment(ParticleState(*state), moment.substeps + count, moment.frames + 1, dt)
         return Step(after, forces, count)
 
-    def _poses(self, moment: Moment, count: int, dt: float, poses: Poses | None) -> tuple[Tensor, ...]:
+    def _poses(self, moment: Moment, count: int, dt: float, poses: Poses | Callable | None) -> tuple[Tensor, ...]:
         """(S, W K, ...) each, in the simulator's type."""
         colliders, device = len(self.motions[0]), self.prepared.numerics.device
         if not colliders:
             return ()
         if poses is None:
-            first, start = (0, moment.time) if self.chooser is not None else (moment.substeps, 0.0)
-            each = [sample_poses(motions, 1, count, dt, start, self.dtype, device, first) for motions in self.motions]
-            return tuple(torch.cat(parts, 1) for parts in zip(*each))
+            each = [self.sample(moment, count, dt, motions) for motions in self.motions]
+            return tuple(torch.cat(parts, 1).to(self.dtype).to(device) for parts in zip(*each))
+        poses = poses(count, dt) if callable(poses) else poses
         leading = (count, colliders) if self.worlds is None else (count, self.worlds, colliders)
         for name, part, shape in zip(Poses._fields, poses, ((3,), (3, 3), (3,), (3,)), strict=True):
             if tuple(part.shape) != (*leading, *shape):
                 raise ConfigError(f"poses: {name}: expected shape {(*leading, *shape)}, found {tuple(part.shape)}")
         poses = [part.to(dtype=self.dtype, device=device) for part in poses]
         return tuple(poses if self.worlds is None else (part.flatten(1, 2) for part in poses))
+
+    def sample(self, moment: Moment, count: int, dt: float, motions: Sequence[Motion | Trajectory], after: int = 0) -> Poses:
+        """Poses (S, K, ...) float64 of colliders with these motions at `count` substeps of dt [s] from `after` substeps after
+        `moment`, at the times at which a rollout takes them."""
+        first, start = (moment.substeps, 0.0) if self.chooser is None else (0, moment.frames * self.frame_dt)
+        return sample_poses(motions, 1, count, dt, start, torch.float64, torch.device("cpu"), first + after)
