@@ -1,13 +1,13 @@
 """Many worlds at once against one: rollouts forward and forward + backward, and steps per second of a stepping body.
 
-    OMP_NUM_THREADS=1 python benchmarks/worlds.py [--device cpu|cuda] [--worlds 1 32 256] [--particles 4040] [--substeps 48]
-                                                  [--frames 5] [--steps 50] [--repeats 5] [--parts rollouts steps]
-                                                  [--check-only]
+    OMP_NUM_THREADS=1 python benchmarks/worlds.py [--device cpu|cuda] [--worlds 1 32 256] [--particles 4040]
+                                                  [--substeps 48] [--frames 5] [--steps 50] [--repeats 5]
+                                                  [--parts rollouts steps] [--check-only]
 
 A block of corotated material with the default adapter (an anisotropic stiffness) falls on the ground with friction; every world
-has a start, a shear modulus and, in the check, gravity and a moving ball of its own. `--substeps` are those of 0.02 s: 48 are as long as
-the 40 of the README's rabbit in 1/60 s. Rollouts have `--frames` intervals; forward + backward gives gradients with respect to
-every world's velocity and modulus and the adapter's numbers. Steps are those of `mosa.episode`, which `Twin.step` takes: 0.02 s
+has a start, a shear modulus and, in the check, gravity and a moving ball of its own. `--substeps` are those of 0.02 s: 48 are as
+long as the 40 of the README's rabbit in 1/60 s. Rollouts have `--frames` intervals; forward + backward gives gradients with respect
+to every world's velocity and modulus and the adapter's numbers. Steps are those of `mosa.episode`, which `Twin.step` takes: 0.02 s
 each, with a paddle that an action drives, each step with its own look at the result.
 
 Wall times, best of the repeats after those that compile and capture. On a CPU (default worlds 1 and 8) the many worlds run on as
@@ -145,9 +145,9 @@ def check(device: str, particles: int = 500, worlds: int = 4) -> None:
                 difference = float((part[b] - expected[0]).abs().max() / expected.abs().max())
                 steepest = max(steepest, difference)
     allowed = (CELLS, GRADIENT) if device == "cuda" else (0.0, 1e-12)
-    print(f"check, {worlds} worlds, so many, 2 or 1 in a launch, float64: positions that moved {min(moved):.2f} to {max(moved):.2f} "
-          f"cells differ by at most {worst:.2g} cells (allowed {allowed[0]:g}), gradients by {steepest:.2g} (allowed "
-          f"{allowed[1]:g})")
+    print(f"check, {worlds} worlds, so many, 2 or 1 in a launch, float64: positions that moved {min(moved):.2f} to "
+          f"{max(moved):.2f} cells differ by at most {worst:.2g} cells (allowed {allowed[0]:g}), gradients by {steepest:.2g} "
+          f"(allowed {allowed[1]:g})")
     if not (worst <= allowed[0] and steepest <= allowed[1] and min(moved) > 0.5):
         raise SystemExit("worlds are not their single rollouts")
 
@@ -157,8 +157,8 @@ def learned_body(particles: int, device: str) -> Body:
     ones, n = torch.ones(particles, 3), particles
     made = Body(
         rest=x, volume=torch.full((n,), (DX / 2) ** 3), colors=ones, opacities=torch.ones(n),
-        covariances=torch.eye(3).expand(n, 3, 3), density=DENSITY, material=Material("corotated", {"E": 2.7 * MU, "nu": 0.36}), heterogeneity=None, adapter=adapter_of("cpu"),
-        settings=SimulationSettings(dx=DX),
+        covariances=torch.eye(3).expand(n, 3, 3), density=DENSITY, material=Material("corotated", {"E": 2.7 * MU, "nu": 0.36}),
+        heterogeneity=None, adapter=adapter_of("cpu"), settings=SimulationSettings(dx=DX),
     )  # fmt: skip
     return made.to(device).eval()
 

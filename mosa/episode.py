@@ -127,7 +127,8 @@ class Episode:
         times = {"time": moment.frames * self.frame_dt, "lag": moment.lag}
         return TwinState(
             *(getattr(moment.state, name) for name in STATE), self._lifts, *self._poses, self._driven,
-            **{k: torch.tensor(v) for k, v in numbers.items()}, **{k: torch.tensor(v).double() for k, v in times.items()},
+            **{k: torch.tensor(v) for k, v in numbers.items()},
+            **{k: torch.tensor(v, dtype=torch.float64) for k, v in times.items()},
         )  # fmt: skip
 
     @state.setter
