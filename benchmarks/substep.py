@@ -58,7 +58,7 @@ def measure(dtype: torch.dtype, particles: int, grid: int | None, substeps: int,
     results = []
     for with_adjoint in (False, True):
         work = solver.workspace(substeps, False, False, with_adjoint)
-        work.set_window(window)
+        work.set_window(*window)
         work.load(state, held, volume, solver.mass, 0.0)
         if law is None:
             launch = work._run

@@ -124,7 +124,7 @@ class Chain:
         raise solver.left_behind(flags, first, dt)
 
     def adjoint(
-        self, solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...], packed: Tensor, window: tuple[tuple, tuple],
+        self, solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...], packed: Tensor, window: tuple,
         seeds: Sequence[Tensor | None], tape: Sequence[Tensor],
     ) -> tuple[list[Tensor], Tensor, list[Tensor]]:  # fmt: skip
         """Gradients of (state, parameters, weights). learned: with the names and weights of `advance`; seeds: adjoints of what it
@@ -254,7 +254,7 @@ class Chain:
                 torch._foreach_add_(*zip(*sums))
 
     def _load(
-        self, work: Workspace, window: tuple[tuple, tuple], solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...],
+        self, work: Workspace, window: tuple, solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...],
         packed: Tensor,
     ) -> None:  # fmt: skip
         """Place the chain's start in `work`. Forget captured graphs where what they have by value or address is another one."""

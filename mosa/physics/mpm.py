@@ -3,9 +3,9 @@
 Between the passes the states of all substeps are kept where there is room for them, else only a segment's inputs.
 """
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -75,8 +75,8 @@ class SegmentSolver:
         return self.workspaces[key]
 
     def prepare(
-        self, state: tuple[Tensor, ...], held: dict, poses, substeps: int, windows: Sequence, with_adjoint: bool,
-        steps: Steps | None = None,
+        self, state: tuple[Tensor, ...], held: dict, poses, substeps: int, windows: tuple[np.ndarray, np.ndarray],
+        with_adjoint: bool, steps: Steps | None = None,
     ) -> Workspace:  # fmt: skip
         """A workspace loaded with the start of a segment. poses: of the colliders at its substeps, None where there are none;
         windows: of every world."""
@@ -110,34 +110,23 @@ class SegmentSolver:
         """How many of the `left` substeps the next window is to serve: at most `most`, and so few that it is not much larger than
         the window of `WIDENED` substeps."""
         bounds, pieces = self.bounds(state), -(-left // most)
-        if not all(math.isfinite(b) for each in bounds for b in each):
+        if not np.isfinite(bounds).all():
             return min(left, WIDENED)
         while (count := -(-left // pieces)) > WIDENED:
-            if self._few_nodes(bounds, count * dt, WIDENED * dt):
+            reach = fallen(bounds, self.gravities, count * dt)
+            long, short = (window_of(reach, self.numerics.dx, n * dt, 2)[1].prod(-1) for n in (count, WIDENED))
+            if long.sum() <= short.sum() + SMALL and long.max() <= MAX_NODES:
                 break
             pieces *= 2
         return count
 
-    def _few_nodes(self, bounds: Sequence[Sequence[float]], time: float, short: float) -> bool:
-        """Whether windows for `time` [s] of worlds that gravity pulls on have few nodes: about as few as those for `short`."""
-        counts = []
-        for span in (time, short):
-            falling = (fallen(each, gravity, time) for each, gravity in zip(bounds, self.gravities))
-            counts.append([math.prod(window_of(each, self.numerics.dx, span, 2)[1]) for each in falling])
-        return sum(counts[0]) <= sum(counts[1]) + SMALL * self.worlds and max(counts[0]) <= MAX_NODES
-
-    def windows(self, state: tuple[Tensor, ...], time: float, margin: int, falls: bool) -> tuple:
-        """The window of every world for `time` [s], with room for `margin` nodes more. falls: also for what gravity adds to the
-        speeds at the start. Errors: SimulationDiverged as `grid_window`."""
-        found, size = [], len(self.volume) // self.worlds
-        for world, (bounds, gravity) in enumerate(zip(self.bounds(state), self.gravities)):
-            bounds = fallen(bounds, gravity, time) if falls else bounds
-            x, v = (t[world * size : (world + 1) * size] for t in state[:2])
-            try:
-                found.append(grid_window(x, v, self.numerics.dx, time, margin, bounds=bounds))
-            except SimulationDiverged as error:
-                raise SimulationDiverged(f"{self._named(world)}{error}") from error
-        return tuple(found)
+    def windows(self, state: tuple[Tensor, ...], time: float, margin: int, falls: bool) -> tuple[np.ndarray, np.ndarray]:
+        """The windows of the worlds, (W, 3) each, for `time` [s], with room for `margin` nodes more. falls: also for what gravity
+        adds to the speeds at the start. Errors: SimulationDiverged as `grid_window`."""
+        bounds = self.bounds(state)
+        bounds = fallen(bounds, self.gravities, time) if falls else bounds
+        x, v = (self._apart(t) for t in state[:2])
+        return grid_window(x, v, self.numerics.dx, time, margin, bounds=bounds, name=self._named)
 
     def _named(self, world: int) -> str:
         return "" if self._first_world is None else f"world {self._first_world + world}: "
@@ -158,8 +147,8 @@ class SegmentSolver:
     def look(self, flags: Tensor, final: tuple[Tensor, ...]) -> list[int]:
         """The events of a segment; the same transfer tells the host where the next one starts."""
         bounds = extent(*(self._apart(t) for t in final[:2]))
-        numbers = torch.cat([flags.double(), bounds.double().flatten()]).tolist()  # float64 holds the flags exactly
-        self._know(final, [numbers[first : first + 12] for first in range(4, len(numbers), 12)])
+        numbers = torch.cat([flags.double(), bounds.double().flatten()]).numpy(force=True)  # float64 holds the flags exactly
+        self._know(final, numbers[4:].reshape(-1, 12))
         return [int(n) for n in numbers[:4]]
 
     def _apart(self, t: Tensor) -> Tensor:
@@ -170,13 +159,13 @@ class SegmentSolver:
         """Whether the states of so many substeps may be kept."""
         return substeps * substep_bytes(self.numerics, len(self.volume)) <= self.room
 
-    def bounds(self, state: tuple[Tensor, ...]) -> list[list[float]]:
-        """`extent` of every world's x and v, without a transfer where `look` has told it."""
+    def bounds(self, state: tuple[Tensor, ...]) -> np.ndarray:
+        """`extent` (W, 12) of every world's x and v, without a transfer where `look` has told it."""
         if self._known is None or self._known[:2] != _identity(state):
-            self._know(state, extent(*(self._apart(t) for t in state[:2])).tolist())
+            self._know(state, extent(*(self._apart(t) for t in state[:2])).double().numpy(force=True))
         return self._known[2]
 
-    def _know(self, state: tuple[Tensor, ...], bounds: list[list[float]]) -> None:
+    def _know(self, state: tuple[Tensor, ...], bounds: np.ndarray) -> None:
         # aliases hold the memory, so that it does not become another tensor's, but not the graph, which holds the solver
         self._known = (*_identity(state), bounds, [t.detach() for t in state[:2]])
 

@@ -6,12 +6,12 @@ CPU the 10 us that Python takes for each. The grid's window is read from memory 
 than it: a body that moves or speeds up goes through the same graphs.
 """
 
-import math
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -168,7 +168,7 @@ class Workspace:
             self.colliders = ColliderBuffers(numerics.colliders, self.scalar, substeps, self, with_adjoint)
         self.cutoff = 0.0
         self.nodes = self.capacity = self.allocations = 0
-        self._placed: tuple | None = None
+        self._placed: np.ndarray | None = None
         self._pulled: tuple | None = None
         self.steps = Steps(numerics.dt, numerics.dt)
         self._graphs: dict[tuple, object] = {}
@@ -200,20 +200,18 @@ class Workspace:
         """(2, slots, nodes of the windows, 4): momentum and mass, velocity."""
         return self.fields[:, :, : self.nodes]
 
-    def set_window(self, *windows: tuple[tuple[int, int, int], tuple[int, int, int]]) -> None:
-        """Place the grid of every world: (lowest node, number of nodes per axis). Buffers and graphs are new where there is no room
-        for them."""
-        sizes = [math.prod(dims) for _, dims in windows]
-        nodes = sum(sizes)
-        if not nodes <= self.capacity <= max(IDLE * nodes, SMALL * self.worlds):
-            self._allocate_nodes(nodes + max(nodes // SPARE, min(nodes // 2, SMALL * self.worlds)))
-        if self._placed != windows:
-            rows, first = [], 0
-            for (origin, dims), size in zip(windows, sizes, strict=True):
-                rows += [origin, dims, (first, 0, 0)]
-                first += size
-            self.window.copy_(torch.tensor(rows, dtype=torch.int32), non_blocking=True)  # CUDA stages it before it returns
-            self._placed, self.nodes = windows, nodes
+    def set_window(self, origins: np.ndarray, dims: np.ndarray) -> None:
+        """Place the grids: lowest node and number of nodes per axis, (W, 3), or (3,) for all worlds. Buffers and graphs are new
+        where there is no room for them."""
+        rows = np.zeros((self.worlds, 3, 3), dtype=np.int32)
+        rows[:, 0], rows[:, 1] = origins, dims
+        ends = rows[:, 1].prod(-1, dtype=np.int64).cumsum()
+        rows[1:, 2, 0], nodes = ends[:-1], int(ends[-1])
+        if not nodes <= self.capacity <= max(IDLE * nodes, SMALL):
+            self._allocate_nodes(nodes + max(nodes // SPARE, min(nodes // 2, SMALL)))
+        if self._placed is None or not np.array_equal(rows, self._placed):
+            self.window.copy_(torch.from_numpy(rows).flatten(0, 1), non_blocking=True)  # CUDA stages it before it returns
+            self._placed, self.nodes = rows, nodes
 
     @torch.inference_mode(False)  # another rollout may want gradients
     def _allocate_nodes(self, count: int) -> None:

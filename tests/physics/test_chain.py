@@ -362,9 +362,9 @@ def test_buffers_that_could_not_be_made_are_made_later(make_block, monkeypatch):
     with pytest.raises(torch.OutOfMemoryError):
         run(30)
     monkeypatch.setattr(torch, "zeros", zeros)
-    chain.full.set_window(((0, 0, 0), (60, 60, 60)))
+    chain.full.set_window((0, 0, 0), (60, 60, 60))
     assert chain.full.fields.shape[2] >= 60**3
-    chain.full.set_window(((0, 0, 0), (6, 6, 6)))  # not needed any more
+    chain.full.set_window((0, 0, 0), (6, 6, 6))  # not needed any more
     assert torch.equal(run(1), expected) and chain.full.capacity == capacity and not chain._graphs
 
 

@@ -35,9 +35,9 @@ def test_captured_segments_are_those_launched_one_by_one(kept, tight, collides, 
     replays, launches, dims, sizes = [], [], set(), set()
     replay, place, send = wp.capture_launch, workspace.Workspace.set_window, workspace.Workspace._launch
 
-    def placed(work, *windows):
-        place(work, *windows)
-        dims.add(windows[0][1])
+    def placed(work, origin, size):
+        place(work, origin, size)
+        dims.add(tuple(size[0].tolist()))
         sizes.add(work.capacity)
 
     monkeypatch.setattr(wp, "capture_launch", lambda *a, **k: (replays.append(1), replay(*a, **k)))
