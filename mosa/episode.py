@@ -17,7 +17,6 @@ from torch import Tensor
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body import Body, Ready, Start, World
 from mosa.modules.identification import each_law
-from mosa.physics.asking import AdapterOperator
 from mosa.physics.collider_motion import Poses, exponential, rotation_matrices, rotation_vector
 from mosa.physics.colliders import reach
 from mosa.physics.stepping import STATE, Moment
@@ -99,16 +98,14 @@ class Episode:
         with self._gradients():
             if self.worlds is None:
                 ready = body.ready(starts, world, **options)
-                lifts, state, more = ready.lift, ready.state, {"control": ready.timing.get("control")}
+                more = {"control": ready.timing.get("control")}
             else:
-                ready, state, lifts = _worlds(body, world, starts, laws, gravity, options)
+                ready = _worlds(body, world, starts, laws, gravity, options)
                 more = {"gravity": gravity, "together": together}
-            self._lifts = lifts
-            apart = lifts.ndim > 1
-            own = [[c.motion.shifted(lift) for c in self.colliders] for lift in (lifts if apart else [lifts])]
-            self._motions = own
+            self._lifts, motions = ready.lift, ready.motions(self.colliders)
+            self._motions = motions if ready.lift.ndim > 1 else [motions]
             self._stepper, moment = ready.simulator.stepper(
-                state, **ready.arguments, motions=own if apart else own[0], steps=frames, **more
+                ready.state, **ready.arguments, motions=motions, steps=frames, **more
             )
             self._driven = torch.zeros(len(self.colliders), dtype=torch.bool)
             self._moment, self._poses = moment, self._placed(moment, 0)
@@ -297,46 +294,29 @@ def _fastest(body: Body, starts: Sequence[Start]) -> Start:
 
 def _worlds(
     body: Body, world: World, starts: Sequence[Start], laws: Tensor | None, gravity: Tensor | None, options: dict
-) -> tuple[Ready, ParticleState, Tensor]:
-    """(what is the same in all worlds, the states (B, ...), the contact's offsets (3,) or (B, 3) [m])."""
+) -> Ready:
+    """All worlds, with a lift (3,) [m] where it is the same in all."""
     if body.settings.adaptive:
         raise ConfigError("simulation.adaptive: expected false with many worlds, which take the same substeps")
-    pulls = [world.gravity] * len(starts) if gravity is None else list(torch.as_tensor(gravity).to(body.rest))
-    strongest = replace(world, gravity=max(pulls, key=lambda g: float(g.norm())))
+    if laws is not None and (len(laws) != len(starts) or options["variant"] != "adapted"):
+        raise ConfigError(f"laws: expected one for each of {len(starts)} worlds, of variant adapted, found {len(laws)} of "
+                          f"{options['variant']}")
+    pulls = [world.gravity.to(body.rest)] * len(starts) if gravity is None else list(gravity.to(body.rest))
+    # the time step is one for all
+    hardest = replace(world, gravity=max(pulls, key=lambda g: float(g.norm())))
     quick = _fastest(body, starts)
     if laws is None:
-        found = [body.ready(quick, strongest, **options)]
+        found = [body.ready(quick, hardest, **options)]
     else:
-        if len(laws) != len(starts):
-            raise ConfigError(f"laws: expected one for each of {len(starts)} worlds, found {len(laws)}")
-        counts = [body.ready(quick, strongest, **options).simulator.substeps for _ in each_law(body, laws)]
+        counts = [body.ready(quick, hardest, **options).simulator.substeps for _ in each_law(body, laws)]
         fixed = {**options, "substeps": max(counts)}
-        found = [_answered(body.ready(quick, strongest, **fixed), quick, body) for _ in each_law(body, laws)]
-    first, count = found[0], found[0].simulator.substeps
-    simulator = body.simulator(first.simulator.law.name, count, options["frame_dt"], world, first.simulator.numerics.strain)
-    dt, states = options["frame_dt"] / count, []
+        found = [body.ready(quick, hardest, **fixed).answered() for _ in each_law(body, laws)]
+    first = found[0].simulator
+    simulator = body.simulator(first.law.name, first.substeps, first.frame_dt, world, first.numerics.strain)
+    states = []
     for b, (start, pull) in enumerate(zip(starts, pulls)):
-        state = body.initial_state(start, dt, pull.to(body.rest))
-        state = replace(state, x=state.x + found[b if laws is not None else 0].lift)
+        state = body.initial_state(start, simulator.dt, pull)
+        state = replace(state, x=state.x + found[b % len(found)].lift)
         states.append(ParticleState(*(getattr(state, name).to(simulator.dtype) for name in STATE)))
-    arguments = first.arguments
-    if laws is not None:
-        n = len(body.rest)
-        each = [ready.arguments["parameters"] for ready in found]
-        parameters = {k: torch.stack([p[k].expand(n) for p in each]) for k in each[0]}
-        adapters = [ready.arguments["adapter"] for ready in found]
-        arguments = {**arguments, "parameters": parameters, "adapter": None if adapters[0] is None else adapters}
-    lifts = first.lift if laws is None else torch.stack([ready.lift for ready in found])
-    return replace(first, simulator=simulator, arguments=arguments), ParticleState.stack(states), lifts
-
-
-def _answered(ready: Ready, start: Start, body: Body) -> Ready:
-    """With the answer of the adapter as it is now in place of the adapter, which another law will change."""
-    adapter = ready.arguments["adapter"]
-    if adapter is None:
-        return ready
-    if ready.arguments["stride"] is not None:
-        raise ConfigError(f"laws: expected an adapter whose operator is the same in every state, found {type(adapter).__name__}")
-    state = ready.state
-    held = AdapterOperator(*adapter(ready.simulator.material_state(state.F, state.C_affine, ready.arguments["parameters"])))
-    return replace(ready, arguments={**ready.arguments, "adapter": lambda _: held})
+    ready = found[0] if laws is None else Ready.stack(found)
+    return replace(ready, simulator=simulator, state=ParticleState.stack(states))
