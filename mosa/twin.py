@@ -1,4 +1,4 @@
-"""The learned twin in use: load a checkpoint, roll its law out from a new start, export particles and a video.
+"""The learned twin in use: load a checkpoint, roll its law out from a new start or step by step, export particles and a video.
 
     from mosa.twin import Twin
     twin = Twin.load("outputs/train/.../checkpoints/last.ckpt")
@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ from torch import Tensor
 
 from mosa.analysis.figures import side_by_side, write_video
 from mosa.checkpoints import TENSORS, checked, checked_posterior, read_checkpoint
+from mosa.episode import Episode, Stepped, TwinState
 from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
 from mosa.limits import machine_memory
 from mosa.modules.body import VARIANTS, Body, Start, World
@@ -45,6 +47,7 @@ class Twin:
     ) -> None:
         self.body, self.world, self.frame_dt = body, world, frame_dt
         self.config, self.training_start, self.posterior = config, training_start, posterior
+        self._episode: Episode | None = None
 
     @classmethod
     def load(cls, path: str | Path, device: str = "cpu") -> Twin:
@@ -90,6 +93,7 @@ class Twin:
         *,
         rotation: Sequence[float] | Tensor | None = None,
         height: float | None = None,
+        position: Sequence[float | None] | Tensor | None = None,
         velocity: Sequence[float] | None = None,
         angular_velocity: Sequence[float] | None = None,
         frames: int = 30,
@@ -99,21 +103,95 @@ class Twin:
     ) -> Rollout:
         """Roll the learned law out from a new start.
 
-        rotation: (ax, ay, az, degrees) about the body's centre, or a (3, 3) matrix, relative to the rest shape; height [m] of the
-        lowest point above the ground; velocity [m/s]; angular_velocity [rad/s]; what is left out is taken from the training
+        rotation: (ax, ay, az, degrees) about the body's centre, or a (3, 3) matrix, relative to the rest shape; position: (3,) [m]
+        of the body's centre, None for a number that is left as it is; height [m] of the lowest point above the ground, in place
+        of the position along `up`; velocity [m/s]; angular_velocity [rad/s]; what is left out is taken from the training
         sequence. colliders: rigid solids instead of the world's, or entries as a configuration has them; `reactions` of the result
         holds the forces on them. Errors: ConfigError naming the argument (also a solid that the body starts in),
         SimulationDiverged (the body leaves the box of the scene).
         """
+        check_frames(frames, len(self.body.rest))
+        check_variant(variant)
+        start, world = self._start(rotation, height, position, velocity, angular_velocity, colliders)
+        with tqdm(total=frames - 1, desc="simulate", unit="frame", disable=not progress) as bar:
+            return self.body.simulate(start, world, frames, self.frame_dt, variant=variant, progress=lambda _: bar.update())
+
+    def reset(
+        self,
+        *,
+        rotation: Sequence[float] | Tensor | None = None,
+        height: float | None = None,
+        position: Sequence[float | None] | Tensor | None = None,
+        velocity: Sequence[float] | Tensor | None = None,
+        angular_velocity: Sequence[float] | Tensor | None = None,
+        colliders: Sequence[Collider | Mapping] | None = None,
+        variant: str = "adapted",
+        control_dt: float | None = None,
+        substeps: int | None = None,
+        frames: int = 30,
+        differentiable: bool = False,
+    ) -> TwinState:
+        """Begin a motion that `step` goes on with; returns its state at time 0.
+
+        rotation, height, position, velocity, angular_velocity, colliders, variant: as `simulate`. control_dt [s]: of a step, the
+        `frame_dt` of the training by default; substeps: of every step, None for as many as the time step bound asks for in a
+        motion of `frames` steps, `simulate(frames=...)`'s. differentiable: whether gradients reach tensors among these arguments
+        (a rotation as a matrix), the actions, and the law's parameters; it keeps states between the passes. Errors: ConfigError.
+        """
+        check_frames(frames, len(self.body.rest))
+        check_variant(variant)
+        start, world = self._start(rotation, height, position, velocity, angular_velocity, colliders)
+        self._episode = Episode(
+            self.body, world, checked_dt(control_dt, self.frame_dt), start, variant=variant, frames=frames,
+            substeps=checked_substeps(substeps), differentiable=differentiable,
+        )  # fmt: skip
+        return self._episode.state
+
+    def step(self, action: Mapping[str, Any] | None = None) -> Stepped:
+        """Go one step on: (state, reactions), see `mosa.episode`.
+
+        action: for colliders by name (their number as a text where they have none), either `velocity` (3,) [m/s] and
+        `angular_velocity` (3,) [rad/s] in world axes, about the collider's origin, for this step, or the `position` (3,) [m] and
+        `rotation` ((3,) vector [rad] or (3, 3)) where it shall be after it; three numbers alone are a velocity. A collider that
+        was never in an action follows its own motion; one that was, but is not in this one, stands still.
+        Errors: ConfigError naming the collider, what was expected and found; SimulationDiverged.
+        """
+        return self.episode.step(action)
+
+    @property
+    def episode(self) -> Episode:
+        """The motion that `reset` began. Errors: ConfigError before that."""
+        if self._episode is None:
+            raise ConfigError("twin: expected reset(...) before step and state, found no motion")
+        return self._episode
+
+    @property
+    def state(self) -> TwinState:
+        """Of the motion now; set it to go back to an earlier one, or to branch. `state.tensors()` are plain tensors to save, and
+        `TwinState.read` makes them a state again, after a reset with the same arguments."""
+        return self.episode.state
+
+    @state.setter
+    def state(self, state: TwinState) -> None:
+        self.episode.state = state
+
+    def worlds(self, count: int, laws: Tensor | None = None) -> TwinWorlds:
+        """`count` copies of the body, each in a world of its own, that are reset and stepped together.
+
+        laws: (count, numbers) of a law for each, as `posterior.draws(count)` gives them, None for the learned one in all.
+        Errors: ConfigError."""
+        return TwinWorlds(self, count, laws)
+
+    def _start(self, rotation, height, position, velocity, angular_velocity, colliders) -> tuple[Start, World]:
+        """(the start, the world with its colliders), checked. Errors: ConfigError naming the argument."""
         body, first = self.body, self.training_start
-        check_frames(frames, len(body.rest))
-        if variant not in VARIANTS:
-            raise ConfigError(f"variant: expected one of {', '.join(VARIANTS)}, found {variant!r}")
         Q = first.rotation if rotation is None else rotation_matrix(rotation)
         Q = Q.to(body.rest)
         velocity_ = first.velocity if velocity is None else vector("velocity", velocity)
         spin = first.angular_velocity if angular_velocity is None else vector("angular_velocity", angular_velocity)
         center = first.center.to(body.rest)
+        if position is not None:
+            center = placed(position, center)
         up = self.world.up.to(body.rest)
         arms = (body.rest - body.center) @ Q.T
         if height is not None:
@@ -126,8 +204,7 @@ class Twin:
         if colliders is not None:
             world = replace(world, colliders=colliders_from_config(colliders, "colliders"))
         check_clear(world.colliders, center + arms, "the body", "world.colliders" if colliders is None else "colliders")
-        with tqdm(total=frames - 1, desc="simulate", unit="frame", disable=not progress) as bar:
-            return body.simulate(start, world, frames, self.frame_dt, variant=variant, progress=lambda _: bar.update())
+        return start, world
 
     @torch.no_grad()
     def render(self, rollout: Rollout, size: int = 400) -> Tensor:
@@ -159,6 +236,76 @@ class Twin:
         return folder
 
 
+class TwinWorlds:
+    """A twin's body in `count` worlds that never meet, stepped together: on CUDA in the same launches, on a CPU in threads."""
+
+    def __init__(self, twin: Twin, count: int, laws: Tensor | None = None) -> None:
+        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+            raise ConfigError(f"worlds: expected a whole number of at least 1, found {count!r}")
+        if laws is not None and len(laws) != count:
+            raise ConfigError(f"laws: expected one for each of {count} worlds, found {len(laws)}")
+        self.twin, self.count, self.laws = twin, count, laws
+        self.episode: Episode | None = None
+
+    def reset(
+        self, starts: Mapping | Sequence[Mapping] | None = None, *, colliders: Sequence[Collider | Mapping] | None = None,
+        gravity: Tensor | Sequence | None = None, variant: str = "adapted", control_dt: float | None = None,
+        substeps: int | None = None, frames: int = 30, differentiable: bool = False,
+    ) -> TwinState:  # fmt: skip
+        """Begin a motion in every world; returns the state (count, ...).
+
+        starts: rotation, height, position, velocity, angular_velocity as `Twin.simulate` takes them, for all worlds or one mapping
+        for each; gravity: (count, 3) [m/s^2], None for the world's; others as `Twin.reset`. Errors: ConfigError naming the world.
+        """
+        check_frames(frames, self.count * len(self.twin.body.rest))
+        check_variant(variant)
+        each = [dict(starts or {})] * self.count if starts is None or isinstance(starts, Mapping) else list(starts)
+        if len(each) != self.count:
+            raise ConfigError(f"starts: expected one, or one for each of {self.count} worlds, found {len(each)}")
+        found = []
+        for b, given in enumerate(each):
+            if unknown := sorted(set(given) - set(STARTED)):
+                raise ConfigError(f"starts[{b}]: expected {', '.join(STARTED)}, found {', '.join(unknown)}")
+            if b and given is each[0]:
+                found.append(found[0])
+                continue
+            try:
+                found.append(self.twin._start(*(given.get(name) for name in STARTED), colliders))
+            except ConfigError as error:
+                raise ConfigError(f"starts[{b}]: {error}") from error
+        if gravity is not None:
+            gravity = numbers("gravity", gravity, f"finite numbers ({self.count}, 3)")
+            if gravity.shape != (self.count, 3):
+                raise ConfigError(f"gravity: expected shape ({self.count}, 3), found {tuple(gravity.shape)}")
+        self.episode = Episode(
+            self.twin.body, found[0][1], checked_dt(control_dt, self.twin.frame_dt), [start for start, _ in found],
+            variant=variant, frames=frames, substeps=checked_substeps(substeps), laws=self.laws, gravity=gravity,
+            differentiable=differentiable,
+        )  # fmt: skip
+        return self.episode.state
+
+    def step(self, action: Mapping[str, Any] | None = None) -> Stepped:
+        """As `Twin.step`; every command is the same in all worlds, or (count, 3), rotations (count, 3, 3), for each."""
+        if self.episode is None:
+            raise ConfigError("worlds: expected reset(...) before step and state, found no motion")
+        return self.episode.step(action)
+
+    @property
+    def state(self) -> TwinState:
+        """As `Twin.state`, of all worlds."""
+        if self.episode is None:
+            raise ConfigError("worlds: expected reset(...) before step and state, found no motion")
+        return self.episode.state
+
+    @state.setter
+    def state(self, state: TwinState) -> None:
+        if self.episode is None:
+            raise ConfigError("worlds: expected reset(...) before step and state, found no motion")
+        self.episode.state = state
+
+
+STARTED = ("rotation", "height", "position", "velocity", "angular_velocity")
+"""What a start may say, in the order of `Twin._start`."""
 FASTEST = 1e6
 """[m/s], [rad/s] of a start: the time step would be refused far below."""
 STORED_BYTES = 4 * (3 + 3 + 9 + 9)
@@ -174,15 +321,44 @@ def check_frames(frames: int, particles: int) -> None:
         raise ConfigError(f"frames: expected at most {most}, which take half of this machine's memory, found {frames}")
 
 
+def check_variant(variant: str) -> None:
+    if variant not in VARIANTS:
+        raise ConfigError(f"variant: expected one of {', '.join(VARIANTS)}, found {variant!r}")
+
+
+def checked_dt(value: float | None, default: float) -> float:
+    """[s] of a step. Errors: ConfigError."""
+    if value is None:
+        return default
+    if not is_number(value) or not value > 0:
+        raise ConfigError(f"control_dt: expected a positive number [s], found {value!r}")
+    return float(value)
+
+
+def checked_substeps(value: int | None) -> int | None:
+    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
+        raise ConfigError(f"substeps: expected a whole number of at least 1, or None, found {value!r}")
+    return value
+
+
+def placed(position: Sequence[float | None] | Tensor, center: Tensor) -> Tensor:
+    """(3,) the centre with the numbers of `position` that are not None. Errors: ConfigError."""
+    if isinstance(position, Sequence) and not isinstance(position, str) and len(position) == 3:
+        kept = [number is None for number in position]
+        found = vector("position", [0.0 if number is None else number for number in position]).to(center)
+        return torch.where(torch.tensor(kept, device=center.device), center, found)
+    return vector("position", position).to(center)
+
+
 def numbers(name: str, value: Sequence[float] | Tensor, expected: str) -> Tensor:
-    """float32 tensor of finite numbers. Errors: ConfigError naming the field."""
+    """Tensor of finite numbers, float64 where they are given so, else float32. Errors: ConfigError naming the field."""
     try:
         result = torch.as_tensor(value)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}") from error
-    if result.dtype == torch.bool or result.is_complex() or not bool(torch.isfinite(result.float()).all()):
+    if result.dtype == torch.bool or result.is_complex() or not bool(torch.isfinite(result.detach().float()).all()):
         raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}")
-    return result.float()
+    return result if result.dtype == torch.float64 else result.float()
 
 
 def rotation_matrix(value: Sequence[float] | Tensor) -> Tensor:
@@ -190,7 +366,7 @@ def rotation_matrix(value: Sequence[float] | Tensor) -> Tensor:
     expected = "(ax, ay, az, degrees) with a non-zero axis or a 3x3 rotation matrix"
     value = numbers("rotation", value, expected)
     if value.shape == (3, 3):
-        R = value.double()
+        R = value.detach().double()
         defect = float((R @ R.T - torch.eye(3).double()).abs().max())
         if defect > 1e-3 or float(torch.linalg.det(R)) < 0:
             raise ConfigError(f"rotation: expected R R^T = I and det R = 1, found a defect of {defect:.3g} and a determinant of "
@@ -206,7 +382,7 @@ def vector(name: str, value: Sequence[float]) -> Tensor:
     """(3,) tensor. Errors: ConfigError naming the field."""
     expected = f"three finite numbers within {FASTEST:g}"
     result = numbers(name, value, expected)
-    if result.shape != (3,) or float(result.abs().max()) > FASTEST:
+    if result.shape != (3,) or float(result.detach().abs().max()) > FASTEST:
         raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}")
     return result
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import torch
@@ -150,7 +151,7 @@ class Reconstruction:
 class ParticleState:
     """State between substeps. x, v: (N, 3) [m], [m/s]; C_affine: (N, 3, 3) [1/s]; F, F_tot: (N, 3, 3).
 
-    For laws without return mapping F_tot is the same tensor as F.
+    For laws without return mapping F_tot is the same tensor as F. Of B worlds: (B, N, ...) each.
     """
 
     x: Tensor
@@ -158,6 +159,15 @@ class ParticleState:
     C_affine: Tensor
     F: Tensor
     F_tot: Tensor
+
+    @classmethod
+    def stack(cls, states: Sequence[ParticleState]) -> ParticleState:
+        """The states of equally many particles each, as those of B worlds."""
+        return cls(*(torch.stack([getattr(state, f.name) for state in states]) for f in fields(cls)))
+
+    def worlds(self) -> list[ParticleState]:
+        """The states of B worlds, one by one."""
+        return [ParticleState(*parts) for parts in zip(*(getattr(self, f.name).unbind(0) for f in fields(self)))]
 
 
 @dataclass(frozen=True)
@@ -167,6 +177,7 @@ class Rollout:
     inverted: number of (particle, frame) pairs with det F <= 0. reactions: (T - 1, substeps, K, 6) force [N] and torque about the
     collider's origin [N m] that the body exerts on each of K colliders, None without colliders; a frame's mean is `.mean(1)`.
     Where the substeps vary by frame they are (T - 1, 1, K, 6), that mean. counts: substeps of each of the T - 1 frame intervals.
+    Of B worlds: x (T, B, N, 3) and so on, final (B, N, ...), reactions (T - 1, substeps, B, K, 6), see `worlds`.
     """
 
     x: Tensor
@@ -178,3 +189,12 @@ class Rollout:
     inverted: int = 0
     reactions: Tensor | None = None
     counts: tuple[int, ...] = ()
+
+    def worlds(self) -> list[Rollout]:
+        """The rollouts of B worlds, one by one; `inverted` is then of all of them."""
+        parts = zip(*(getattr(self, name).unbind(1) for name in ("x", "v", "F", "F_tot")))
+        forces = (None,) * self.x.shape[1] if self.reactions is None else self.reactions.unbind(2)
+        return [
+            replace(self, x=x, v=v, F=F, F_tot=F_tot, final=final, reactions=force)
+            for (x, v, F, F_tot), final, force in zip(parts, self.final.worlds(), forces)
+        ]

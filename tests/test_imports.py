@@ -54,8 +54,9 @@ def test_the_physics_has_no_import_circle():
 
 def test_the_physics_knows_nothing_of_learning():
     everything = imports("mosa.")
-    # ply: which files of points are safe to read; schema: kinds of single values
-    allowed = ("mosa.physics", "mosa.errors", "mosa.types", "mosa.rotations", "mosa.ply", "mosa.schema")
+    # ply: which files of points are safe to read; schema: kinds of single values; threads, limits: of the machine
+    allowed = ("mosa.physics", "mosa.errors", "mosa.types", "mosa.rotations", "mosa.ply", "mosa.schema", "mosa.threads",
+               "mosa.limits")
     outside = {name: {f for f in found if not f.startswith(allowed)}
                for name, found in everything.items() if name.startswith("mosa.physics.")}
     assert {name: found for name, found in outside.items() if found} == {}

@@ -19,6 +19,7 @@ from mosa.modules.heterogeneity import HeterogeneityField
 from mosa.modules.material import Material
 from mosa.modules.stiffness_modes import StiffnessModes
 from mosa.physics.adaptive import StepControl
+from mosa.physics.asking import AdapterOperator
 from mosa.physics.boundary import Plane
 from mosa.physics.colliders import Collider, reach
 from mosa.physics.rollout import Simulator
@@ -60,6 +61,77 @@ class World:
     box: Tensor
     planes: tuple[Plane, ...] = ()
     colliders: tuple[Collider, ...] = ()
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A body at its start, and what a simulation of it takes; or, by `stack`, the same in B worlds.
+
+    state: in the simulator's type, higher by `lift` (3,) [m], the contact's offset, than where the body is seen; arguments: of
+    `Simulator.rollout`; timing: those of substeps that vary, {} where they are fixed.
+    """
+
+    simulator: Simulator
+    state: ParticleState
+    lift: Tensor
+    arguments: dict
+    timing: dict
+
+    def simulate(
+        self, frames: int, colliders: Sequence[Collider] = (), *, collect: Callable | None = None,
+        progress: Callable[[int], None] | None = None, observed: Tensor | None = None, gain: float = 0.0,
+    ) -> Rollout:  # fmt: skip
+        """As `Body.simulate`, from here on; of a stack, the worlds at once (`Simulator.rollout_worlds`), without `collect`."""
+        simulator, stacked = self.simulator, self.state.x.ndim == 3
+        if stacked:
+            roll = partial(simulator.rollout_worlds, **self.arguments, motions=self.motions(colliders))
+        else:
+            roll = partial(simulator.rollout, **self.arguments, collect=collect, motions=self.motions(colliders))
+        lift = self.lift[:, None] if stacked else self.lift
+        if observed is None:
+            rollout = roll(self.state, frames=frames, progress=progress, **self.timing)
+        else:
+            if self.timing:
+                raise ConfigError("simulation.adaptive: expected false where a criterion corrects the prediction frame by frame")
+            seen = (observed[:frames, None] if stacked else observed[:frames]) + lift.detach()
+            rollout = corrected_rollout(roll, self.state, seen.to(self.state.x.dtype), gain, simulator.frame_dt)
+        fields = {name: getattr(rollout, name).to(self.lift.dtype) for name in ("x", "v", "F", "F_tot")}
+        return replace(rollout, **{**fields, "x": fields["x"] - lift})
+
+    def motions(self, colliders: Sequence[Collider]) -> list:
+        """Of the colliders, where the simulator sees them: the offset is the ground's, they keep their place. Of a stack, a list
+        for each world."""
+        if self.lift.ndim > 1:
+            return [[collider.motion.shifted(lift) for collider in colliders] for lift in self.lift]
+        return [collider.motion.shifted(self.lift) for collider in colliders]
+
+    def answered(self) -> Ready:
+        """With the adapter's answer now in place of the adapter, which may become another one. Errors: ConfigError where the
+        operator depends on the state."""
+        adapter = self.arguments["adapter"]
+        if adapter is None:
+            return self
+        if self.arguments["stride"] is not None:
+            raise ConfigError(f"adapter: expected one whose operator is the same in every state, found {type(adapter).__name__}")
+        state, parameters = self.state, self.arguments["parameters"]
+        held = AdapterOperator(*adapter(self.simulator.material_state(state.F, state.C_affine, parameters)))
+        return replace(self, arguments={**self.arguments, "adapter": lambda _: held})
+
+    @classmethod
+    def stack(cls, parts: Sequence[Ready]) -> Ready:
+        """B bodies of the same particles and law, each with its own numbers, `answered`, and start, as so many worlds: state
+        (B, N, ...), lift (B, 3), and arguments of `Simulator.rollout_worlds`. Errors: ConfigError where the time steps differ."""
+        first, n = parts[0], len(parts[0].arguments["volume"])
+        counts = sorted({part.simulator.substeps for part in parts})
+        if len(counts) > 1 or any(part.timing for part in parts):
+            raise ConfigError(f"worlds: expected the same fixed substeps in all, found {counts}; give substeps")
+        each = [part.arguments for part in parts]
+        parameters = {name: torch.stack([own["parameters"][name].expand(n) for own in each]) for name in each[0]["parameters"]}
+        adapters = None if each[0]["adapter"] is None else [own["adapter"] for own in each]
+        return replace(
+            first, state=ParticleState.stack([part.state for part in parts]), lift=torch.stack([part.lift for part in parts]),
+            arguments={**each[0], "parameters": parameters, "adapter": adapters},
+        )  # fmt: skip
 
 
 EVEN = 4
@@ -262,6 +334,20 @@ class Body(nn.Module):
         towards what was seen (`criteria.corrected_rollout`). substeps: of every frame, where differences hold them fixed; None: as
         many as the time step bound asks for. Errors: SimulationDiverged, ConfigError (time step).
         """
+        ready = self.ready(
+            start, world, frames, frame_dt, variant=variant, with_adapter=with_adapter, with_heterogeneity=with_heterogeneity,
+            counts=counts, substeps=substeps,
+        )  # fmt: skip
+        rollout = ready.simulate(frames, world.colliders, collect=collect, progress=progress, observed=observed, gain=gain)
+        taken = rollout.counts
+        self.last_substeps = -(-sum(taken) // len(taken)) if taken else ready.simulator.substeps
+        return rollout
+
+    def ready(
+        self, start: Start, world: World, frames: int, frame_dt: float, *, variant: str = "adapted", with_adapter: bool = True,
+        with_heterogeneity: bool = True, counts: Sequence[int] | None = None, substeps: int | None = None,
+    ) -> Ready:  # fmt: skip
+        """The body at `start`, ready to be simulated; arguments and errors as `simulate`."""
         material, contact, heterogeneity, adapter = self.parts(variant)
         if not with_heterogeneity:
             heterogeneity = None
@@ -293,25 +379,16 @@ class Body(nn.Module):
                 float(material.max_viscosity(factor.detach())),
             )  # fmt: skip
             state = self.initial_state(start, frame_dt / substeps, gravity)
-        simulator = self.simulator(material.law, substeps, frame_dt, world, getattr(adapter, "strain", None))
         lift = contact() * up
         state = replace(state, x=state.x + lift)
         state = ParticleState(*(getattr(state, name).to(dtype) for name in ("x", "v", "C_affine", "F", "F_tot")))
-        stride = None if adapter is not None and adapter.steady else self.settings.stride
-        roll = partial(
-            simulator.rollout, parameters={k: p.to(dtype) for k, p in parameters.items()}, volume=self.volume.to(dtype),
-            density=self.density, adapter=adapter, stride=stride, collect=collect,
-            motions=[c.motion.shifted(lift) for c in world.colliders],  # the offset is the ground's: they keep their place
-        )  # fmt: skip
-        if observed is None:
-            rollout = roll(state, frames=frames, progress=progress, **timing)
-        else:
-            if timing:
-                raise ConfigError("simulation.adaptive: expected false where a criterion corrects the prediction frame by frame")
-            rollout = corrected_rollout(roll, state, (observed[:frames] + lift.detach()).to(dtype), gain, frame_dt)
-        self.last_substeps = -(-sum(rollout.counts) // len(rollout.counts)) if rollout.counts else substeps
-        fields = {name: getattr(rollout, name).to(self.rest.dtype) for name in ("x", "v", "F", "F_tot")}
-        return replace(rollout, **{**fields, "x": fields["x"] - lift})
+        arguments = {
+            "parameters": {k: p.to(dtype) for k, p in parameters.items()}, "volume": self.volume.to(dtype),
+            "density": self.density, "adapter": adapter,
+            "stride": None if adapter is not None and adapter.steady else self.settings.stride,
+        }  # fmt: skip
+        simulator = self.simulator(material.law, substeps, frame_dt, world, getattr(adapter, "strain", None))
+        return Ready(simulator, state, lift, arguments, timing)
 
     def simulator(self, law: str, substeps: int, frame_dt: float, world: World, strain: str | None = None) -> Simulator:
         """The simulator of `law` in `world`, one per time step (kernels are compiled once per law and precision).

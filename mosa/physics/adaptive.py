@@ -89,11 +89,12 @@ class StepChooser:
         self.rest_modulus = law.wave_modulus(values).expand(n)
         self.viscosity = law.explicit_viscosity(values).expand(n)
         # what the frame itself can add to the speeds at its start
-        self.added_speed = math.hypot(*numerics.gravity) * self.frame_dt + collider_speed
+        self.fall, self.collider_speed = math.hypot(*numerics.gravity) * self.frame_dt, collider_speed
 
     @torch.no_grad()
-    def choose(self, frame: int, v: Tensor, C_affine: Tensor, F: Tensor) -> int:
-        """Substeps from frame - 1 to `frame`. v: (N, 3) [m/s]; C_affine, F: (N, 3, 3).
+    def choose(self, frame: int, v: Tensor, C_affine: Tensor, F: Tensor, collider_speed: float | None = None) -> int:
+        """Substeps from frame - 1 to `frame`. v: (N, 3) [m/s]; C_affine, F: (N, 3, 3); collider_speed: in this frame, None for
+        the bound in any.
 
         A law that softens in compression is not followed below its stiffness at rest: it may be back there within the frame.
         Errors: SimulationDiverged for a state that is not finite; ConfigError where more than the maximum would be needed.
@@ -110,7 +111,8 @@ class StepChooser:
         speed = (control.factor * modulus / self.density).sqrt()
         viscosity = self.viscosity * J.clamp_min(0)  # per current volume, as the mass is
         rate = speed / (control.courant * dx) + viscosity / (VISCOUS_NUMBER * self.density * dx * dx)
-        stiffest, fastest = int(rate.argmax()), float(v.norm(dim=1).max()) + self.added_speed
+        stiffest, fastest = int(rate.argmax()), float(v.norm(dim=1).max())
+        fastest += self.fall + (self.collider_speed if collider_speed is None else collider_speed)
         c, mu = float(speed[stiffest]), float(viscosity[stiffest])
         density = float(self.density[stiffest] if isinstance(self.density, Tensor) else self.density)
         if not math.isfinite(c):

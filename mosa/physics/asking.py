@@ -1,6 +1,6 @@
 """What an adapter is asked, what it may answer, and the check of its answer."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -33,6 +33,23 @@ class AdapterOperator(NamedTuple):
     h: Tensor
     plastic_G: Tensor | None = None
     plastic_h: Tensor | None = None
+
+
+class Several:
+    """An adapter for each of several worlds, asked as one: the particles of the worlds come one after another.
+
+    Errors: ConfigError for another number of adapters than worlds."""
+
+    def __init__(self, adapters: Sequence[Callable[[MaterialState], AdapterOperator]], worlds: int) -> None:
+        if len(adapters) != worlds:
+            raise ConfigError(f"adapter: expected one, or one for each of {worlds} worlds, found {len(adapters)}")
+        self.adapters = tuple(adapters)
+
+    def __call__(self, state: MaterialState) -> AdapterOperator:
+        count = len(self.adapters)
+        parts = zip(*((None,) * count if t is None else t.chunk(count) for t in state))
+        answers = [AdapterOperator(*adapter(MaterialState(*part))) for adapter, part in zip(self.adapters, parts)]
+        return AdapterOperator(*(None if own[0] is None else torch.cat(own) for own in zip(*answers)))
 
 
 def ask(

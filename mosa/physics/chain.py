@@ -24,7 +24,6 @@ from mosa.physics.asking import ANSWER
 from mosa.physics.capturing import ATTEMPTS, Captures
 from mosa.physics.mpm import WIDENED, LeftWindow, SegmentSolver, wants_gradient
 from mosa.physics.mpm_kernels import NO_EVENT
-from mosa.physics.window import fallen, grid_window
 from mosa.physics.workspace import Numerics, Workspace, copies, warp_stream
 
 MARGIN = 4
@@ -108,11 +107,10 @@ class Chain:
         learned: of the adapter as it is now; kept: leave all substeps on the tape, else nothing; full: in the buffers of the
         backward pass, which kept needs and any rollout with one has anyway. Errors: as `SegmentSolver.advance`; LeftWindow of
         chains that can be cut, with marks or of more than `WIDENED` substeps in several segments."""
-        dx, dt, total = self.numerics.dx, self.numerics.dt, self.substeps
+        dt, total = self.numerics.dt, self.substeps
         work = self._full() if full else self._light()
-        bounds = fallen(solver.bounds(state), self.numerics.gravity, total * dt)
         for margin in (MARGIN, 3 + total // 2):
-            window = grid_window(state[0], state[1], dx, total * dt, margin, bounds=bounds)
+            window = solver.windows(state, total * dt, margin, falls=True)
             self._load(work, window, solver, learned, state, packed)
             self._capture()
             self._play(("forward", full))
@@ -126,7 +124,7 @@ class Chain:
         raise solver.left_behind(flags, first, dt)
 
     def adjoint(
-        self, solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...], packed: Tensor, window: tuple[tuple, tuple],
+        self, solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...], packed: Tensor, window: tuple,
         seeds: Sequence[Tensor | None], tape: Sequence[Tensor],
     ) -> tuple[list[Tensor], Tensor, list[Tensor]]:  # fmt: skip
         """Gradients of (state, parameters, weights). learned: with the names and weights of `advance`; seeds: adjoints of what it
@@ -256,7 +254,7 @@ class Chain:
                 torch._foreach_add_(*zip(*sums))
 
     def _load(
-        self, work: Workspace, window: tuple[tuple, tuple], solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...],
+        self, work: Workspace, window: tuple, solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...],
         packed: Tensor,
     ) -> None:  # fmt: skip
         """Place the chain's start in `work`. Forget captured graphs where what they have by value or address is another one."""

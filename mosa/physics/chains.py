@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import accumulate, pairwise
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -111,13 +112,13 @@ class Chains:
         """How many frames, `count` at most, the next chain goes over: as many as keep its window not much larger than one frame's,
         and as there is room for the states of."""
         bounds, size = solver.bounds(state), sum(t.nbytes for t in state)
-        if count <= 1 or not all(math.isfinite(b) for b in bounds):
+        if count <= 1 or not np.isfinite(bounds).all():
             return 1
 
         def nodes(count: int) -> int:
             time = count * substeps * self.numerics.dt
             reach = fallen(bounds, self.numerics.gravity, time)
-            return math.prod(window_of(reach, self.numerics.dx, time, MARGIN)[1])
+            return int(window_of(reach, self.numerics.dx, time, MARGIN)[1].prod())
 
         # a state is in the graph and in the answer
         while count > 1 and (nodes(count) > min(nodes(1) + SMALL, MAX_NODES) or not room(self.numerics.device, 2 * count * size)):

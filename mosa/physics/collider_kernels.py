@@ -4,7 +4,8 @@ A node at y, r = y - position, in the collider's axes at q = R^T r, of distance 
 moves relative to the solid's velocity there, V = linear + angular x r:
     u' = u + w(phi) (V + collide(u - V, n) - u),    force on the collider f = -m (u' - u)/dt,    torque r x f
 with `collide` of `boundary` and w = 1 inside (tolerance 1e-6 m as for planes), falling to 0 over the collider's `thickness`.
-Colliders act in the order given, after the planes. The pose is the one at the start of the substep.
+Colliders act in the order given, after the planes. The pose is the one at the start of the substep. Worlds have the same solids,
+each with poses of its own: solid k of world w has column w count + k of poses and reactions.
 """
 
 from functools import cache
@@ -29,7 +30,7 @@ def collider_kernels(scalar) -> SimpleNamespace:
     shape = shape_functions(scalar)
     signed_distance, curvature = shape.signed_distance, shape.curvature
     transfers = transfer_kernels(scalar)
-    node_position, node_count = transfers.node_position, transfers.node_count
+    node_position, nodes_of = transfers.node_position, transfers.nodes_of
     load3, store3 = vector_memory(scalar).load3, vector_memory(scalar).store3
     module = f"mosa.physics.colliders_{scalar.__name__}"
 
@@ -48,18 +49,18 @@ def collider_kernels(scalar) -> SimpleNamespace:
 
     @wp.func
     def respond(
-        u: vec3, y: vec3, k: int, substep: int, shapes: wp.array2d(dtype=scalar), codes: wp.array2d(dtype=int),
+        u: vec3, y: vec3, k: int, column: int, substep: int, shapes: wp.array2d(dtype=scalar), codes: wp.array2d(dtype=int),
         fields: wp.array(dtype=scalar), position: wp.array2d(dtype=vec3), rotation: wp.array2d(dtype=mat33),
         linear: wp.array2d(dtype=vec3), angular: wp.array2d(dtype=vec3),
     ):  # fmt: skip
         """Velocity u of a node at y after collider k."""
         out = u
-        r = y - position[substep, k]
-        Q = rotation[substep, k]
+        r = y - position[substep, column]
+        Q = rotation[substep, column]
         phi, g = signed_distance(wp.transpose(Q) * r, k, shapes, codes, fields)
         w, _slope = weight(phi, shapes[k, 3])
         if w > scalar(0.0):
-            V = linear[substep, k] + wp.cross(angular[substep, k], r)
+            V = linear[substep, column] + wp.cross(angular[substep, column], r)
             hit = V + collide(u - V, Q * wp.normalize(g), codes[k, 1], shapes[k, 4])
             if w < scalar(1.0):
                 out = u + w * (hit - u)
@@ -76,18 +77,21 @@ def collider_kernels(scalar) -> SimpleNamespace:
         force: wp.array2d(dtype=vec3), torque: wp.array2d(dtype=vec3),
     ):  # fmt: skip
         """Changes velocity in place, adds to force and torque of the substep."""
-        for node in range(wp.tid(), node_count(window), threads):
+        world = wp.tid() / threads
+        first, end = nodes_of(window, world)
+        for node in range(first + wp.tid() - world * threads, end, threads):
             m = grid[node][3]
             if m > cutoff:
                 now = velocity[node]  # changed in place, which `load3` is not for
                 u = vec3(now[0], now[1], now[2])
-                y = node_position(node, window[0], window[1], dx)
+                y = node_position(node - first, window[3 * world], window[3 * world + 1], dx)
                 for k in range(count):
-                    after = respond(u, y, k, substep, shapes, codes, fields, position, rotation, linear, angular)
+                    c = world * count + k
+                    after = respond(u, y, k, c, substep, shapes, codes, fields, position, rotation, linear, angular)
                     f = (m * inv_dt) * (u - after)
                     if wp.dot(f, f) > scalar(0.0):
-                        wp.atomic_add(force, substep, k, f)
-                        wp.atomic_add(torque, substep, k, wp.cross(y - position[substep, k], f))
+                        wp.atomic_add(force, substep, c, f)
+                        wp.atomic_add(torque, substep, c, wp.cross(y - position[substep, c], f))
                     u = after
                 store3(velocity, node, u)
 
@@ -103,32 +107,35 @@ def collider_kernels(scalar) -> SimpleNamespace:
     ):  # fmt: skip
         """before: node velocities as the first collider finds them. Turns adj_velocity into theirs, writes adj_mass, adds to the
         adjoints of the pose and of the velocities."""
-        for node in range(wp.tid(), node_count(window), threads):
+        world = wp.tid() / threads
+        first, end = nodes_of(window, world)
+        for node in range(first + wp.tid() - world * threads, end, threads):
             m = grid[node][3]
             am = scalar(0.0)
             if m > cutoff:
                 now = adj_velocity[node]
                 a = vec3(now[0], now[1], now[2])
-                y = node_position(node, window[0], window[1], dx)
+                y = node_position(node - first, window[3 * world], window[3 * world + 1], dx)
                 for reverse in range(count):
                     k = count - 1 - reverse
-                    r = y - position[substep, k]
-                    Q = rotation[substep, k]
+                    c = world * count + k
+                    r = y - position[substep, c]
+                    Q = rotation[substep, c]
                     q = wp.transpose(Q) * r
                     phi, g = signed_distance(q, k, shapes, codes, fields)
                     w, slope = weight(phi, shapes[k, 3])
                     if w > scalar(0.0):
                         u = load3(before, node)
                         for j in range(k):
-                            u = respond(u, y, j, substep, shapes, codes, fields, position, rotation, linear, angular)
-                        omega = angular[substep, k]
+                            u = respond(u, y, j, c - k + j, substep, shapes, codes, fields, position, rotation, linear, angular)
+                        omega = angular[substep, c]
                         local = wp.normalize(g)
                         n = Q * local
-                        V = linear[substep, k] + wp.cross(omega, r)
+                        V = linear[substep, c] + wp.cross(omega, r)
                         D = V + collide(u - V, n, codes[k, 1], shapes[k, 4]) - u
                         # u' = u + w D,  f = -(m w/dt) D,  torque = r x f
-                        at = adj_torque[substep, k]
-                        af = adj_force[substep, k] + wp.cross(at, r)
+                        at = adj_torque[substep, c]
+                        af = adj_force[substep, c] + wp.cross(at, r)
                         f = (-m * w * inv_dt) * D
                         am = am - (w * inv_dt) * wp.dot(D, af)
                         aD = w * a - (m * w * inv_dt) * af
@@ -147,10 +154,10 @@ def collider_kernels(scalar) -> SimpleNamespace:
                         aq = curvature(q, k, shapes, codes, fields, ag) + (slope * aw) * g
                         # q = Q^T r, r = y - position
                         ar = ar + Q * aq
-                        wp.atomic_add(adj_linear, substep, k, aV)
-                        wp.atomic_add(adj_angular, substep, k, wp.cross(r, aV))
-                        wp.atomic_add(adj_rotation, substep, k, wp.outer(an, local) + wp.outer(r, aq))
-                        wp.atomic_add(adj_position, substep, k, -ar)
+                        wp.atomic_add(adj_linear, substep, c, aV)
+                        wp.atomic_add(adj_angular, substep, c, wp.cross(r, aV))
+                        wp.atomic_add(adj_rotation, substep, c, wp.outer(an, local) + wp.outer(r, aq))
+                        wp.atomic_add(adj_position, substep, c, -ar)
                 store3(adj_velocity, node, a)
             adj_mass[node] = am
 
@@ -160,7 +167,9 @@ def collider_kernels(scalar) -> SimpleNamespace:
     ):
         """What the reaction adds to the adjoint of node masses."""
         z = scalar(0.0)
-        for node in range(wp.tid(), node_count(window), threads):
+        world = wp.tid() / threads
+        first, end = nodes_of(window, world)
+        for node in range(first + wp.tid() - world * threads, end, threads):
             adj_grid[node] = adj_grid[node] + vec4(z, z, z, adj_mass[node])
 
     return SimpleNamespace(

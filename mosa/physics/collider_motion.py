@@ -115,9 +115,11 @@ class Motion:
         """The same motion moved by offset (3,) [m]."""
         return replace(self, position=torch.as_tensor(self.position, dtype=torch.float64).cpu() + offset.double().cpu())
 
-    def sample(self, frames: int, substeps: int, dt: float, start: float = 0.0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def sample(
+        self, frames: int, substeps: int, dt: float, start: float = 0.0, first: int = 0
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """(position (S, 3), rotation (S, 3, 3), linear (S, 3), angular (S, 3)) float64 at S = frames * substeps substeps of dt [s]
-        from time `start`. Errors: ConfigError naming the field."""
+        from the `first` one after time `start`. Errors: ConfigError naming the field."""
         start_position, R0 = _vectors("position", self.position).cpu(), rotation_matrices(self.rotation).cpu()
         if len(start_position) != 1:
             raise ConfigError(f"motion: position: expected (3,), found {len(start_position)} vectors: see Motion.waypoints")
@@ -135,7 +137,7 @@ class Motion:
         for turn in turns:
             attitudes.append(turn @ attitudes[-1])
         attitudes = torch.stack(attitudes)
-        t = start + dt * torch.arange(frames * substeps, dtype=torch.float64)
+        t = start + dt * torch.arange(first, first + frames * substeps, dtype=torch.float64)
         # a substep belongs to the piece that its middle is in
         piece = torch.searchsorted(times, t + 0.5 * dt, right=True) - 1
         resting = (piece < 0)[:, None]
@@ -160,15 +162,16 @@ class Motion:
             )
         return length[count] * torch.arange(count, dtype=torch.float64), count
 
-    def timed(self, frames: int, frame_dt: float) -> "Motion":
+    def timed(self, frames: int | None, frame_dt: float) -> "Motion":
         """The same motion with `times` said: what one velocity per frame interval means, whatever the substeps.
 
+        frames: intervals of the rollout, None where there may be any number of them.
         Errors: ConfigError for another number of velocities without times: substeps of varying length have no such list.
         """
         if self.times is not None:
             return self
         count = max(len(_vectors(name, getattr(self, name))) for name in ("velocity", "angular_velocity"))
-        if count not in (1, frames):
+        if frames is not None and count not in (1, frames):
             raise ConfigError(
                 f"motion: velocity and angular_velocity: expected 1 or {frames} (per frame interval) vectors where no times are "
                 f"given and the substeps vary, found {count}; give times"
@@ -194,11 +197,14 @@ class Trajectory:
     def shifted(self, offset: Tensor) -> "Trajectory":
         return replace(self, position=self.position.double().cpu() + offset.double().cpu())
 
-    def sample(self, frames: int, substeps: int, dt: float, start: float = 0.0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def sample(
+        self, frames: int, substeps: int, dt: float, start: float = 0.0, first: int = 0
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """As `Motion.sample`; `start` must be a whole number of substeps into the trajectory."""
-        first, count = round(start / dt), frames * substeps
+        begin, count = round(start / dt), frames * substeps
+        first += begin
         values = (self.position, rotation_matrices(self.rotation, 1), self.velocity, self.angular_velocity)
-        if any(len(v) < first + count for v in values) or not math.isclose(first * dt, start, abs_tol=1e-6 * dt):
+        if any(len(v) < first + count for v in values) or not math.isclose(begin * dt, start, abs_tol=1e-6 * dt):
             raise ConfigError(
                 f"trajectory: expected poses and velocities of substeps {first} to {first + count}, found "
                 f"{[len(v) for v in values]}"
@@ -245,19 +251,22 @@ class _Shifted(NamedTuple):
     trajectory: Trajectory
     origin: float
 
-    def sample(self, frames: int, substeps: int, dt: float, start: float = 0.0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        return self.trajectory.sample(frames, substeps, dt, start - self.origin)
+    def sample(
+        self, frames: int, substeps: int, dt: float, start: float = 0.0, first: int = 0
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return self.trajectory.sample(frames, substeps, dt, start - self.origin, first)
 
 
 def sample_poses(
     motions: Sequence[Motion | Trajectory], frames: int, substeps: int, dt: float, start: float, dtype: torch.dtype,
-    device: torch.device,
+    device: torch.device, first: int = 0,
 ) -> Poses:  # fmt: skip
-    """Poses of all colliders at every substep of `frames` frame intervals, in the simulator's type.
+    """Poses of all colliders at every substep of `frames` frame intervals, from the `first` substep after time `start`, in the
+    simulator's type.
 
     Errors: ConfigError naming a collider whose motion is not finite (a NaN would silently touch nothing).
     """
-    sampled = [motion.sample(frames, substeps, dt, start) for motion in motions]
+    sampled = [motion.sample(frames, substeps, dt, start, first) for motion in motions]
     for i, parts in enumerate(sampled):
         for name, part in zip(Poses._fields, parts):
             if not bool(torch.isfinite(part.detach()).all()):

@@ -12,8 +12,9 @@ from mosa.physics.colliders import PackedColliders
 class ColliderBuffers:
     """K colliders over `substeps` substeps of the workspace `work`, which holds them and is not held by them.
 
-    poses, adj_poses: position (S, K, 3), rotation (S, K, 3, 3), linear, angular (S, K, 3); reaction: force [N] and torque [N m]
-    about the collider's origin (S, K, 3), as the body exerts them on the collider in world axes.
+    poses, adj_poses: position (S, W K, 3), rotation (S, W K, 3, 3), linear, angular (S, W K, 3) of W worlds, one after another;
+    reaction: force [N] and torque [N m] about the collider's origin (S, W K, 3), as the body exerts them on the collider in
+    world axes.
     """
 
     def __init__(self, packed: PackedColliders, scalar, substeps: int, work, with_adjoint: bool) -> None:
@@ -24,7 +25,8 @@ class ColliderBuffers:
             wp.from_torch(packed.shapes, dtype=scalar), wp.from_torch(packed.codes, dtype=wp.int32),
             wp.from_torch(packed.fields, dtype=scalar),
         ]  # fmt: skip
-        vectors, matrices = (substeps, self.count, 3), (substeps, self.count, 3, 3)
+        columns = work.worlds * self.count
+        vectors, matrices = (substeps, columns, 3), (substeps, columns, 3, 3)
         vec3, mat33 = self.kernels.vec3, self.kernels.mat33
         pose = ((vectors, vec3), (matrices, mat33), (vectors, vec3), (vectors, vec3))
 

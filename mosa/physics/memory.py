@@ -2,6 +2,8 @@
 
 import torch
 
+from mosa.limits import machine_memory
+
 KEPT_SHARE = 0.25
 """Of a GPU's free memory, for the states of all substeps of a rollout, where that is enough for them."""
 KEPT_ON_CPU = 2**30
@@ -14,10 +16,10 @@ def free_memory(device: torch.device) -> int:
     return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
 
 
-def room(device: torch.device, wanted: int) -> float:
+def room(device: torch.device, wanted: int, worlds: int = 1) -> float:
     """Bytes that a rollout which could use `wanted` may keep between the passes: on a GPU all or nothing, so that a long rollout of
-    many particles stays small."""
+    many particles stays small; on a CPU as much for each of its worlds as a rollout of one, within a share of the memory."""
     if device.type != "cuda":
-        return KEPT_ON_CPU
+        return KEPT_ON_CPU if worlds == 1 else min(worlds * KEPT_ON_CPU, KEPT_SHARE * machine_memory())
     available = KEPT_SHARE * free_memory(device)
     return available if wanted < available else 0

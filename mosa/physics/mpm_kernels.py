@@ -1,8 +1,9 @@
 """Transfers between particles and grid, with hand-written adjoints: MLS-MPM, APIC, quadratic B-splines.
 
-A node (i, j, k) sits at dx (i, j, k). The grid is a window, flat, z fastest, told by two rows: its lowest node and its number of
-nodes per axis. It holds (momentum, mass) as one 4-vector, and the node velocity after gravity and contact as another, of which
-the fourth is unused. Arrays of nodes may be longer than the window.
+A node (i, j, k) sits at dx (i, j, k). Every world has a grid of its own: a window, flat, z fastest, told by three rows, its lowest
+node, its number of nodes per axis, and (place of its first node in the arrays, 0, 0). It holds (momentum, mass) as one 4-vector,
+and the node velocity after gravity and contact as another, of which the fourth is unused. Arrays of nodes may be longer than all
+windows. Particles are ordered by world, `size` in each: particle p is in world p / size, and worlds never meet.
 The adjoint of P2G is a pure gather; the adjoint of G2P scatters three numbers per node.
 Stencils are nested static loops over 3: a single loop over 27 nodes compiles to a dynamic loop.
 """
@@ -32,7 +33,7 @@ _FLIPPED = wp.constant(INVERTED)
 def transfer_kernels(scalar) -> SimpleNamespace:
     """Kernels clear, p2g, grid_update, g2p, adj_g2p, adj_grid, adj_p2g for wp.float32 or wp.float64 fields.
 
-    Those over nodes take all of the window's, whatever the number of `threads` that they are launched with."""
+    Those over nodes are launched with `threads` for each world and take all nodes of its window, however many threads that is."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
     vec4 = wp.types.vector(length=4, dtype=scalar)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
@@ -65,8 +66,10 @@ def transfer_kernels(scalar) -> SimpleNamespace:
         return vec3(wp.floor(x[0] * inv_dx - h), wp.floor(x[1] * inv_dx - h), wp.floor(x[2] * inv_dx - h))
 
     @wp.func
-    def local_cell(base: vec3, origin: wp.vec3i, dims: wp.vec3i):
-        """Index of the stencil's lowest node in the window, -1 if the stencil is not inside (or x is NaN)."""
+    def local_cell(base: vec3, window: wp.array(dtype=wp.vec3i), row: int):
+        """Index of the stencil's lowest node, -1 if the stencil is not inside the window at `row` (or x is NaN)."""
+        origin = window[row]
+        dims = window[row + 1]
         i = base[0] - scalar(origin[0])
         j = base[1] - scalar(origin[1])
         k = base[2] - scalar(origin[2])
@@ -74,21 +77,22 @@ def transfer_kernels(scalar) -> SimpleNamespace:
         z = scalar(0.0)
         if i >= z and j >= z and k >= z:
             if i <= scalar(dims[0] - 3) and j <= scalar(dims[1] - 3) and k <= scalar(dims[2] - 3):
-                r = (int(i) * dims[1] + int(j)) * dims[2] + int(k)
+                r = window[row + 2][0] + (int(i) * dims[1] + int(j)) * dims[2] + int(k)
         return r
 
     @wp.kernel(module=module, enable_backward=False)
     def p2g(
         x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), C: wp.array(dtype=mat33), F: wp.array(dtype=mat33),
         tau: wp.array(dtype=mat33), mass: wp.array(dtype=scalar), volume: wp.array(dtype=scalar),
-        window: wp.array(dtype=wp.vec3i), dx: scalar, inv_dx: scalar, dt: scalar,
+        window: wp.array(dtype=wp.vec3i), size: int, dx: scalar, inv_dx: scalar, dt: scalar,
         check_J: int, substep: int, flags: wp.array(dtype=wp.int64), grid: wp.array(dtype=vec4),
     ):  # fmt: skip
         p = wp.tid()
         xp = x[p]
         base = cell(xp, inv_dx)
-        dims = window[1]
-        n = local_cell(base, window[0], dims)
+        place = 3 * (p / size)
+        dims = window[place + 1]
+        n = local_cell(base, window, place)
         if n < 0:
             wp.atomic_min(flags, _LEFT, wp.int64(substep) * wp.int64(x.shape[0]) + wp.int64(p))
             return
@@ -160,47 +164,58 @@ def transfer_kernels(scalar) -> SimpleNamespace:
         return a
 
     @wp.func
-    def node_count(window: wp.array(dtype=wp.vec3i)):
-        return window[1][0] * window[1][1] * window[1][2]
+    def nodes_of(window: wp.array(dtype=wp.vec3i), world: int):
+        """(first, last + 1) of a world's nodes in the arrays."""
+        dims = window[3 * world + 1]
+        first = window[3 * world + 2][0]
+        return first, first + dims[0] * dims[1] * dims[2]
 
     @wp.kernel(module=module, enable_backward=False)
     def clear(window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4)):
         z = scalar(0.0)
-        for node in range(wp.tid(), node_count(window), threads):
+        world = wp.tid() / threads
+        first, end = nodes_of(window, world)
+        for node in range(first + wp.tid() - world * threads, end, threads):
             store4(grid, node, vec4(z, z, z, z))
 
     @wp.kernel(module=module, enable_backward=False)
     def grid_update(
-        window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4), impulse: vec3, cutoff: scalar,
+        window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4), impulses: wp.array(dtype=vec3), cutoff: scalar,
         dx: scalar, planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int,
         velocity: wp.array(dtype=vec4),
     ):  # fmt: skip
-        origin = window[0]
-        dims = window[1]
-        for node in range(wp.tid(), node_count(window), threads):
+        world = wp.tid() / threads
+        origin = window[3 * world]
+        dims = window[3 * world + 1]
+        impulse = impulses[world]
+        first, end = nodes_of(window, world)
+        for node in range(first + wp.tid() - world * threads, end, threads):
             g = load4(grid, node)
             u = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
             if g[3] > cutoff:
                 u = free_velocity(g, impulse)
                 if count > 0:
-                    u = contact(u, node_position(node, origin, dims, dx), planes, modes, count)
+                    u = contact(u, node_position(node - first, origin, dims, dx), planes, modes, count)
             store3(velocity, node, u)
 
     @wp.kernel(module=module, enable_backward=False)
     def adj_grid(
-        window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4), impulse: vec3, cutoff: scalar,
+        window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4), impulses: wp.array(dtype=vec3), cutoff: scalar,
         dx: scalar, planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int,
         adj_velocity: wp.array(dtype=vec4), adj_grid: wp.array(dtype=vec4),
     ):  # fmt: skip
-        origin = window[0]
-        dims = window[1]
-        for node in range(wp.tid(), node_count(window), threads):
+        world = wp.tid() / threads
+        origin = window[3 * world]
+        dims = window[3 * world + 1]
+        impulse = impulses[world]
+        first, end = nodes_of(window, world)
+        for node in range(first + wp.tid() - world * threads, end, threads):
             g = load4(grid, node)
             if g[3] > cutoff:
                 u = free_velocity(g, impulse)
                 a = load3(adj_velocity, node)
                 if count > 0:
-                    a = adj_contact(u, node_position(node, origin, dims, dx), planes, modes, count, a)
+                    a = adj_contact(u, node_position(node - first, origin, dims, dx), planes, modes, count, a)
                 a = a / g[3]
                 # v = p/m: dL/dm = -a.(p/m)/m
                 store4(adj_grid, node, vec4(a[0], a[1], a[2], -(a[0] * g[0] + a[1] * g[1] + a[2] * g[2]) / g[3]))
@@ -211,7 +226,7 @@ def transfer_kernels(scalar) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def g2p(
         x: wp.array(dtype=vec3), A: wp.array(dtype=mat33), velocity: wp.array(dtype=vec4),
-        window: wp.array(dtype=wp.vec3i), dx: scalar, inv_dx: scalar, dt: scalar,
+        window: wp.array(dtype=wp.vec3i), size: int, dx: scalar, inv_dx: scalar, dt: scalar,
         low: vec3, high: vec3, substep: int, flags: wp.array(dtype=wp.int64),
         x_new: wp.array(dtype=vec3), v_new: wp.array(dtype=vec3), C_new: wp.array(dtype=mat33),
         A_new: wp.array(dtype=mat33),
@@ -220,8 +235,9 @@ def transfer_kernels(scalar) -> SimpleNamespace:
         p = wp.tid()
         xp = x[p]
         base = cell(xp, inv_dx)
-        dims = window[1]
-        n = local_cell(base, window[0], dims)
+        place = 3 * (p / size)
+        dims = window[place + 1]
+        n = local_cell(base, window, place)
         if n < 0:
             x_new[p] = xp
             return
@@ -274,7 +290,7 @@ def transfer_kernels(scalar) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def adj_g2p(
         x: wp.array(dtype=vec3), A: wp.array(dtype=mat33), velocity: wp.array(dtype=vec4), C_new: wp.array(dtype=mat33),
-        window: wp.array(dtype=wp.vec3i), dx: scalar, inv_dx: scalar, dt: scalar,
+        window: wp.array(dtype=wp.vec3i), size: int, dx: scalar, inv_dx: scalar, dt: scalar,
         adj_x_new: wp.array(dtype=vec3), adj_v_new: wp.array(dtype=vec3), adj_C_new: wp.array(dtype=mat33),
         adj_A_new: wp.array(dtype=mat33),
         adj_x: wp.array(dtype=vec3), adj_A: wp.array(dtype=mat33), adj_velocity: wp.array(dtype=vec4),
@@ -283,8 +299,9 @@ def transfer_kernels(scalar) -> SimpleNamespace:
         p = wp.tid()
         xp = x[p]
         base = cell(xp, inv_dx)
-        dims = window[1]
-        n = local_cell(base, window[0], dims)
+        place = 3 * (p / size)
+        dims = window[place + 1]
+        n = local_cell(base, window, place)
         if n < 0:
             return
         f = xp * inv_dx - base
@@ -333,7 +350,7 @@ def transfer_kernels(scalar) -> SimpleNamespace:
     def adj_p2g(
         x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), C: wp.array(dtype=mat33), tau: wp.array(dtype=mat33),
         mass: wp.array(dtype=scalar), volume: wp.array(dtype=scalar),
-        window: wp.array(dtype=wp.vec3i), dx: scalar, inv_dx: scalar, dt: scalar,
+        window: wp.array(dtype=wp.vec3i), size: int, dx: scalar, inv_dx: scalar, dt: scalar,
         adj_grid: wp.array(dtype=vec4),
         adj_x: wp.array(dtype=vec3), adj_v: wp.array(dtype=vec3), adj_C: wp.array(dtype=mat33),
         adj_tau: wp.array(dtype=mat33),
@@ -342,8 +359,9 @@ def transfer_kernels(scalar) -> SimpleNamespace:
         p = wp.tid()
         xp = x[p]
         base = cell(xp, inv_dx)
-        dims = window[1]
-        n = local_cell(base, window[0], dims)
+        place = 3 * (p / size)
+        dims = window[place + 1]
+        n = local_cell(base, window, place)
         if n < 0:
             return
         f = xp * inv_dx - base
@@ -403,5 +421,5 @@ def transfer_kernels(scalar) -> SimpleNamespace:
 
     return SimpleNamespace(
         clear=clear, p2g=p2g, grid_update=grid_update, g2p=g2p, adj_g2p=adj_g2p, adj_grid=adj_grid, adj_p2g=adj_p2g,
-        node_position=node_position, node_count=node_count, vec3=vec3, vec4=vec4, mat33=mat33,
+        node_position=node_position, nodes_of=nodes_of, vec3=vec3, vec4=vec4, mat33=mat33,
     )  # fmt: skip

@@ -18,16 +18,16 @@ from torch import Tensor, nn
 
 from mosa.errors import ConfigError
 from mosa.physics.adaptive import StepChooser, StepControl, check_counts
-from mosa.physics.asking import AdapterOperator, MaterialState, ask
+from mosa.physics.asking import AdapterOperator, MaterialState, Several, ask
 from mosa.physics.boundary import Plane, ground_plane, pack_planes
-from mosa.physics.chains import SEGMENT, Chains
+from mosa.physics.chains import Chains
 from mosa.physics.collider_motion import Motion, Trajectory, sample_frame, sample_poses
 from mosa.physics.colliders import Collider, pack_colliders, reach
 from mosa.physics.laws import SLOTS, law_named
-from mosa.physics.memory import room
-from mosa.physics.mpm import LONGEST, LONGEST_KEPT, SegmentSolver, advance_segment, substep_bytes, wants_gradient
-from mosa.physics.particle_operations import first_advance, material_state
+from mosa.physics.mpm import Lanes, SegmentSolver, wants_gradient
+from mosa.physics.particle_operations import material_state
 from mosa.physics.plasticity import yield_factor
+from mosa.physics.stepping import STATE, Moment, Prepared, Stepper, flat, mean_force, segments
 from mosa.physics.strain import STRAINS
 from mosa.physics.workspace import SCALARS, Numerics, Steps
 from mosa.types import Ground, ParticleState, Rollout
@@ -115,17 +115,23 @@ class Simulator:
             colliders=packed_colliders, strain=strain,
         )  # fmt: skip
         self._workspaces: dict = {}
+        self._buffers, self._warm = [self._workspaces], set()  # see `Lanes`
         self._long = self.device.type == "cuda"  # a CPU gains nothing
         self.chained = self.device.type == "cuda" if chained is None else chained
         # no method: the cycle would keep a dropped simulator's buffers until the garbage collector looks
         self._ask = partial(ask, self.law, dtype)
         self._chains = Chains(self.numerics, self._ask)
 
-    def pack(self, parameters: dict[str, Tensor], particles: int, rotation: Tensor | None = None) -> Tensor:
+    def pack(
+        self, parameters: dict[str, Tensor], particles: int, rotation: Tensor | None = None, worlds: int | None = None
+    ) -> Tensor:
         """(N, SLOTS) parameters in the law's order. Values: numbers, (N,), () or, for vectors of k numbers, (N, k) or (k,).
 
-        rotation: (N, 3, 3), fills the law's reference rotation. Errors: ConfigError naming a missing, unknown or misshapen one.
+        rotation: (N, 3, 3), fills the law's reference rotation. worlds: (W N, SLOTS), one world's after the other's; values may
+        then also be (W, N) or (W, 1), vectors (W, N, k) or (W, 1, k). Errors: ConfigError naming a missing, unknown or misshapen
+        one.
         """
+        shape = (particles,) if worlds is None else (worlds, particles)
         expected = [name for name in self.law.parameters if name != self.law.reference]
         if missing := [name for name in expected if name not in parameters]:
             raise ConfigError(f"law {self.law.name!r} needs {', '.join(expected)}; missing: {', '.join(missing)}")
@@ -134,7 +140,7 @@ class Simulator:
         columns = []
         for name, size in self.law.parameters.items():
             if name == self.law.reference:
-                columns.append(rotation.detach().reshape(particles, 9))
+                columns.append(rotation.detach().reshape(*shape, 9))
                 continue
             value = parameters[name]
             if isinstance(value, int | float):
@@ -143,15 +149,16 @@ class Simulator:
             if name == "yield_stress" and "von_mises" in self.law.name.split("+"):
                 value = value * self.yield_factor  # the other laws that yield have their radius fixed
             try:
-                columns.append((value[..., None] if size == 1 else value).expand(particles, size))
+                columns.append((value[..., None] if size == 1 else value).expand(*shape, size))
             except RuntimeError:
+                each, last = "" if worlds is None else f", ({worlds}, 1%s) or ({worlds}, {particles}%s)", f", {size}" * (size > 1)
                 raise ConfigError(
                     f"parameter {name!r}: expected shape {'()' if size == 1 else f'({size},)'} or ({particles}"
-                    f"{',' if size == 1 else f', {size}'}), found {tuple(value.shape)}"
+                    f"{last or ','}){each.replace('%s', last)}, found {tuple(value.shape)}"
                 ) from None
         used = sum(self.law.parameters.values())
-        columns.append(torch.zeros(particles, SLOTS - used, dtype=self.dtype, device=self.device))
-        return torch.cat(columns, 1)
+        columns.append(torch.zeros(*shape, SLOTS - used, dtype=self.dtype, device=self.device))
+        return torch.cat(columns, -1).flatten(0, -2)
 
     def rollout(
         self,
@@ -186,111 +193,233 @@ class Simulator:
         frame_dt/counts[-1] of an earlier rollout that this one goes on from, None: the first substep's dt, as with a fixed step.
         Frame 0 of the result holds the state as given. Errors: SimulationDiverged naming substep and particle; ConfigError.
         """
-        if frames < 1 or (stride is not None and stride < 1):
-            raise ConfigError(f"frames and stride: expected at least 1, found {frames} and {stride}")
-        n = len(state.x)
-        self._check(state, volume)
-        volume = volume.detach().contiguous()
-        density, mean_mass = self._density(density, volume)
-        C = state.C_affine if started or self.init_affine == "spin" else torch.zeros_like(state.C_affine)
-        F, F_tot = state.F, state.F_tot if self.law.plastic else state.F
-        rotation = _polar(F) if self.law.reference is not None else None
-        packed = self.pack(parameters, n, rotation)
-        cutoff = self.mass_cutoff
-        if cutoff is None:
-            cutoff = 0.0 if self.dtype == torch.float64 else 1e-12 * mean_mass
-        solver = SegmentSolver(self.numerics, volume, density, cutoff, self._workspaces)
-        held = {"parameters": packed, "G": None, "h": None, "plastic_G": None, "plastic_h": None}
-        recorded = {"x": [state.x], "v": [state.v], "F": [F], "F_tot": [F_tot]}
-        motions = self._motions(motions)
-        given, chooser, variable = None, None, control is not None or counts is not None
-        if counts is not None:
-            given = check_counts(counts, frames)
-        elif variable:
-            solids = max((m.max_speed(reach(c.shape)) for m, c in zip(motions, self.colliders)), default=0.0)
-            chooser = StepChooser(control, self.numerics, parameters, packed, density, self.frame_dt, solids)
+        prepared = self._prepare(state, parameters, volume, density, adapter, stride, collect, frames)
+        motions, variable = self._motions(motions), control is not None or counts is not None
+        given = None if counts is None else check_counts(counts, frames)
+        chooser = self._chooser(control, prepared, parameters, density, motions) if variable and given is None else None
+        poses = () if variable else self._poses(motions, frames, start_time)
+        current = (state.x, state.v, self._affine(state, started), state.F, state.F_tot if self.law.plastic else state.F)
+        recorded = {"x": [state.x], "v": [state.v], "F": [current[3]], "F_tot": [current[4]]}
 
         def substeps_of(frame: int, v: Tensor, C: Tensor, F: Tensor) -> int:
             if not variable:
                 return self.substeps
             return given[frame - 1] if given is not None else chooser.choose(frame, v, C, F)
 
-        taken = [substeps_of(1, state.v, C, F)] if frames > 1 else []
+        taken = [substeps_of(1, *current[1:4])] if frames > 1 else []
         if not started:
-            numerics = replace(self.numerics, dt=self.frame_dt / taken[0]) if taken else self.numerics
-            if self.law.plastic:
-                F_tot = F_tot + numerics.dt * (C @ F_tot)
-                operator = self._ask(adapter, F, C, packed, collect) if adapter is not None else held
-                F = first_advance(numerics, F, C, packed, operator["plastic_G"], operator["plastic_h"])
-            else:
-                F = F_tot = first_advance(numerics, F, C, packed)
-        if adapter is not None and stride is None:
-            held.update(self._ask(adapter, F, C, packed, collect))
-            adapter = None  # answered: nothing cuts the segments
-        chained = self.chained and isinstance(adapter, nn.Module) and not variable and not self.colliders
-        current = (state.x, state.v, C, F, F_tot)
+            current = prepared.first_advance(current, self.frame_dt / taken[0] if taken else self.dt)
+        prepared.settle(current)
+        chained = self.chained and isinstance(prepared.adapter, nn.Module) and not variable and not self.colliders
         if chained:
-            lengths = _segments(self.substeps, stride)
-            states = self._chains.frames(solver, adapter, current, packed, frames - 1, lengths, collect)
-        poses = () if variable else self._poses(motions, frames, start_time)
+            solver, lengths = prepared.lanes.solvers[0], segments(self.substeps, stride)
+            states = self._chains.frames(solver, adapter, current, prepared.packed, frames - 1, lengths, collect)
+        wanted, total = wants_gradient((*current, *prepared.held.values(), *poses)), (frames - 1) * self.substeps
+        if not chained:
+            prepared.give_memory(total, wanted)
+        prepared.choose_lengths(total, wanted, variable)
         reactions = []
-        wanted = wants_gradient((*current, *held.values(), *poses))
-        if not chained and (wanted or (adapter is not None and torch.is_grad_enabled())):
-            solver.room = room(self.device, (frames - 1) * self.substeps * substep_bytes(self.numerics, n))
-        most_alone = SEGMENT
-        if self._long and not variable and not wanted:
-            most_alone = LONGEST
-        elif self._long and not variable and solver.room:
-            most_alone = max(SEGMENT, min(LONGEST_KEPT, (frames - 1) * self.substeps // 8))
         for frame in range(1, frames):
             if frame > 1:
-                taken.append(substeps_of(frame, current[1], current[2], current[3]))
+                taken.append(substeps_of(frame, *current[1:4]))
             count, first = taken[-1], sum(taken[:-1])
             dt = self.frame_dt / count
             if variable:
                 steps = Steps(dt if lag is None else 0.5 * (lag + dt), dt)
                 along = self._poses_of_frame(motions, frames, taken, start_time, given is not None)
-                lengths = _segments(count, SEGMENT if adapter is None else stride)  # sizes that many counts share
             else:
                 steps, along = None, tuple(part[first : first + count] for part in poses)
-                lengths = _segments(count, None if adapter is None else stride, most_alone)
             if chained:
                 current, forces = next(states), None
             else:
-                current, forces = self._frame(solver, adapter, packed, current, held, lengths, first, along, steps, collect)
+                current, forces = prepared.frame(current, prepared.lengths(count, variable), first, along, steps)
             lag = dt
             if forces is not None:
-                reactions.append(_mean_force(forces, steps) if variable else forces)
+                reactions.append(mean_force(forces, steps) if variable else forces)
             for name, value in zip(recorded, (current[0], current[1], current[3], current[4])):
                 recorded[name].append(value)
             if progress is not None:
                 progress(frame)
+        return self._recorded(recorded, current, reactions, taken)
+
+    def rollout_worlds(
+        self,
+        state: ParticleState,
+        parameters: dict[str, Tensor],
+        volume: Tensor,
+        density: float | Tensor,
+        frames: int,
+        adapter: Callable | Sequence[Callable] | None = None,
+        stride: int | None = 1,
+        progress: Callable[[int], None] | None = None,
+        started: bool = False,
+        motions: Sequence | None = None,
+        start_time: float = 0.0,
+        gravity: Tensor | Sequence | None = None,
+        together: int | None = None,
+    ) -> Rollout:
+        """B rollouts of the same body at once, as `rollout` with the fixed time step: a leading dimension for the worlds.
+
+        state: x (B, N, 3) and so on; parameters: as in `rollout`, where they are the same in all worlds, or (B, 1) or (B, N),
+        vectors (B, 1, k) or (B, N, k). adapter: one for all worlds, which is asked for all particles, (B N, ...), or one for each.
+        motions: of the colliders in every world, B sequences, or one sequence of K for all. gravity: (B, 3) [m/s^2], where it is
+        not the simulator's in all worlds. volume (N,), density, frames, stride, progress, started, start_time: as `rollout`.
+        together: worlds that go through the same launches: all of them on a CUDA device, where they fill it, and one on a CPU,
+        where as many worlds as there are cores advance at a time; it divides B.
+        Returns a `Rollout` with x (T, B, N, 3) and so on, reactions (T - 1, substeps, B, K, 6): `Rollout.worlds` parts it. On a
+        CPU each world has the bits of its own `rollout`, where gradients of what worlds share are summed over them.
+        Errors: as `rollout`; SimulationDiverged names the world: none of the others is returned.
+        """
+        worlds = self._check_worlds(state, together)
+        gravities = self._gravities(gravity, worlds)
+        prepared = self._prepare(state, parameters, volume, density, adapter, stride, None, frames, worlds, gravities, together)
+        each = self._motions_of_worlds(motions, worlds)
+        poses = [self._poses(own, frames, start_time) for own in each]
+        poses = tuple(torch.cat(parts, 1) for parts in zip(*poses))
+        C = self._affine(state, started)
+        current = flat(replace(state, C_affine=C, F_tot=state.F_tot if self.law.plastic else state.F))
+        recorded = {name: [value] for name, value in zip(("x", "v", "F", "F_tot"), (*current[:2], *current[3:]))}
+        if not started:
+            current = prepared.first_advance(current, self.dt)
+        prepared.settle(current)
+        wanted, total = wants_gradient((*current, *prepared.held.values(), *poses)), (frames - 1) * self.substeps
+        prepared.give_memory(total, wanted)
+        prepared.choose_lengths(total, wanted, False)
+        lengths, reactions = prepared.lengths(self.substeps, False), []
+        for frame in range(1, frames):
+            first = (frame - 1) * self.substeps
+            along = tuple(part[first : first + self.substeps] for part in poses)
+            current, forces = prepared.frame(current, lengths, first, along, None)
+            reactions += [] if forces is None else [forces]
+            for name, value in zip(recorded, (current[0], current[1], current[3], current[4])):
+                recorded[name].append(value)
+            if progress is not None:
+                progress(frame)
+        found = self._recorded(recorded, current, reactions, [self.substeps] * (frames - 1))
+        apart = {name: getattr(found, name).unflatten(1, (worlds, -1)) for name in ("x", "v", "F", "F_tot")}
+        final = ParticleState(*(getattr(found.final, name).unflatten(0, (worlds, -1)) for name in STATE))
+        forces = None if found.reactions is None else found.reactions.unflatten(2, (worlds, -1))
+        return replace(found, **apart, final=final, reactions=forces)
+
+    def stepper(
+        self,
+        state: ParticleState,
+        parameters: dict[str, Tensor],
+        volume: Tensor,
+        density: float | Tensor,
+        adapter: Callable | Sequence[Callable] | None = None,
+        stride: int | None = 1,
+        *,
+        started: bool = False,
+        motions: Sequence | None = None,
+        gravity: Tensor | Sequence | None = None,
+        together: int | None = None,
+        control: StepControl | None = None,
+        steps: int = 30,
+    ) -> tuple[Stepper, Moment]:
+        """(what advances a body, or B of them, frame by frame, the moment to start from); arguments as `rollout` and
+        `rollout_worlds`.
+
+        state: x (N, 3), or (B, N, 3) of B worlds. control: choose the substeps of every frame (one world only). steps: for which
+        there shall be memory to keep all states, where a gradient is wanted; there may be more. Every step gives the bits of the
+        same frame of a rollout. Errors: ConfigError.
+        """
+        worlds = None if state.x.ndim == 2 else self._check_worlds(state, together)
+        if worlds is not None and control is not None:
+            raise ConfigError("control: expected None with many worlds, which take the same substeps")
+        if worlds is None and (gravity is not None or together is not None):
+            raise ConfigError("gravity and together: expected None without worlds; gravity is the simulator's")
+        gravities = None if worlds is None else self._gravities(gravity, worlds)
+        prepared = self._prepare(state, parameters, volume, density, adapter, stride, None, 1, worlds, gravities, together)
+        each = [self._motions(motions)] if worlds is None else self._motions_of_worlds(motions, worlds)
+        each = [[m.timed(None, self.frame_dt) if isinstance(m, Motion) else m for m in own] for own in each]
+        chooser = None
+        if control is not None:
+            chooser = self._chooser(control, prepared, parameters, density, each[0])
+        current = replace(state, C_affine=self._affine(state, started), F_tot=state.F_tot if self.law.plastic else state.F)
+        parts = tuple(getattr(current, name) for name in STATE) if worlds is None else flat(current)
+        prepared.settle(parts)
+        prepared.give_memory(steps * self.substeps, torch.is_grad_enabled())
+        stepper = Stepper(prepared, worlds, self.substeps, self.frame_dt, chooser, each, self.dtype)
+        return stepper, Moment(current, self.substeps if started else 0)
+
+    def _prepare(
+        self, state: ParticleState, parameters: dict[str, Tensor], volume: Tensor, density: float | Tensor, adapter, stride,
+        collect, frames: int, worlds: int | None = None, gravities: Sequence[tuple] | None = None, together: int | None = None,
+    ) -> Prepared:  # fmt: skip
+        """What a rollout needs besides its state. Errors: ConfigError."""
+        if frames < 1 or (stride is not None and stride < 1):
+            raise ConfigError(f"frames and stride: expected at least 1, found {frames} and {stride}")
+        self._check(state, volume)
+        volume, n, count = volume.detach().contiguous(), len(volume), worlds or 1
+        density, mean_mass = self._density(density, volume)
+        F = state.F if worlds is None else state.F.flatten(0, 1)
+        packed = self.pack(parameters, n, _polar(F) if self.law.reference is not None else None, worlds)
+        cutoff = self.mass_cutoff
+        if cutoff is None:
+            cutoff = 0.0 if self.dtype == torch.float64 else 1e-12 * mean_mass
+        if worlds is None:
+            solvers = [SegmentSolver(self.numerics, volume, density, cutoff, self._workspaces)]
+        else:
+            size = together or (worlds if self.device.type == "cuda" else 1)
+            volume, density = (t.repeat(size) if isinstance(t, Tensor) else t for t in (volume, density))
+            solvers = [
+                SegmentSolver(self.numerics, volume, density, cutoff, self._workspaces, 0.0, gravities[i : i + size], i)
+                for i in range(0, worlds, size)
+            ]
+        if isinstance(adapter, Sequence):
+            adapter = Several(adapter, count)
+        lanes = Lanes(solvers, self._buffers, self._warm)
+        return Prepared(self.numerics, self._ask, lanes, packed, adapter, stride, collect, self._long)
+
+    def _affine(self, state: ParticleState, started: bool) -> Tensor:
+        return state.C_affine if started or self.init_affine == "spin" else torch.zeros_like(state.C_affine)
+
+    def _chooser(
+        self, control: StepControl, prepared: Prepared, parameters: dict[str, Tensor], density: float | Tensor, motions
+    ) -> StepChooser:
+        solids = max((m.max_speed(reach(c.shape)) for m, c in zip(motions, self.colliders)), default=0.0)
+        density = density if isinstance(density, Tensor) and density.ndim else float(density)
+        return StepChooser(control, self.numerics, parameters, prepared.packed, density, self.frame_dt, solids)
+
+    def _recorded(
+        self, recorded: dict[str, list[Tensor]], current: tuple[Tensor, ...], reactions: list[Tensor], taken: list[int]
+    ) -> Rollout:
         stacked = {name: torch.stack(values) for name, values in recorded.items() if name != "F_tot"}
         stacked["F_tot"] = torch.stack(recorded["F_tot"]) if self.law.plastic else stacked["F"]
+        frames = len(recorded["x"])
         times = self.frame_dt * torch.arange(frames, dtype=self.dtype, device=self.device)
         inverted = int((_determinant(stacked["F"].detach()) <= 0).sum())
         if inverted and self.on_inversion == "warn":
-            warnings.warn(f"{inverted} particle states with det F <= 0 in {frames} frames", stacklevel=2)
+            warnings.warn(f"{inverted} particle states with det F <= 0 in {frames} frames", stacklevel=3)
         per_frame = torch.stack(reactions) if reactions else None
         return Rollout(
             **stacked, times=times, final=ParticleState(*current), inverted=inverted, reactions=per_frame, counts=tuple(taken)
         )
 
-    def _frame(
-        self, solver: SegmentSolver, adapter: Callable | None, packed: Tensor, state: tuple[Tensor, ...], held: dict,
-        lengths: list[int], first: int, poses: tuple[Tensor, ...], steps: Steps | None, collect: Callable | None,
-    ) -> tuple[tuple[Tensor, ...], Tensor | None]:  # fmt: skip
-        """(state after the segments of a frame, reactions (substeps, K, 6) or None). first: number of its first substep."""
-        forces, done = [], 0
-        for length in lengths:
-            if adapter is not None:
-                held.update(self._ask(adapter, state[3], state[2], packed, collect))
-            along = tuple(part[done : done + length] for part in poses)
-            state, reaction = advance_segment(solver, state, held, length, first + done, along, steps)
-            forces += [torch.cat(reaction, -1)] if reaction else []
-            steps = None if steps is None else Steps(steps.dt, steps.dt)
-            done += length
-        return state, torch.cat(forces) if forces else None
+    def _check_worlds(self, state: ParticleState, together: int | None) -> int:
+        """The number of worlds. Errors: ConfigError."""
+        if state.x.ndim != 3:
+            raise ConfigError(f"x: expected shape (worlds, particles, 3), found {tuple(state.x.shape)}")
+        worlds = len(state.x)
+        if together is not None and (together < 1 or worlds % together):
+            raise ConfigError(f"together: expected a divisor of the {worlds} worlds, found {together}")
+        return worlds
+
+    def _gravities(self, gravity: Tensor | Sequence | None, worlds: int) -> tuple[tuple[float, float, float], ...]:
+        if gravity is None:
+            return (self.numerics.gravity,) * worlds
+        gravity = torch.as_tensor(gravity, dtype=torch.float64)
+        if tuple(gravity.shape) != (worlds, 3) or not bool(torch.isfinite(gravity).all()):
+            raise ConfigError(f"gravity: expected finite numbers of shape ({worlds}, 3), found shape {tuple(gravity.shape)}")
+        return tuple(map(tuple, gravity.tolist()))
+
+    def _motions_of_worlds(self, motions: Sequence | None, worlds: int) -> list[Sequence[Motion | Trajectory]]:
+        if motions is None or not any(isinstance(own, Sequence) for own in motions):
+            return [self._motions(motions)] * worlds
+        if len(motions) != worlds:
+            raise ConfigError(f"motions: expected one sequence for each of {worlds} worlds, found {len(motions)}")
+        return [self._motions(own) for own in motions]
 
     def _motions(self, motions: Sequence[Motion | Trajectory] | None) -> Sequence[Motion | Trajectory]:
         motions = [collider.motion for collider in self.colliders] if motions is None else motions
@@ -317,8 +446,8 @@ class Simulator:
         return MaterialState(*material_state(self.law, F, C_affine, self.pack(parameters, len(F), rotation)))
 
     def _check(self, state: ParticleState, volume: Tensor) -> None:
-        n = len(state.x)
-        shapes = {"x": (n, 3), "v": (n, 3), "C_affine": (n, 3, 3), "F": (n, 3, 3), "F_tot": (n, 3, 3)}
+        *worlds, n = state.x.shape[:-1]
+        shapes = {name: (*worlds, n, 3) if name in ("x", "v") else (*worlds, n, 3, 3) for name in STATE}
         values = {name: (getattr(state, name), shape) for name, shape in shapes.items()} | {"volume": (volume, (n,))}
         for name, (value, shape) in values.items():
             if tuple(value.shape) != shape or value.dtype != self.dtype or value.device.type != self.device.type:
@@ -348,20 +477,6 @@ class Simulator:
         if not densities:
             raise ConfigError("density: expected positive numbers [kg/m^3] for all particles")
         return density, mass
-
-
-def _segments(substeps: int, stride: int | None, most: int = 0) -> list[int]:
-    """Lengths of a frame's segments: `stride` each (the last may be shorter), or nearly equal ones of at most `most`."""
-    if stride is None:
-        count = -(-substeps // most)
-        return [substeps // count + (i < substeps % count) for i in range(count)]
-    return [min(stride, substeps - i) for i in range(0, substeps, stride)]
-
-
-def _mean_force(forces: Tensor, steps: Steps) -> Tensor:
-    """(1, K, 6) of (S, K, 6): the impulse over the time in which it acted, the first substep's being its kick."""
-    longer = steps.kick / steps.dt - 1
-    return (longer * forces[:1] + forces.sum(0, keepdim=True)) / (len(forces) + longer)
 
 
 def _determinant(F: Tensor) -> Tensor:

@@ -1,8 +1,8 @@
 """The window of grid nodes that a segment works on: where the particles are and may come to."""
 
-import math
-from collections.abc import Sequence
+from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -10,6 +10,8 @@ from mosa.errors import SimulationDiverged
 
 MAX_NODES = 2**23
 """Nodes of the largest window: 200 cells across."""
+MOST_NODES = 2**30
+"""Nodes of the windows of all worlds together: the kernels count them in 32 bits."""
 FARTHEST = 2**30
 """Nodes of the farthest window from the origin."""
 SMALL = 2**16
@@ -21,55 +23,60 @@ TURNED = 0.5
 
 
 def extent(x: Tensor, v: Tensor) -> Tensor:
-    """(12,): lowest and highest x (N, 3), lowest and highest v (N, 3). NaN stays."""
-    return torch.cat([*torch.aminmax(x, dim=0), *torch.aminmax(v, dim=0)])
+    """(..., 12): lowest and highest x (..., N, 3), lowest and highest v (..., N, 3). NaN stays."""
+    return torch.cat([*torch.aminmax(x, dim=-2), *torch.aminmax(v, dim=-2)], -1)
 
 
-def fallen(bounds: Sequence[float], gravity: Sequence[float], time: float) -> list[float]:
-    """`extent` with the velocities of a body that gravity (3,) [m/s^2] pulls on for `time` seconds."""
-    lowest = [v + min(g * time, 0.0) for v, g in zip(bounds[6:9], gravity)]
-    highest = [v + max(g * time, 0.0) for v, g in zip(bounds[9:], gravity)]
-    return [*bounds[:6], *lowest, *highest]
+def fallen(bounds: np.ndarray, gravity: np.ndarray, time: float) -> np.ndarray:
+    """`extent` (..., 12) with the velocities of bodies that gravity (..., 3) [m/s^2] pulls on for `time` seconds."""
+    bounds, gained = np.array(bounds, dtype=np.float64), np.asarray(gravity, dtype=np.float64) * time
+    bounds[..., 6:9] += np.minimum(gained, 0.0)
+    bounds[..., 9:] += np.maximum(gained, 0.0)
+    return bounds
 
 
 def grid_window(
-    x: Tensor, v: Tensor, dx: float, time: float, margin: int, bounds: Sequence[float] | None = None
-) -> tuple[tuple, tuple]:
-    """(lowest node, nodes per axis) that hold the stencils of all particles for `time` seconds.
+    x: Tensor, v: Tensor, dx: float, time: float, margin: int, bounds: np.ndarray | None = None,
+    name: Callable[[int], str] = lambda world: "",
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """(lowest node, nodes per axis) (..., 3) that hold the stencils of all particles of each world for `time` seconds.
 
-    x, v: (N, 3); bounds: their extent, where the host has it already. Errors: SimulationDiverged for non-finite input or particles
-    spread over more than 2^23 nodes.
+    x, v: (..., N, 3); bounds: their extent, where the host has it already; name: of a world, for messages. Errors:
+    SimulationDiverged for non-finite input or particles of a world spread over more than 2^23 nodes.
     """
-    bounds = extent(x, v).tolist() if bounds is None else bounds  # the only transfer to the host
-    if not all(math.isfinite(b) for b in bounds):
+    bounds = extent(x, v).numpy(force=True) if bounds is None else bounds  # the only transfer to the host
+    rows = np.reshape(bounds, (-1, 12))
+    if not np.isfinite(rows).all():
+        world = int((~np.isfinite(rows)).any(1).nonzero()[0][0])
+        x, v = (t.reshape(len(rows), -1, 3)[world] for t in (x, v))
         bad = int((~(torch.isfinite(x).all(1) & torch.isfinite(v).all(1))).nonzero()[0])
-        raise SimulationDiverged(f"particle {bad} has a non-finite position or velocity before the substep")
+        raise SimulationDiverged(f"{name(world)}particle {bad} has a non-finite position or velocity before the substep")
     low, dims = window_of(bounds, dx, time, margin)
-    if max(map(abs, low)) + max(dims) > FARTHEST:
+    far = np.abs(low).max(-1) + dims.max(-1)
+    if (far > FARTHEST).any():
+        world = int(np.argmax(far))
         raise SimulationDiverged(
-            f"a particle is {max(map(abs, bounds[:6])):.3g} m from the origin, more than {FARTHEST} nodes of {dx} m: use more "
-            "substeps, or a box"
+            f"{name(world)}a particle is {np.abs(rows[world, :6]).max():.3g} m from the origin, more than {FARTHEST} nodes of {dx} "
+            "m: use more substeps, or a box"
         )
-    if math.prod(dims) > MAX_NODES:
+    nodes = dims.prod(-1)
+    if (nodes > MAX_NODES).any() or nodes.sum() > MOST_NODES:
+        world = int(np.argmax(nodes))
         raise SimulationDiverged(
-            f"particles spread over {list(dims)} grid nodes of {dx} m (speeds to {_largest_speed(bounds):.3g} m/s): use more "
-            "substeps, or a box"
+            f"{name(world)}particles spread over {dims.reshape(-1, 3)[world].tolist()} grid nodes of {dx} m (speeds to "
+            f"{np.abs(rows[world, 6:]).max():.3g} m/s): use more substeps, or a box"
         )
     return low, dims
 
 
-def _largest_speed(bounds: Sequence[float]) -> float:
-    """Largest component of a velocity."""
-    return max(map(abs, bounds[6:]))
+def window_of(bounds: np.ndarray, dx: float, time: float, margin: int) -> tuple[np.ndarray, np.ndarray]:
+    """As `grid_window`, of extents (..., 12) and of any size."""
+    bounds = np.asarray(bounds, dtype=np.float64)
+    turned = TURNED * np.abs(bounds[..., 6:]).max(-1, keepdims=True)  # by the largest component of a velocity
 
+    def nodes(speed: np.ndarray) -> np.ndarray:
+        return np.ceil(np.maximum(GAINED * speed, turned) * time / dx) + margin
 
-def window_of(bounds: Sequence[float], dx: float, time: float, margin: int) -> tuple[tuple, tuple]:
-    """As `grid_window`, of an extent and of any size."""
-    turned = TURNED * _largest_speed(bounds)
-
-    def nodes(speed: float) -> int:
-        return math.ceil(max(GAINED * speed, turned) * time / dx) + margin
-
-    low = [math.floor(x / dx - 0.5) - nodes(-v) for x, v in zip(bounds[:3], bounds[6:9])]
-    high = [math.floor(x / dx - 0.5) + 2 + nodes(v) for x, v in zip(bounds[3:6], bounds[9:])]
-    return tuple(low), tuple(h - l + 1 for l, h in zip(low, high))
+    low = np.floor(bounds[..., :3] / dx - 0.5) - nodes(-bounds[..., 6:9])
+    high = np.floor(bounds[..., 3:6] / dx - 0.5) + 2 + nodes(bounds[..., 9:])
+    return low.astype(np.int64), (high - low + 1).astype(np.int64)

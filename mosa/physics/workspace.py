@@ -6,12 +6,12 @@ CPU the 10 us that Python takes for each. The grid's window is read from memory 
 than it: a body that moves or speeds up goes through the same graphs.
 """
 
-import math
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -30,10 +30,10 @@ SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
 
 @dataclass(frozen=True)
 class Numerics:
-    """What is constant over a rollout. dx [m], dt [s] where the step is fixed, gravity (3,) [m/s^2], planes (P, 5) and modes (P,)
-    from `pack_planes`, low and high (3,) [m] corners of the admissible domain, norm_eps under the root of yield norms, colliders
-    None where there are none, strain: measure of an operator that is a stiffness (`stress_kernel`), None for one that acts on the
-    stress."""
+    """What is constant over a rollout and the same in all worlds, but for gravity where each has its own. dx [m], dt [s] where the
+    step is fixed, gravity (3,) [m/s^2], planes (P, 5) and modes (P,) from `pack_planes`, low and high (3,) [m] corners of the
+    admissible domain, norm_eps under the root of yield norms, colliders None where there are none, strain: measure of an operator
+    that is a stiffness (`stress_kernel`), None for one that acts on the stress."""
 
     law: Law
     dtype: torch.dtype
@@ -105,15 +105,17 @@ def copies(tensors: Sequence[Tensor]) -> list[Tensor]:
 class Workspace:
     """Buffers for N particles and `slots` stored substeps (2 states and 1 grid when nothing is stored).
 
-    adapted, plastic_adapted: whether a stress operator and a plastic operator act; with_adjoint: also buffers for the adjoint;
-    pointed: no buffers for the operators, which only `point` gives.
+    worlds: among which the particles are shared in equal parts, one world's after the other's; adapted, plastic_adapted: whether a
+    stress operator and a plastic operator act; with_adjoint: also buffers for the adjoint; pointed: no buffers for the operators,
+    which only `point` gives.
     """
 
     @torch.inference_mode(False)
     def __init__(
         self, numerics: Numerics, particles: int, substeps: int, *, adapted: bool, plastic_adapted: bool, with_adjoint: bool,
-        pointed: bool = False,
+        pointed: bool = False, worlds: int = 1,
     ) -> None:  # fmt: skip
+        self.worlds, self.size = worlds, particles // worlds
         self.numerics, self.particles, self.substeps, self.with_adjoint = numerics, particles, substeps, with_adjoint
         self.scalar = SCALARS[numerics.dtype]
         self.kernels = transfer_kernels(self.scalar)
@@ -156,7 +158,9 @@ class Workspace:
             self.all_adj_wp = wp.from_torch(buffer, dtype=self.scalar)
             self.adj_operator_wp = wp.from_torch(buffer[parts[1].storage_offset() :], dtype=self.scalar)
         self.flags, self.flags_wp = self.array((4,), wp.int64, torch.int64)
-        self.window, self.window_wp = self.array((2, 3), wp.vec3i, torch.int32)
+        self.window, self.window_wp = self.array((3 * worlds, 3), wp.vec3i, torch.int32)
+        # what gravity adds to node velocities in the first substep of a segment and in the others
+        self.impulses, self.impulses_wp = self._per_slot(2, (worlds, 3), self.kernels.vec3)
         self.planes_wp = wp.from_torch(numerics.planes, dtype=self.scalar)
         self.modes_wp = wp.from_torch(numerics.modes, dtype=wp.int32)
         self.colliders = None
@@ -164,7 +168,8 @@ class Workspace:
             self.colliders = ColliderBuffers(numerics.colliders, self.scalar, substeps, self, with_adjoint)
         self.cutoff = 0.0
         self.nodes = self.capacity = self.allocations = 0
-        self._placed: tuple | None = None
+        self._placed: np.ndarray | None = None
+        self._pulled: tuple | None = None
         self.steps = Steps(numerics.dt, numerics.dt)
         self._graphs: dict[tuple, object] = {}
         self._captures = Captures("substeps cannot be captured as a graph and are launched one by one")
@@ -192,18 +197,21 @@ class Workspace:
         return [part[0]._base for part in parts]
 
     def grid_slots(self) -> Tensor:
-        """(2, slots, nodes of the window, 4): momentum and mass, velocity."""
+        """(2, slots, nodes of the windows, 4): momentum and mass, velocity."""
         return self.fields[:, :, : self.nodes]
 
-    def set_window(self, origin: tuple[int, int, int], dims: tuple[int, int, int]) -> None:
-        """Place the grid: lowest node and number of nodes per axis. Buffers and graphs are new where there is no room for them."""
-        nodes = math.prod(dims)
+    def set_window(self, origins: np.ndarray, dims: np.ndarray) -> None:
+        """Place the grids: lowest node and number of nodes per axis, (W, 3), or (3,) for all worlds. Buffers and graphs are new
+        where there is no room for them."""
+        rows = np.zeros((self.worlds, 3, 3), dtype=np.int32)
+        rows[:, 0], rows[:, 1] = origins, dims
+        ends = rows[:, 1].prod(-1, dtype=np.int64).cumsum()
+        rows[1:, 2, 0], nodes = ends[:-1], int(ends[-1])
         if not nodes <= self.capacity <= max(IDLE * nodes, SMALL):
             self._allocate_nodes(nodes + max(nodes // SPARE, min(nodes // 2, SMALL)))
-        if self._placed != (origin, dims):
-            rows = torch.tensor([origin, dims], dtype=torch.int32)
-            self.window.copy_(rows, non_blocking=True)  # CUDA stages it before it returns
-            self._placed, self.nodes = (origin, dims), nodes
+        if self._placed is None or not np.array_equal(rows, self._placed):
+            self.window.copy_(torch.from_numpy(rows).flatten(0, 1), non_blocking=True)  # CUDA stages it before it returns
+            self._placed, self.nodes = rows, nodes
 
     @torch.inference_mode(False)  # another rollout may want gradients
     def _allocate_nodes(self, count: int) -> None:
@@ -224,11 +232,18 @@ class Workspace:
     def load(
         self, state: tuple[Tensor, ...], held: dict[str, Tensor | None], volume: Tensor, mass: Tensor, cutoff: float,
         poses: tuple[Tensor, ...] | None = None, steps: Steps | None = None,
+        gravities: tuple[tuple[float, float, float], ...] | None = None,
     ) -> None:  # fmt: skip
         """Copy the start of a segment in: (x, v, C_affine, F, F_tot), the parameters, the adapter's operator, colliders' poses.
 
-        steps: the numerics' dt by default."""
+        steps: the numerics' dt by default; gravities: of every world [m/s^2], the numerics' by default."""
         self.steps = steps or Steps(self.numerics.dt, self.numerics.dt)
+        pulled = (*self.steps, gravities or (self.numerics.gravity,) * self.worlds)
+        if pulled != self._pulled:
+            rows = [[[time * g for g in gravity] for gravity in pulled[2]] for time in self.steps]
+            rows = torch.tensor(rows, dtype=torch.float64)
+            self.impulses[0]._base.copy_(rows.to(self.numerics.dtype), non_blocking=True)
+            self._pulled = pulled
         if self.colliders is not None:
             self.colliders.load(poses)
         slots = (self.x, self.v, self.C, self.F) + ((self.A,) if self.plastic else ())
@@ -299,13 +314,13 @@ class Workspace:
         launch(kernel, dim, inputs, self.flags_wp.device, adj_inputs)
 
     def over_nodes(self, kernel, inputs: list) -> None:
-        """Launch for all nodes of the window. Graphs hold the number of threads: one for all nodes on a CPU, on a CUDA device one
-        for each that there is room for."""
-        threads = self.capacity if self.flags_wp.device.is_cuda else 1
-        self._run(kernel, threads, [self.window_wp, threads, *inputs])
+        """Launch for all nodes of the windows. Graphs hold the number of threads: one for all nodes of a world on a CPU, on a CUDA
+        device one for each that there is room for, shared among the worlds in equal parts."""
+        threads = -(-self.capacity // self.worlds) if self.flags_wp.device.is_cuda else 1
+        self._run(kernel, threads * self.worlds, [self.window_wp, threads, *inputs])
 
     def _geometry(self, dt: float) -> list:
-        return [self.window_wp, self.numerics.dx, 1.0 / self.numerics.dx, dt]
+        return [self.window_wp, self.size, self.numerics.dx, 1.0 / self.numerics.dx, dt]
 
     def _kick(self, step: int) -> float:
         """For how long [s] the forces of a substep act."""
@@ -313,9 +328,9 @@ class Workspace:
 
     def _grid_arguments(self, slot: int, step: int) -> list:
         numerics = self.numerics
-        impulse = self.kernels.vec3(*(self._kick(step) * g for g in numerics.gravity))
         return [
-            self.grid_wp[slot], impulse, self.cutoff, numerics.dx, self.planes_wp, self.modes_wp, numerics.plane_count,
+            self.grid_wp[slot], self.impulses_wp[min(step, 1)], self.cutoff, numerics.dx, self.planes_wp, self.modes_wp,
+            numerics.plane_count,
         ]  # fmt: skip
 
     def _collider_place(self, slot: int) -> list:

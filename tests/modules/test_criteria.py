@@ -5,7 +5,9 @@ import torch
 from small_bodies import FRAME_DT, FREE, WORLD, small_body, start
 
 from mosa.errors import ConfigError
+from mosa.modules.body import Ready
 from mosa.modules.criteria import Criterion
+from mosa.modules.identification import each_law, read_numbers
 
 
 def simulated(body, begins, frames=10, world=WORLD, **options):
@@ -106,3 +108,20 @@ def test_what_a_criterion_compares_and_refuses():
     for gain in (0.0, -0.1, 1.1, float("nan")):
         with pytest.raises(ConfigError, match=r"criterion\.gain: expected"):
             Criterion("corrected", gain)
+
+
+def test_laws_side_by_side_are_so_many_simulations():
+    """What differences of a residual need: a law in each world, free and corrected, to the last bit."""
+    body, begins = small_body(numbers=0.1 * torch.linspace(-1, 1, 19).double(), contact=True), start(speed=-2.0)
+    laws = read_numbers(body) + 0.02 * torch.randn(3, len(read_numbers(body)), generator=torch.Generator().manual_seed(2)).double()
+    with torch.no_grad():
+        seen = body.simulate(begins, WORLD, 6, FRAME_DT).x + 1e-3
+        for more in ({}, {"observed": seen, "gain": 0.5}):
+            expected = [body.simulate(begins, WORLD, 6, FRAME_DT, substeps=12, **more) for _ in each_law(body, laws)]
+            parts = [body.ready(begins, WORLD, 6, FRAME_DT, substeps=12).answered() for _ in each_law(body, laws)]
+            found = Ready.stack(parts).simulate(6, **more).worlds()
+            for own, other in zip(expected, found, strict=True):
+                assert torch.equal(own.x, other.x) and torch.equal(own.F, other.F)
+            assert (expected[0].x - expected[1].x).abs().max() > 1e-5
+    with pytest.raises(ConfigError, match=r"worlds: expected the same fixed substeps in all, found \[12, 16\]"):
+        Ready.stack([parts[0], body.ready(begins, WORLD, 6, FRAME_DT, substeps=16)])

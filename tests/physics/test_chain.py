@@ -9,12 +9,12 @@ from torch.func import functional_call
 
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.modules.adapter import StressAdapter, pool
-from mosa.physics import chain as chain_module
 from mosa.physics import chains as chains_module
+from mosa.physics import mpm as mpm_module
 from mosa.physics.asking import AdapterOperator
 from mosa.physics.capturing import ATTEMPTS
-from mosa.physics.chains import Plan, chain_length, grouped
-from mosa.physics.rollout import SEGMENT, Simulator
+from mosa.physics.chains import SEGMENT, Plan, chain_length, grouped
+from mosa.physics.rollout import Simulator
 from mosa.types import Ground, ParticleState
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
@@ -177,7 +177,7 @@ def test_two_rollouts_before_their_backward_passes(device, make_block):
 def test_frames_in_one_chain_are_the_frames_one_by_one(device, law, plastic, pull, foreseen, make_block, monkeypatch):
     """Without a gradient a chain goes over several frames. A pull that is not foreseen takes the body out of their window."""
     if not foreseen:
-        for module in (chain_module, chains_module):
+        for module in (mpm_module, chains_module):
             monkeypatch.setattr(module, "fallen", lambda bounds, *_: bounds)
     adapter, state = adapter_of(device, torch.float64, plastic), make_block(n=5, velocity=(0.3, -1.0, 0.2))
     state = ParticleState(*(getattr(state, name).to(device) for name in ("x", "v", "C_affine", "F", "F_tot")))

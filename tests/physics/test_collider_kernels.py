@@ -49,8 +49,8 @@ def arguments(threads, colliders, mass, poses):
     # poses are those of substep 2 of 3
     held = [torch.stack([torch.full_like(p, 7.0), torch.full_like(p, 7.0), p]).contiguous() for p in poses]
     return [
-        wp.array([(0, 0, 0), DIMS], dtype=wp.vec3i, device="cpu"), threads, wp.from_torch(grid, dtype=VEC4), 0.0, DX, 1 / DT,
-        len(colliders), 2,
+        wp.array([(0, 0, 0), DIMS, (0, 0, 0)], dtype=wp.vec3i, device="cpu"), threads, wp.from_torch(grid, dtype=VEC4), 0.0, DX,
+        1 / DT, len(colliders), 2,
         *(wp.from_torch(t, dtype=kind) for t, kind in zip(packed, (wp.float64, wp.int32, wp.float64))),
         *(wp.from_torch(p, dtype=kind) for p, kind in zip(held, kinds)),
     ]  # fmt: skip

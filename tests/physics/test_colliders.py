@@ -244,7 +244,7 @@ CASES = {
 def test_gradient_of_a_rollout(name, make_block, monkeypatch):
     """In pose, velocities (per frame), the body's position and velocity and its stiffness; loss on the state and the reactions."""
     shape, mode, friction, thickness = CASES[name]
-    monkeypatch.setattr("mosa.physics.rollout.SEGMENT", 8)
+    monkeypatch.setattr("mosa.physics.stepping.SEGMENT", 8)
     state = make_block(velocity=(0.0, -0.8, 0.0))
     leaves = {"position": [0.15, -0.05, 0.11], "rotation": [0.2, -0.1, 0.3], "velocity": [[0.2, 0.4, 0.0], [0.0, 0.6, -0.2]],
               "angular_velocity": [[1.0, 0.0, 2.0], [0.0, -3.0, 1.0]], "x0": [0.0] * 3, "v0": [0.0] * 3, "mu": 4e4}  # fmt: skip

@@ -37,7 +37,7 @@ def test_captured_segments_are_those_launched_one_by_one(kept, tight, collides, 
 
     def placed(work, origin, size):
         place(work, origin, size)
-        dims.add(size)
+        dims.add(tuple(size[0].tolist()))
         sizes.add(work.capacity)
 
     monkeypatch.setattr(wp, "capture_launch", lambda *a, **k: (replays.append(1), replay(*a, **k)))

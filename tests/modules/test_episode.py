@@ -1,0 +1,250 @@
+"""A twin that is stepped: the bits of one long simulation, state saved and branched, driven colliders, gradients, many worlds."""
+
+import re
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+
+import pytest
+import torch
+from small_bodies import FRAME_DT, STICKY, WORLD, small_body, start
+
+from mosa.episode import TwinState
+from mosa.errors import ConfigError, DataError
+from mosa.modules.identification import read_numbers
+from mosa.physics.collider_motion import Trajectory, exponential
+from mosa.physics.colliders import colliders_from_config
+from mosa.twin import Twin
+
+STEPS = 8
+NUMBERS = 0.2 * torch.linspace(-1, 1, 19).double()
+PUSHER = {"type": "box", "name": "pusher", "size": [0.06, 0.1, 0.12], "position": [-0.12, 0.08, 0], "mode": "separate",
+          "friction": 0.3, "thickness": 0.02, "motion": {"velocity": [0.6, 0, 0]}}  # fmt: skip
+BALL = {"type": "sphere", "radius": 0.04, "position": [0.0, 0.2, 0.0],
+        "motion": {"waypoints": [{"time": 0.02, "position": [0, 0.2, 0]}, {"time": 0.1, "position": [0, 0.15, 0]}]}}  # fmt: skip
+BALL.pop("position")
+
+
+def twin(precision=64, world=WORLD, **options):
+    body = small_body(precision=precision, contact=True, numbers=NUMBERS, **options)
+    return Twin(body, world, FRAME_DT, {}, start(dtype=torch.float64 if precision == 64 else torch.float32))
+
+
+@pytest.mark.parametrize("precision", [32, 64])
+@pytest.mark.parametrize("adaptive", [False, True])
+def test_steps_are_one_long_simulation_to_the_last_bit(precision, adaptive):
+    """Also from a state that was saved and read, and with colliders on motions of their own."""
+    made = twin(precision)
+    made.body.settings = replace(made.body.settings, adaptive=adaptive)
+    given = {"colliders": [PUSHER, BALL], "position": (0.01, None, -0.02), "velocity": (0.1, -1.0, 0.0), "frames": STEPS + 1}
+    long = made.simulate(**given)
+    state = made.reset(**given)
+    assert torch.equal(state.positions, long.x[0]) and long.reactions.abs().max() > 1 and float(state.time) == 0
+    assert torch.allclose(long.x[0].mean(0)[::2], torch.tensor([0.01, -0.02]).to(long.x))
+    for k in range(STEPS):
+        state, reactions = made.step()
+        assert torch.equal(state.positions, long.x[k + 1]) and torch.equal(reactions, long.reactions[k])
+        if k == 3:
+            file, branch = BytesIO(), state
+            torch.save(state.tensors(), file)
+    assert (made.episode.substeps is None) == adaptive and int(state.substeps) == sum(long.counts)
+    assert float(state.time) == pytest.approx(STEPS * FRAME_DT) and float(state.position[0, 0]) == pytest.approx(-0.12 + 0.6 / 7.5)
+    assert float(state.position[1, 1]) == pytest.approx(0.15) and not state.driven.any()
+    file.seek(0)
+    for saved in (TwinState.read(torch.load(file, weights_only=True)), branch):
+        made.reset(**given)
+        made.state = saved
+        for _ in range(STEPS - 4):
+            again = made.step().state
+        assert torch.equal(again.positions, long.x[-1]) and torch.equal(again.F, state.F)
+
+
+def test_driven_colliders_are_the_trajectory_of_their_commands():
+    """Velocities, targets and rests, step by step, against one rollout along the poses they give; the last step of each kind is
+    also told by where the solid is."""
+    made, generator = twin(), torch.Generator().manual_seed(3)
+    made.reset(colliders=[PUSHER, BALL], frames=STEPS + 1)
+    dt, count = FRAME_DT / made.episode.substeps, made.episode.substeps
+    parts, states = [], [made.state]
+    for k in range(STEPS):
+        before, kind = states[-1], k % 4
+        v, w = (0.3 * torch.randn(3, generator=generator).double() for _ in range(2))
+        command = {"velocity": v, "angular_velocity": w}
+        if kind == 1:
+            target = {"position": before.position[0] + FRAME_DT * v, "rotation": exponential(FRAME_DT * w) @ before.rotation[0]}
+            command = target
+        elif kind == 2:
+            command, w = tuple(v.tolist()), torch.zeros(3).double()
+        action = {} if kind == 3 else {"pusher": command}
+        v, w = (0 * v, 0 * w) if kind == 3 else (v, w)
+        state, reactions = made.step(action)
+        if kind == 1:
+            assert torch.equal(state.position[0], target["position"]) and torch.equal(state.rotation[0], target["rotation"])
+        torch.testing.assert_close(state.position[0], before.position[0] + FRAME_DT * v, rtol=0, atol=1e-15)
+        times = dt * torch.arange(count).double()[:, None]
+        turned = exponential(times * w) @ before.rotation[0]
+        parts.append((before.position[0] + times * v, turned, v.expand(count, 3), w.expand(count, 3)))
+        states.append(state)
+    assert reactions.abs().max() > 1e-3 and states[-1].driven.tolist() == [True, False]
+    moving = Trajectory(*(torch.cat(values) for values in zip(*parts)))
+    pusher, ball = colliders_from_config([PUSHER, BALL])
+    long = made.simulate(colliders=[replace(pusher, motion=moving), ball], frames=STEPS + 1)
+    for k, state in enumerate(states):  # a target's twist is rounded
+        torch.testing.assert_close(state.positions, long.x[k], rtol=0, atol=0 if k < 2 else 1e-13)
+
+
+def test_gradients_of_a_control_sequence_are_central_differences():
+    """50 steps of a body pushed along the ground by a solid that is turned and moved in every one of them. Contact is smooth here:
+    the solid's fades in over its thickness, and nodes stick to the ground or do not touch it."""
+    steps, generator = 50, torch.Generator().manual_seed(0)
+    made = twin(world=STICKY, counts=(4, 4, 3))
+    pusher = {**PUSHER, "position": [-0.13, 0.08, 0], "mode": "sticky", "friction": 0, "thickness": 0.03, "motion": None}
+    values = {
+        "velocity": torch.tensor([0.1, -0.5, 0.1]).double(), "position": torch.tensor([0.0, 0.08, -0.01]).double(),
+        "spin": torch.tensor([0.5, 1.0, -2.0]).double(),
+        "controls": 0.25 * torch.randn(steps, 3, generator=generator).double() + torch.tensor([0.35, 0, 0]).double(),
+        "turns": 0.5 * torch.randn(steps, 3, generator=generator).double(),
+    }  # fmt: skip
+    body = made.body
+    law = {"E": body.material.raw["E"], "numbers": body.adapter.numbers, "contact": body.contact.cells}
+    felt = []
+
+    def loss(given):
+        made.reset(velocity=given["velocity"], position=given["position"], angular_velocity=given["spin"], colliders=[pusher],
+                   control_dt=0.005, substeps=8, differentiable=True)  # fmt: skip
+        total = 0.0
+        for v, w in zip(given["controls"], given["turns"]):
+            state, reactions = made.step({"pusher": {"velocity": v, "angular_velocity": w}})
+            total = total + 1e-3 * reactions.mean(0).square().sum()
+            felt.append(bool(reactions.detach().abs().max() > 1e-3))
+        return total + (state.positions - torch.tensor([0.1, 0.1, 0.0])).square().sum() + 0.01 * state.v.square().sum()
+
+    leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
+    found = torch.autograd.grad(loss(leaves), [*leaves.values(), *law.values()])
+    assert sum(felt) > 20 and (made.state.positions[:, 1].min() < 0.5 * 0.04)
+    for (name, value), gradient in zip([*values.items(), *law.items()], found, strict=True):
+        direction = torch.randn(value.shape, generator=generator, dtype=torch.float64)
+        sides = []
+        with torch.no_grad():
+            kept = value.detach().clone()
+            for side in (1e-5, -1e-5):
+                moved = kept + side * direction
+                if name in values:
+                    sides.append(loss({**values, name: moved}))
+                else:
+                    value.copy_(moved)
+                    sides.append(loss(values))
+                    value.copy_(kept)
+        slope = (sides[0] - sides[1]) / 2e-5
+        torch.testing.assert_close((gradient * direction).sum(), slope, rtol=1e-5, atol=0, msg=lambda m, name=name: f"{name}: {m}")
+
+
+def test_without_differentiable_no_graph_is_kept():
+    made = twin()
+    made.reset(colliders=[PUSHER])
+    state, reactions = made.step({"pusher": torch.zeros(3, requires_grad=True)})
+    assert not state.x.requires_grad and not reactions.requires_grad
+    made.reset(colliders=[PUSHER], differentiable=True)
+    with torch.no_grad():
+        assert not made.step().state.x.requires_grad
+    assert made.step().state.x.requires_grad  # the law's parameters are learned
+
+
+def test_worlds_are_so_many_twins():
+    """Starts, commands for all or for each, gravity; then a law for each. Every world has the bits of its twin."""
+    made, count = twin(), 3
+    starts = [{"velocity": (0.1 * b, -1.0, 0.0), "position": (0.01 * b, None, 0.0)} for b in range(count)]
+    pushes = torch.tensor([[0.4, 0.0, 0.0], [0.5, 0.1, 0.0], [0.3, 0.0, 0.2]]).double()
+    laws = read_numbers(made.body) + 0.05 * torch.randn(count, len(read_numbers(made.body)),
+                                                        generator=torch.Generator().manual_seed(1)).double()  # fmt: skip
+    for numbers in (None, laws):
+        worlds = made.worlds(count, numbers)
+        first = worlds.reset(starts, colliders=[PUSHER, BALL], substeps=12, frames=5)
+        assert first.x.shape == (count, 120, 3)
+        for k in range(4):
+            state, reactions = worlds.step({"pusher": {"velocity": pushes}, "1": (0.0, -0.1 * k, 0.0)})
+        assert reactions.shape == (12, count, 2, 6) and state.position.shape == (count, 2, 3)
+        for b in range(count):
+            single = twin()
+            if numbers is not None:
+                single = Twin(_with(made.body, numbers[b]), WORLD, FRAME_DT, {}, start())
+            single.reset(**starts[b], colliders=[PUSHER, BALL], substeps=12, frames=5)
+            for k in range(4):
+                own, forces = single.step({"pusher": pushes[b], "1": (0.0, -0.1 * k, 0.0)})
+            assert torch.equal(own.positions, state.positions[b]) and torch.equal(forces, reactions[:, b])
+            assert torch.equal(own.position, state.position[b])
+    assert (state.positions[0] - state.positions[1]).abs().max() > 1e-3
+    heavy = torch.tensor([[0.0, -9.8, 0.0], [0.0, -20.0, 0.0], [1.0, -9.8, 0.0]])
+    worlds = made.worlds(count)
+    worlds.reset({"height": 0.5}, gravity=heavy, frames=5)
+    branch = worlds.step().state
+    fallen = worlds.step().state.v.mean(1) - branch.v.mean(1)
+    torch.testing.assert_close(fallen, FRAME_DT * heavy.double(), rtol=1e-6, atol=1e-9)
+    worlds.state = branch
+    assert torch.equal(worlds.step().state.v.mean(1) - branch.v.mean(1), fallen)
+
+
+def _with(body, numbers):
+    from mosa.modules.identification import each_law
+
+    for _ in each_law(body, numbers[None]):
+        made = small_body(contact=True, numbers=NUMBERS)
+        made.load_state_dict(body.state_dict())
+    return made
+
+
+@pytest.mark.parametrize("action, message", [
+    ({"paddle": (0, 0, 0)}, r"action: expected names of colliders \(pusher, 1\), found 'paddle'"),
+    ({"pusher": (1, 2)}, r"action\['pusher'\]\.velocity: expected finite numbers \(3,\), found shape \(2,\)"),
+    ({"pusher": {"velocity": "fast"}}, r"action\['pusher'\]\.velocity: expected finite numbers \(3,\), found fast"),
+    ({"pusher": {"velocity": (0, float("nan"), 0)}}, r"action\['pusher'\]\.velocity: .* found \[0\.0, nan, 0\.0\]"),
+    ({"1": {"speed": 1.0}}, r"action\['1'\]: expected velocity and angular_velocity, or position and rotation .*, found speed"),
+    ({"1": {"velocity": (0, 0, 0), "position": (0, 0, 0)}}, r"action\['1'\]: .* found velocity, position"),
+    ({"1": {"rotation": 2 * torch.eye(3)}}, r"action\['1'\]\.rotation: .*a defect of 3"),
+    ({"pusher": (0, 100.0, 0)}, r"action\['pusher'\]: expected a speed of at most .* found 100"),
+    ({"pusher": {"position": (5.0, 0, 0)}}, r"action\['pusher'\]: expected a speed of at most"),
+    (5, "action: expected commands by the names of colliders, found 5"),
+])  # fmt: skip
+def test_errors_of_actions_name_the_collider(action, message):
+    made = twin()
+    before = made.reset(colliders=[PUSHER, BALL])
+    with pytest.raises(ConfigError, match=message):
+        made.step(action)
+    assert torch.equal(made.state.x, before.x) and int(made.state.frames) == 0
+
+
+def test_errors_of_starts_and_states():
+    made = twin()
+    with pytest.raises(ConfigError, match=r"twin: expected reset\(...\) before"):
+        made.step()
+    with pytest.raises(ConfigError, match="position: expected three finite numbers"):
+        made.reset(position=(0.0, "up", 0.0))
+    with pytest.raises(ConfigError, match=r"control_dt: .*found -1"):
+        made.reset(control_dt=-1)
+    with pytest.raises(ConfigError, match=r"colliders: expected names of their own, found 0 more than once"):
+        made.reset(colliders=[PUSHER | {"name": ""}, BALL | {"name": "0"}])
+    with pytest.raises(ConfigError, match=r"starts\[1\]: height: expected metres"):
+        made.worlds(2).reset([{}, {"height": -1}])
+    with pytest.raises(ConfigError, match=r"laws: expected one for each of 2 worlds, found 3"):
+        made.worlds(2, torch.zeros(3, 5))
+    made.reset()
+    with pytest.raises(ConfigError, match=r"state\.x: expected a tensor torch.float64 \(120, 3\), found torch.float64 \(7, 3\)"):
+        made.state = replace(made.state, x=torch.zeros(7, 3).double())
+    with pytest.raises(DataError, match=r"state: expected .* found x"):
+        TwinState.read({"x": torch.zeros(3)})
+
+
+def test_the_page_about_the_twin_runs(monkeypatch, tmp_path):
+    """Every block of docs/twin.md, one after another, with a small body in place of the checkpoint's."""
+    page = (Path(__file__).parents[2] / "docs" / "twin.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert len(blocks) == 4
+    monkeypatch.setattr(Twin, "load", lambda path: twin(32))
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    for block in blocks:
+        exec(block, names)
+    assert names["outcomes"][0].shape == (120, 3) and not torch.equal(*names["outcomes"])
+    assert names["by_push"].abs().max() > 0 and names["by_modulus"].abs() > 0
+    assert names["state"].positions.shape == (4, 120, 3) and names["reactions"].shape[1:] == (4, 1, 6)
+    assert TwinState.read(torch.load("moment.pt", weights_only=True)).x.shape == (120, 3)
