@@ -95,12 +95,14 @@ class Posterior:
 
 @dataclass
 class GaussNewton:
-    """One or more seats of the same model; the first one holds the result. progress: called after every column."""
+    """One or more seats of the same model; the first one holds the result. progress: called after every column; many: (K, R)
+    residuals of K rows of numbers (K, D) at once, where the columns of a Jacobian shall not be asked for one by one."""
 
     blocks: list[Block]
     seats: list[Seat]
     halvings: int = 4
     progress: Callable[[], None] | None = None
+    many: Callable[[Tensor], Tensor] | None = None
     matrix: Tensor | None = field(default=None, init=False)
     data: Tensor | None = field(default=None, init=False)
 
@@ -127,6 +129,11 @@ class GaussNewton:
         """(R, D) of the type and on the device of r (R,): one residual vector per column, the columns shared among the seats."""
         steps, highest = self._vector(lambda b: b.step), self._vector(lambda b: b.bounds[1])
         steps = torch.where(numbers + steps > highest, -steps, steps)
+        if self.many is not None:
+            try:
+                return ((self.many(numbers + torch.diag(steps)) - r) / steps.to(r)[:, None]).T
+            finally:
+                self.seats[0].write(numbers)
         J = torch.empty(len(numbers), len(r), dtype=r.dtype, device=r.device)
         left, lock, over = iter(range(len(numbers))), threading.Lock(), threading.Event()
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.modules import residuals
-from mosa.modules.body import Body, ContactOffset, World
+from mosa.modules.body import Body, ContactOffset, Ready, World
 from mosa.modules.criteria import Criterion
 from mosa.modules.gauss_newton import Block, GaussNewton, Posterior, Seat
 from mosa.modules.hyperelastic import HyperelasticAdapter
@@ -33,6 +33,8 @@ NOISE_ITERATIONS = 3
 COARSER = 1.25
 """Spacing of the second grid, on which the same numbers are rolled out to see what the first one gets wrong."""
 MOST_THREADS = 8
+PARTICLES_TOGETHER = 400_000
+"""Of all worlds in one launch: more no longer make a GPU's substep cheaper for each."""
 ROUNDED = 8
 """Substeps are held fixed within an iteration, at a multiple of this above what the time step bound asks for at its start."""
 
@@ -197,7 +199,8 @@ class Identification:
         self.grid: list[residuals.Fields] | None = None  # differences between the two grids, of every pair
         if self.settings.grid_error > 0 and not self.calibrating:
             blocks.append(Block("grid", torch.zeros(1), torch.full((1,), float(settings.grid_error)), 0.2, nuisance=True))
-        self.newton = GaussNewton(blocks, [self._seat(each) for each in bodies], progress=progress)
+        self.newton = GaussNewton(blocks, [self._seat(each) for each in bodies], progress=progress,
+                                  many=self._many if body.rest.is_cuda and not body.settings.adaptive else None)
         self.converged = False
 
     def threads(self, numbers: int) -> int:
@@ -229,6 +232,27 @@ class Identification:
             with_heterogeneity=self.heterogeneity, observed=cues.positions if gain else None, gain=gain, substeps=substeps,
         )  # fmt: skip
 
+    @torch.no_grad()
+    def _many(self, rows: Tensor) -> Tensor:
+        """(K, R) whitened residuals of numbers (K, D): rolled out side by side, as so many worlds."""
+        seat, together = self.newton.seats[0], max(1, PARTICLES_TOGETHER // len(self.body.rest))
+        found: list[list[residuals.Fields]] = [[] for _ in rows]
+        for first in range(0, len(rows), together):
+            some = rows[first : first + together]
+            for i, gain in self.pairs:
+                take, parts = self.takes[i], []
+                for row in some:
+                    seat.write(row)
+                    parts.append(self.body.ready(
+                        take.start, self.world, len(take.cues.positions), take.frame_dt, with_adapter=self.adapter,
+                        with_heterogeneity=self.heterogeneity, substeps=self.substeps[i]).answered())  # fmt: skip
+                rollout = Ready.stack(parts).simulate(
+                    len(take.cues.positions), self.world.colliders, observed=take.cues.positions if gain else None, gain=gain)
+                for k, own in enumerate(rollout.worlds()):
+                    found[first + k].append(residuals.fields(own, take.cues, take.start.rotation, self.chosen))
+        multiples = rows[:, -1].tolist() if self.newton.blocks[-1].name == "grid" else [0.0] * len(rows)
+        return torch.stack([self._compared(own, multiple) for own, multiple in zip(found, multiples)])
+
     def _fields(self, body: Body) -> list[residuals.Fields]:
         return [
             residuals.fields(self.rollout(body, i, gain, self.substeps[i]), self.takes[i].cues, self.takes[i].start.rotation,
@@ -239,9 +263,12 @@ class Identification:
     def _whitened(self, body: Body, multiple: float) -> Tensor:
         # torch's switch is a thread's own, and these may be other threads than the one that switched it
         with torch.no_grad():
-            share = self.settings.count / len(self.gains) * (100 / 30 if self.calibrating else 1)
-            counts = tuple(share * on for on in self.kinds)
-            return residuals.whitened(self._along(self._fields(body), multiple), self.noise, [counts] * len(self.pairs))
+            return self._compared(self._fields(body), multiple)
+
+    def _compared(self, found: list[residuals.Fields], multiple: float) -> Tensor:
+        share = self.settings.count / len(self.gains) * (100 / 30 if self.calibrating else 1)
+        counts = tuple(share * on for on in self.kinds)
+        return residuals.whitened(self._along(found, multiple), self.noise, [counts] * len(self.pairs))
 
     def _along(self, found: list[residuals.Fields], multiple: float) -> list[residuals.Fields]:
         return found if self.grid is None else residuals.along(found, self.grid, multiple)

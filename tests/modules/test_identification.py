@@ -1,5 +1,6 @@
 """Identification of a small body from its own rollouts: what it finds, what it leaves alone, going on after a stop, threads."""
 
+import copy
 from dataclasses import replace
 
 import pytest
@@ -9,10 +10,11 @@ from small_bodies import NU, WORLD, E, cues_of, small_body, start, take_of
 from mosa.analysis.anisotropy import dyads
 from mosa.analysis.stiffness import angle_between, stiffest
 from mosa.errors import ConfigError, SimulationDiverged
+from mosa.modules import identification as identification_module
 from mosa.modules.criteria import Criterion
 from mosa.modules.gauss_newton import Seat
 from mosa.modules.hyperelastic import anisotropic_basis
-from mosa.modules.identification import Identification, IdentificationSettings, write_numbers
+from mosa.modules.identification import COARSER, Identification, IdentificationSettings, write_numbers
 from mosa.modules.stages import Stage
 
 FRAMES = 12
@@ -237,3 +239,60 @@ def test_what_it_refuses():
                        ("threads", 1.5), ("grid_error", -1.0), ("model_error", 2)):  # fmt: skip
         with pytest.raises(ConfigError, match=rf"identification\.{key}: expected"):
             IdentificationSettings(**{key: value})
+
+
+def seen_on_a_coarser_grid(truth, angle=0.5):
+    """What the law of `truth` does on a grid 1.25 times as coarse, as if it had been seen."""
+    other = copy.deepcopy(truth)
+    other.settings = replace(other.settings, dx=COARSER * other.settings.dx)
+    return take_and_turn(other, angle)
+
+
+def test_what_a_grid_gets_wrong_is_not_taken_for_the_law():
+    """An isotropic body was seen that differs from the model by its grid alone: E and the operator stay, the multiple is -1."""
+    wrong = {}
+    for known in (1.0, 0.0):
+        body = small_body()
+        found = identification(body, [seen_on_a_coarser_grid(small_body(adapter=False))], grid_error=known)
+        run(found)
+        wrong[known] = abs(values(body)["E"] / E - 1) + float(body.adapter.numbers.detach().norm())
+        assert found.multiple() == pytest.approx(-1.0, abs=0.1) if known else found.multiple() == 0.0
+        assert "grid" not in found.posterior().names
+    assert wrong[1.0] < 0.02 and wrong[0.0] > 3 * wrong[1.0]
+
+
+@pytest.mark.parametrize("criterion", ["free", "both"])
+def test_columns_as_worlds_are_those_one_by_one(criterion):
+    """On a CPU every world has the bits of its own rollout."""
+    truth = small_body(numbers=fibres(0.3), contact=True)
+    body = small_body(contact=True, modes=True)
+    found = identification(body, [take_and_turn(truth, 0.5), take_and_turn(truth, 1.5)], criterion=Criterion(criterion))
+    found.iterate()
+    newton, seat = found.newton, found.newton.seats[0]
+    numbers = seat.read()
+    r = seat.residuals()
+    alone = newton.jacobian(numbers, r)
+    newton.many = found._many
+    for together in (10**6, 3 * len(body.rest)):
+        identification_module.PARTICLES_TOGETHER, kept = together, identification_module.PARTICLES_TOGETHER
+        try:
+            assert torch.equal(newton.jacobian(numbers, r), alone)
+        finally:
+            identification_module.PARTICLES_TOGETHER = kept
+        assert torch.equal(seat.read(), numbers)
+
+
+def test_a_stopped_stage_goes_on_with_what_it_knew_of_the_grid():
+    truth = small_body(numbers=fibres(0.3))
+    take = take_and_turn(truth, 0.5)
+    whole, part = (identification(small_body(), [take]) for _ in range(2))
+    for _ in range(5):
+        whole.iterate()
+    for _ in range(4):
+        part.iterate()
+    again = identification(small_body(), [take])
+    again.newton.seats[0].write(part.newton.seats[0].read())
+    again.restore(part.state())
+    again.iterate()
+    assert again.multiple() == whole.multiple() != 0.0
+    assert torch.equal(again.newton.seats[0].read(), whole.newton.seats[0].read())
