@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError, SimulationDiverged
+from mosa.physics.adaptive import StepControl
 from mosa.physics.asking import AdapterOperator
 from mosa.physics.boundary import Plane
-from mosa.physics.collider_motion import Motion
+from mosa.physics.collider_motion import Motion, Poses, sample_poses
 from mosa.physics.colliders import Collider, Sphere
 from mosa.physics.rollout import Simulator
 from mosa.types import ParticleState
@@ -178,3 +179,28 @@ def test_on_cuda_each_world_is_its_own_rollout(law, make_block):
             torch.testing.assert_close(found.reactions[:, :, b].cpu(), own.reactions, rtol=1e-8, atol=1e-8)
             torch.testing.assert_close(dv[b].cpu(), own_dv, rtol=0, atol=1e-7 * float(own_dv.abs().max()))
             torch.testing.assert_close(dmu[b, 0].cpu(), own_dmu, rtol=1e-7, atol=0)
+
+
+def test_a_stepper_goes_on_from_a_state_with_poses_from_outside(make_block):
+    """Frame by frame, from a moment of one's own, with poses given as tensors or as a function: the frames of a rollout."""
+    state, volume, sim = make_block(), torch.full((64,), 8e-6).double(), simulator()
+    law = {"mu": 4e4, "lam": 5e4}
+    long = sim.rollout(state, law, volume, 1000.0, FRAMES, motions=motions(1))
+    stepper, moment = sim.stepper(state, law, volume, 1000.0, motions=motions(1))
+    poses = sample_poses(motions(1), FRAMES - 1, SUBSTEPS, sim.dt, 0.0, torch.float64, torch.device("cpu"))
+    frames = [Poses(*(part[f * SUBSTEPS : (f + 1) * SUBSTEPS] for part in poses)) for f in range(FRAMES - 1)]
+    for frame, given in enumerate((None, frames[1], lambda count, dt: frames[2])):
+        before, (moment, reactions, count) = moment, stepper.step(moment, given)
+        assert torch.equal(moment.state.x, long.x[frame + 1]) and torch.equal(reactions, long.reactions[frame])
+        assert count == SUBSTEPS and (moment.frames, moment.substeps) == (frame + 1, (frame + 1) * SUBSTEPS)
+    assert torch.equal(stepper.step(before, frames[2]).moment.state.x, moment.state.x)  # a moment is left as it is
+    with pytest.raises(ConfigError, match=r"poses: position: expected shape \(14, 2, 3\), found \(13, 2, 3\)"):
+        stepper.step(before, Poses(*(part[1:] for part in frames[0])))
+    again, begin = sim.stepper(before.state, law, volume, 1000.0, started=True)
+    assert torch.equal(again.step(begin, frames[2]).moment.state.x, moment.state.x)
+    both, pair = sim.stepper(ParticleState.stack([before.state] * 2), law, volume, 1000.0, started=True, gravity=GRAVITY[:2] * 0)
+    given = Poses(*(torch.stack([part, part + (0.01 if i == 0 else 0)], 1) for i, part in enumerate(frames[2])))
+    found = both.step(pair, given)
+    assert found.reactions.shape == (SUBSTEPS, 2, 2, 6) and not torch.equal(*found.moment.state.x)
+    with pytest.raises(ConfigError, match="control: expected None with many worlds"):
+        sim.stepper(pair.state, law, volume, 1000.0, control=StepControl())
