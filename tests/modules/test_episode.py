@@ -184,6 +184,24 @@ def test_worlds_are_so_many_twins():
     assert torch.equal(worlds.step().state.v.mean(1) - branch.v.mean(1), fallen)
 
 
+def test_gradients_of_worlds_are_those_of_their_twins():
+    """Commands of each, to the last bit; the law's numbers, which they share, as a sum."""
+    made, pushes = twin(), torch.tensor([[0.9, 0.0, 0.0], [0.8, 0.1, 0.1]]).double()
+    numbers, given = made.body.adapter.numbers, {"colliders": [PUSHER], "substeps": 12, "differentiable": True}
+
+    def pushed(stepped, push, begins):
+        stepped.reset(begins, **given) if begins is not None else stepped.reset(position=(-0.01, 0.09, 0), **given)
+        for _ in range(6):
+            state, reactions = stepped.step({"pusher": push})
+        return torch.autograd.grad(state.positions.square().sum() + reactions.square().sum(), [push, numbers])
+
+    of_each, of_all = pushed(made.worlds(2), pushes.clone().requires_grad_(), {"position": (-0.01, 0.09, 0)})
+    alone = [pushed(made, push.clone().requires_grad_(), None) for push in pushes]
+    assert torch.equal(of_each, torch.stack([own for own, _ in alone])) and (of_each.abs().amax(1) > 1e-3).all()
+    expected = sum(law for _, law in alone)
+    torch.testing.assert_close(of_all, expected, rtol=0, atol=1e-11 * float(expected.abs().max()))  # sums in another order
+
+
 def _with(body, numbers):
     from mosa.modules.identification import each_law
 
