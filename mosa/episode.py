@@ -7,7 +7,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ from mosa.modules.body import Body, Ready, Start, World
 from mosa.modules.identification import each_law
 from mosa.physics.collider_motion import Poses, exponential, rotation_matrices, rotation_vector
 from mosa.physics.colliders import reach
-from mosa.physics.stepping import STATE, Moment
+from mosa.physics.stepping import STATE, Moment, flat
 from mosa.types import ParticleState
 
 TWISTS, TARGETS = ("velocity", "angular_velocity"), ("position", "rotation")
@@ -100,7 +100,7 @@ class Episode:
                 ready = body.ready(starts, world, **options)
                 more = {"control": ready.timing.get("control")}
             else:
-                ready = _worlds(body, world, starts, laws, gravity, options)
+                ready, self._begin = _worlds(body, world, starts, laws, gravity, options)
                 more = {"gravity": gravity, "together": together}
             self._lifts, motions = ready.lift, ready.motions(self.colliders)
             self._motions = motions if ready.lift.ndim > 1 else [motions]
@@ -109,6 +109,7 @@ class Episode:
             )
             self._driven = torch.zeros(len(self.colliders), dtype=torch.bool)
             self._moment, self._poses = moment, self._placed(moment, 0)
+            self._starts, self._first = starts, self._poses
 
     @property
     def substeps(self) -> int | None:
@@ -159,6 +160,32 @@ class Episode:
             self._moment, self._driven = moment, driven
             self._poses = after[0] if after else self._poses
             return Stepped(self.state, reactions)
+
+    def restart(self, which: Sequence[int], starts: Sequence[Start] | None = None) -> TwinState:
+        """Put some worlds back to a start, each to its own of `starts`, None for those it had; the others stay as they are. Time
+        is one for all and goes on: driven colliders are back where they began, others follow their motion. Errors: ConfigError.
+        """
+        if self.worlds is None or not all(isinstance(b, int) and 0 <= b < self.worlds for b in which):
+            raise ConfigError(f"restart: expected numbers of worlds below {self.worlds or 0}, found {list(which)}")
+        if starts is not None and len(starts) != len(which):
+            raise ConfigError(f"restart: expected a start for each of {len(which)} worlds, found {len(starts)}")
+        moment, chosen = self._moment, torch.zeros(self.worlds, dtype=torch.bool)
+        chosen[list(which)] = True
+        again = dict(zip(which, starts if starts is not None else [self._starts[b] for b in which], strict=True))
+        with self._gradients():
+            now = moment.state.worlds()
+            fresh = ParticleState.stack([self._begin(b, again[b]) if b in again else now[b] for b in range(self.worlds)])
+            if moment.substeps:  # F goes before its velocities by one advance
+                parts = self._stepper.prepared.first_advance(flat(fresh), self._stepper.dt)
+                fresh = ParticleState(*(t.unflatten(0, (self.worlds, -1)) for t in parts))
+            state = ParticleState(*(_where(chosen, getattr(fresh, n), getattr(moment.state, n)) for n in STATE))
+            back = [_where(chosen, first, now) for first, now in zip(self._first, self._poses)]
+            at = self._driven.view(1, -1)
+            self._poses = tuple(
+                torch.where(at.view(1, -1, *(1,) * (new.ndim - 2)), new, old) for new, old in zip(back, self._poses)
+            )
+            self._moment = moment._replace(state=state)
+            return self.state
 
     def _gradients(self):
         return torch.set_grad_enabled(self.differentiable and torch.is_grad_enabled())
@@ -287,6 +314,11 @@ class Episode:
             raise ConfigError(f"{where}: {error}") from error
 
 
+def _where(chosen: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """new in the worlds that are chosen (B,), old in the others."""
+    return torch.where(chosen.to(old.device).view(-1, *(1,) * (old.ndim - 1)), new, old)
+
+
 def _fastest(body: Body, starts: Sequence[Start]) -> Start:
     """The start for which the time step must be smallest."""
     return max(starts, key=lambda s: float(s.velocity.detach().norm() + s.angular_velocity.detach().norm() * body.size))
@@ -294,8 +326,8 @@ def _fastest(body: Body, starts: Sequence[Start]) -> Start:
 
 def _worlds(
     body: Body, world: World, starts: Sequence[Start], laws: Tensor | None, gravity: Tensor | None, options: dict
-) -> Ready:
-    """All worlds, with a lift (3,) [m] where it is the same in all."""
+) -> tuple[Ready, Callable[[int, Start], ParticleState]]:
+    """(all worlds, with a lift (3,) [m] where it is the same in all; the state of a world at a start)."""
     if body.settings.adaptive:
         raise ConfigError("simulation.adaptive: expected false with many worlds, which take the same substeps")
     if laws is not None and (len(laws) != len(starts) or options["variant"] != "adapted"):
@@ -313,10 +345,11 @@ def _worlds(
         found = [body.ready(quick, hardest, **fixed).answered() for _ in each_law(body, laws)]
     first = found[0].simulator
     simulator = body.simulator(first.law.name, first.substeps, first.frame_dt, world, first.numerics.strain)
-    states = []
-    for b, (start, pull) in enumerate(zip(starts, pulls)):
-        state = body.initial_state(start, simulator.dt, pull)
+
+    def begin(b: int, start: Start) -> ParticleState:
+        state = body.initial_state(start, simulator.dt, pulls[b])
         state = replace(state, x=state.x + found[b % len(found)].lift)
-        states.append(ParticleState(*(getattr(state, name).to(simulator.dtype) for name in STATE)))
-    ready = found[0] if laws is None else Ready.stack(found)
-    return replace(ready, simulator=simulator, state=ParticleState.stack(states))
+        return ParticleState(*(getattr(state, name).to(simulator.dtype) for name in STATE))
+
+    ready, states = found[0] if laws is None else Ready.stack(found), [begin(b, start) for b, start in enumerate(starts)]
+    return replace(ready, simulator=simulator, state=ParticleState.stack(states)), begin

@@ -259,20 +259,7 @@ class TwinWorlds:
         """
         check_frames(frames, self.count * len(self.twin.body.rest))
         check_variant(variant)
-        each = [dict(starts or {})] * self.count if starts is None or isinstance(starts, Mapping) else list(starts)
-        if len(each) != self.count:
-            raise ConfigError(f"starts: expected one, or one for each of {self.count} worlds, found {len(each)}")
-        found = []
-        for b, given in enumerate(each):
-            if unknown := sorted(set(given) - set(STARTED)):
-                raise ConfigError(f"starts[{b}]: expected {', '.join(STARTED)}, found {', '.join(unknown)}")
-            if b and given is each[0]:
-                found.append(found[0])
-                continue
-            try:
-                found.append(self.twin._start(*(given.get(name) for name in STARTED), colliders))
-            except ConfigError as error:
-                raise ConfigError(f"starts[{b}]: {error}") from error
+        found = self._found(starts, range(self.count), colliders)
         if gravity is not None:
             gravity = numbers("gravity", gravity, f"finite numbers ({self.count}, 3)")
             if gravity.shape != (self.count, 3):
@@ -284,24 +271,49 @@ class TwinWorlds:
         )  # fmt: skip
         return self.episode.state
 
-    def step(self, action: Mapping[str, Any] | None = None) -> Stepped:
-        """As `Twin.step`; every command is the same in all worlds, or (count, 3), rotations (count, 3, 3), for each."""
+    def restart(self, which: Sequence[int], starts: Mapping | Sequence[Mapping] | None = None) -> TwinState:
+        """Put the worlds with these numbers back to new starts, as `reset` takes them, None for those they had; the others stay as
+        they are. Time is one for all and goes on: colliders that were driven are back where they began, others follow their
+        motion. Errors: ConfigError naming the world."""
+        which, episode = list(which), self._going()
+        given = None if starts is None else [start for start, _ in self._found(starts, which, episode.colliders)]
+        return episode.restart(which, given)
+
+    def _found(self, starts: Mapping | Sequence[Mapping] | None, which: Sequence[int], colliders) -> list[tuple[Start, World]]:
+        """The starts of these worlds, and the world. Errors: ConfigError."""
+        each = [dict(starts or {})] * len(which) if starts is None or isinstance(starts, Mapping) else list(starts)
+        if len(each) != len(which):
+            raise ConfigError(f"starts: expected one, or one for each of {len(which)} worlds, found {len(each)}")
+        found = []
+        for i, (b, given) in enumerate(zip(which, each)):
+            if unknown := sorted(set(given) - set(STARTED)):
+                raise ConfigError(f"starts[{b}]: expected {', '.join(STARTED)}, found {', '.join(unknown)}")
+            if i and given is each[0]:
+                found.append(found[0])
+                continue
+            try:
+                found.append(self.twin._start(*(given.get(name) for name in STARTED), colliders))
+            except ConfigError as error:
+                raise ConfigError(f"starts[{b}]: {error}") from error
+        return found
+
+    def _going(self) -> Episode:
         if self.episode is None:
             raise ConfigError("worlds: expected reset(...) before step and state, found no motion")
-        return self.episode.step(action)
+        return self.episode
+
+    def step(self, action: Mapping[str, Any] | None = None) -> Stepped:
+        """As `Twin.step`; every command is the same in all worlds, or (count, 3), rotations (count, 3, 3), for each."""
+        return self._going().step(action)
 
     @property
     def state(self) -> TwinState:
         """As `Twin.state`, of all worlds."""
-        if self.episode is None:
-            raise ConfigError("worlds: expected reset(...) before step and state, found no motion")
-        return self.episode.state
+        return self._going().state
 
     @state.setter
     def state(self, state: TwinState) -> None:
-        if self.episode is None:
-            raise ConfigError("worlds: expected reset(...) before step and state, found no motion")
-        self.episode.state = state
+        self._going().state = state
 
 
 STARTED = ("rotation", "height", "position", "velocity", "angular_velocity")

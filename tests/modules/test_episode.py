@@ -184,6 +184,35 @@ def test_worlds_are_so_many_twins():
     assert torch.equal(worlds.step().state.v.mean(1) - branch.v.mean(1), fallen)
 
 
+def test_some_worlds_begin_again():
+    """Those are at their start, or at a new one, with the bits of a twin that begins there; the others go on."""
+    made, still = twin(), PUSHER | {"motion": None}
+    begins = [{"velocity": (0.1 * b, -1.0, 0.0), "position": (0.0, 0.1, 0.0)} for b in range(3)]
+    push, new = {"pusher": (0.5, 0.1, 0.0)}, {"velocity": (0.0, -0.5, 0.0), "position": (0.01, 0.11, 0.0)}
+    worlds = made.worlds(3)
+    worlds.reset(begins, colliders=[still], substeps=12)
+    kept = worlds.reset(begins, colliders=[still], substeps=12)
+    assert torch.equal(worlds.restart([0]).x, kept.x)  # nothing has moved yet
+    for _ in range(3):
+        before = worlds.step(push).state
+    assert torch.equal(worlds.restart([2]).positions[2], kept.positions[2])
+    state = worlds.restart([0], [new])
+    assert torch.equal(state.x[1], before.x[1]) and not torch.equal(state.x[0], before.x[0])
+    assert torch.equal(state.position[[0, 2]], kept.position[[0, 2]]) and torch.equal(state.position[1], before.position[1])
+    for _ in range(4):
+        state, reactions = worlds.step(push)
+    for b, begin, steps in ((0, new, 4), (1, begins[1], 7), (2, begins[2], 4)):
+        made.reset(**begin, colliders=[still], substeps=12)
+        for _ in range(steps):
+            own, forces = made.step(push)
+        torch.testing.assert_close(state.positions[b], own.positions, rtol=0, atol=0)
+        assert torch.equal(reactions[:, b], forces)
+    with pytest.raises(ConfigError, match=r"restart: expected numbers of worlds below 3, found \[3\]"):
+        worlds.restart([3])
+    with pytest.raises(ConfigError, match=r"starts\[1\]: velocity: expected three"):
+        worlds.restart([1], [{"velocity": 1}])
+
+
 def test_gradients_of_worlds_are_those_of_their_twins():
     """Commands of each, to the last bit; the law's numbers, which they share, as a sum."""
     made, pushes = twin(), torch.tensor([[0.9, 0.0, 0.0], [0.8, 0.1, 0.1]]).double()
