@@ -103,6 +103,7 @@ class Episode:
                 ready, self._begin = _worlds(body, world, starts, laws, gravity, options)
                 more = {"gravity": gravity, "together": together}
             self._lifts, motions = ready.lift, ready.motions(self.colliders)
+            self._raised = ready.lift.double().cpu()  # once: a step shall not wait for a GPU to say it
             self._motions = motions if ready.lift.ndim > 1 else [motions]
             self._stepper, moment = ready.simulator.stepper(
                 ready.state, **ready.arguments, motions=motions, steps=frames, **more
@@ -211,7 +212,7 @@ class Episode:
 
     def _up(self) -> Tensor:
         """The lifts, to be added to positions ([B,] K, 3)."""
-        return self._lifts.double().cpu().unsqueeze(-2)
+        return self._raised.unsqueeze(-2)
 
     def _along(self, commands: dict[int, dict], driven: Tensor, count: int, dt: float) -> tuple[Poses, tuple[Tensor, Tensor]]:
         """(poses at the step's substeps, (position, rotation) after it)."""
@@ -229,8 +230,7 @@ class Episode:
             v, w, end = self._twist(commands.get(k, {}), x, R)
             turns = w.requires_grad or bool((w != 0).any())
             turned = exponential(times * w) @ R if turns else R.expand(count, *R.shape)
-            lift = self._lifts.double().cpu()
-            columns.append([x + times * v + lift, turned, v.expand(count, *x.shape), w.expand(count, *x.shape)])
+            columns.append([x + times * v + self._raised, turned, v.expand(count, *x.shape), w.expand(count, *x.shape)])
             after = exponential(self.frame_dt * w) @ R if turns else R
             last.append([end.get("position", x + self.frame_dt * v), end.get("rotation", after)])
         axis = 1 + len(self._leading())
