@@ -2,6 +2,7 @@
 
 import importlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -59,3 +60,19 @@ def test_cuda_asked_for_where_there_is_none_is_said(monkeypatch, capsys, name, a
         importlib.import_module(name).main()
     assert ended.value.code == 2
     assert "CUDA device on this machine" in (said := capsys.readouterr().err) or "a CUDA device, and torch finds none" in said
+
+
+def test_the_benchmark_of_worlds_checks_them_first(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    worlds = importlib.import_module("worlds")
+    worlds.check("cpu", particles=64, worlds=2)
+    assert "differ by at most 0 cells" in capsys.readouterr().out
+    rollout_worlds = worlds.Simulator.rollout_worlds
+
+    def shifted(*arguments, **more):
+        found = rollout_worlds(*arguments, **more)
+        return replace(found, x=found.x + 1e-12 * found.x.shape[1])  # by the number of worlds
+
+    monkeypatch.setattr(worlds.Simulator, "rollout_worlds", shifted)
+    with pytest.raises(SystemExit, match="worlds are not their single rollouts"):
+        worlds.check("cpu", particles=64, worlds=2)
