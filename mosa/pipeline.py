@@ -370,7 +370,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         (folder / "plan.md").write_text(plan_text(ranked) + "\n")
         return -ranked[0].gain
     simulate = plain(cfg.simulate)
-    if any(simulate[k] is not None for k in ("velocity", "rotation", "height", "angular_velocity", "colliders")):
+    if any(simulate[k] is not None for k in ("velocity", "rotation", "position", "height", "angular_velocity", "colliders")):
         rollout = twin.simulate(**simulate, progress=True)
         log.info("simulated %d frames into %s", len(rollout.x), twin.export(rollout, folder))
         return None

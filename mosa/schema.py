@@ -63,6 +63,8 @@ SEQUENCES = Kind("a list of names or folders like [a, b], or of sections like {p
 SECTION = Kind("a section of keys", lambda v: isinstance(v, Mapping))
 ENTRIES = Kind("a list of sections", lambda v: isinstance(v, list) and all(isinstance(entry, Mapping) for entry in v))
 THREE = Kind("three numbers", lambda v: isinstance(v, list) and len(v) == 3 and all(map(is_number, v)))
+PLACE = Kind("three numbers, null for one that is left as it is",
+             lambda v: isinstance(v, list) and len(v) == 3 and all(x is None or is_number(x) for x in v))  # fmt: skip
 TURN = Kind("four numbers, an axis and degrees", lambda v: isinstance(v, list) and len(v) == 4 and all(map(is_number, v)))
 POSITIVE, WEIGHT, COUNT = number(0, above=True), number(0), whole(1)
 WIDEST = 4096
@@ -205,6 +207,7 @@ SIMULATION: dict[str, Kind] = {
     "simulate.velocity": or_null(THREE),
     "simulate.angular_velocity": or_null(THREE),
     "simulate.rotation": or_null(TURN),
+    "simulate.position": or_null(PLACE),
     "simulate.height": or_null(Kind("a number", is_number)),
     "simulate.colliders": or_null(ENTRIES),
     "simulate.frames": COUNT,

@@ -90,8 +90,8 @@ def test_colliders(items):
 @examples(40)
 @given(st.data())
 def test_calls_of_a_twin(data):
-    arguments = {"rotation": [0, 0, 1, 30], "height": 0.01, "velocity": [0, -1.0, 0], "angular_velocity": [0, 0, 1.0],
-                 "variant": "prior", "frames": 2}  # fmt: skip
+    arguments = {"rotation": [0, 0, 1, 30], "position": [0.1, None, 0.0], "height": 0.01, "velocity": [0, -1.0, 0],
+                 "angular_velocity": [0, 0, 1.0], "variant": "prior", "frames": 2}  # fmt: skip
     for name in data.draw(st.lists(st.sampled_from(sorted(arguments)), min_size=1, max_size=2, unique=True)):
         drawn = data.draw(st.one_of(values, THREE, st.lists(numbers, min_size=4, max_size=4),
                                     st.lists(THREE, min_size=3, max_size=3)))  # fmt: skip
@@ -99,6 +99,26 @@ def test_calls_of_a_twin(data):
             drawn = 3  # a long rollout is no mistake
         arguments[name] = drawn
     simulated(TWIN(), **arguments)
+
+
+@examples(40)
+@given(st.data())
+def test_actions_of_a_stepped_twin(data):
+    """A step that is refused moves nothing; one that is not leaves finite numbers."""
+    stepped = TWIN()
+    before = stepped.reset(colliders=[SHAPES[0] | {"position": [0.0, -0.4, 0.0], "name": "ball"}], frames=2)
+    drawn = st.one_of(values, THREE, st.lists(THREE, min_size=3, max_size=3))
+    keys = st.sampled_from(["velocity", "angular_velocity", "position", "rotation", "speed"])
+    command = data.draw(st.one_of(drawn, st.dictionaries(keys, drawn, max_size=2)))
+    action = data.draw(st.sampled_from([command, {"ball": command}, {"1": command}]))
+    try:
+        state, reactions = stepped.step(action)
+    except (ConfigError, SimulationDiverged) as error:
+        one_message(error)
+        assert torch.equal(stepped.state.x, before.x) and int(stepped.state.frames) == 0
+        return
+    for found in (state.x, state.v, state.F, state.position, reactions):
+        assert bool(torch.isfinite(found).all())
 
 
 STORED = functools.cache(saved)

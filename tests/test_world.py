@@ -96,3 +96,17 @@ def test_a_collider_that_contains_the_body_is_named(collider):
 def test_an_argument_of_the_wrong_form_is_named(arguments, message):
     with pytest.raises(ConfigError, match=message):
         twin().simulate(**arguments)
+
+
+def test_a_start_is_put_beside_where_the_training_was():
+    """The body moves as from its own place, numbers that are None are kept, and the height wins along `up`."""
+    made = twin()
+    usual = made.simulate(frames=3)
+    aside = made.simulate(frames=3, position=[0.12, None, -0.06])  # whole cells, so that the grid lies the same
+    moved = torch.tensor([0.12, 0.0, -0.06])
+    torch.testing.assert_close(aside.x, usual.x + moved, rtol=0, atol=1e-5)
+    high = made.simulate(frames=1, position=(0.12, 5.0, 0.0), height=0.2)
+    assert float(high.x[0, :, 1].min()) == pytest.approx(0.2, abs=1e-5)
+    for wrong in ([0.1, 0.2], "here", [0.0, float("inf"), 0.0], [True, 0.0]):
+        with pytest.raises(ConfigError, match="position: expected three finite numbers"):
+            made.simulate(position=wrong)
