@@ -175,6 +175,7 @@ TRAINING: dict[str, Kind] = {
     "reconstruction.dynamic.free_shape": FLAG,
     "reconstruction.dynamic.elastic": WEIGHT,
     "reconstruction.dynamic.bending": WEIGHT,
+    "reconstruction.dynamic.bending_scale": WEIGHT,
     "reconstruction.dynamic.hidden": whole(1, WIDEST),
     "world.walls": or_null(SECTION),
     "world.colliders": or_null(ENTRIES),

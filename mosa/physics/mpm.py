@@ -263,7 +263,7 @@ class Lanes:
                 self._buffers.append(buffers)
 
         count = len(self.solvers)
-        if self.solvers[0].volume.is_cuda:  # one launches while another captures a graph: a stream that is captured takes no other work
+        if self.solvers[0].volume.is_cuda:  # in turns: while one captures a graph no other may touch the stream
             return [run(index) for index in range(count)]
         if kind in self._warm:
             return list(threaded(run, range(count)))

@@ -135,7 +135,7 @@ class _Objective:
         if settings.bending > 0 and isinstance(self.motion, ModalMotion):
             c = self.motion.coefficients(frames) / self.motion.reach
             curvature = (self.scaffold.modes.energy[:, None] * c**2).sum((-2, -1))
-            if self.refining and settings.bending_scale > 0:  # the slope of the logarithm is 1 at 0: what a frame shows sets its own weight
+            if self.refining and settings.bending_scale > 0:  # what a frame shows sets its own weight
                 curvature = settings.bending_scale * torch.log1p(curvature / settings.bending_scale)
             loss = loss + settings.bending * curvature.mean()
         return loss

@@ -159,3 +159,31 @@ def test_a_rendered_motion_is_recovered(settings, bound, scaffold):
     error = float((found - true)[1:].pow(2).sum(-1).mean().sqrt())
     assert error < bound
     assert float((start - true)[1:].pow(2).sum(-1).mean().sqrt()) > 9e-3
+
+
+def test_a_body_that_bends_far_is_not_straightened(scaffold):
+    """Default weights, a curvature of twenty times the scale: with the scale the fit is nearer to the truth, and free frames, whose
+    curvature is small, stay as they were."""
+    frames, errors, bent = 3, {}, {}
+    offsets = torch.tensor([[0.0, 0, 0], [0.004, -0.01, 0.0], [0.008, -0.02, 0.004]])
+    truth = ModalMotion(offsets, scaffold.modes.energy, reach=0.1)
+    energy = scaffold.modes.energy
+    with torch.no_grad():
+        truth.amplitude[2, 4:10] = 0.5 * torch.randn(6, 3, generator=torch.Generator().manual_seed(5))
+        c = truth.coefficients(torch.tensor([2]))[0] / 0.1
+        truth.amplitude[2] *= (0.02 / (energy[:, None] * c**2).sum()).sqrt()
+        scene = rendered_windows(scaffold, truth, frames)
+        shifted = Splats(**{**vars(scaffold.splats), "means": scaffold.splats.means + torch.tensor([0.04, 0.25, 0.0])})
+        true = truth(torch.arange(frames), shifted, scaffold.modes).positions
+    windows = object_windows(scene, list(range(6)), list(range(frames)))
+    body = Scaffold(shifted, scaffold.modes, scaffold.around)
+    for scale in (0.0, 0.001):
+        settings = DynamicSettings(carriers="particles", track_iterations=30, iterations=80, bending_scale=scale)
+        motion = fit_motion(body, body, windows, offsets, torch.ones(3), settings, reach=0.1, seed=0)
+        with torch.no_grad():
+            found = motion(torch.arange(frames), shifted, scaffold.modes, scaffold.around).positions
+            coefficients = motion.coefficients(torch.arange(frames)) / 0.1
+        errors[scale] = (found - true).pow(2).sum(-1).mean(-1).sqrt()
+        bent[scale] = (energy[:, None] * coefficients**2).sum((-2, -1))
+    assert errors[0.001][2] < 0.85 * errors[0.0][2] and errors[0.001][1] < errors[0.0][1] + 1e-4
+    assert 1.5 * bent[0.0][2] < bent[0.001][2] < 0.02
