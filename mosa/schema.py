@@ -73,7 +73,7 @@ WIDEST = 4096
 SECTIONS = ("scene", "prior", "adapter", "reconstruction", "simulation", "fit", "rendering", "trainer", "logger", "evaluation",
             "heterogeneity", "losses", "world", "criterion", "identification",
             "fit.prior", "fit.prior_eta", "fit.joint", "reconstruction.static",
-            "reconstruction.appearance", "reconstruction.dynamic")  # fmt: skip
+            "reconstruction.appearance", "reconstruction.dynamic", "reconstruction.carried")  # fmt: skip
 
 FIGURE = Kind("a figure's name like test/rms_m (docs/figures.md)",
               lambda v: isinstance(v, str) and v.split("/")[0] in FIGURES and "/" in v)
@@ -158,6 +158,8 @@ TRAINING: dict[str, Kind] = {
     "reconstruction.*.lr*": WEIGHT,
     "reconstruction.*.ssim": number(0, 1),
     "reconstruction.*.matte": WEIGHT,
+    "reconstruction.carried.degree": whole(0, 3),
+    "reconstruction.carried.light": FLAG,
     "reconstruction.*.shape": one_of("isotropic", "anisotropic"),
     "reconstruction.*.largest": number(1),
     "reconstruction.*.axis_ratio": number(1),
@@ -184,6 +186,7 @@ TRAINING: dict[str, Kind] = {
     "logger.wandb.offline": FLAG,
     "logger.wandb.tags": or_null(NAMES),
     "rendering.backend": TEXT,
+    "rendering.appearance": one_of("splats", "particles"),
     "ckpt_path": or_null(TEXT),
     "optimized_metric": FIGURE,
     "scene.cache": or_null(TEXT),
@@ -203,6 +206,7 @@ SIMULATION: dict[str, Kind] = {
     "ckpt_path": TEXT,
     "cache": or_null(TEXT),
     "plan": or_null(whole(2)),
+    "appearance": or_null(one_of("splats", "particles")),
     "simulate.variant": one_of("adapted", "prior_eta", "prior"),
     "simulate.velocity": or_null(THREE),
     "simulate.angular_velocity": or_null(THREE),

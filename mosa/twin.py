@@ -21,14 +21,14 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from mosa.analysis.figures import side_by_side, write_video
-from mosa.checkpoints import TENSORS, checked, checked_posterior, read_checkpoint
+from mosa.checkpoints import TENSORS, checked, checked_posterior, checked_splats, read_checkpoint
 from mosa.episode import Episode, Stepped, TwinState
 from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
 from mosa.limits import machine_memory
 from mosa.modules.body import VARIANTS, Body, Start, World
+from mosa.modules.carried_splats import CarriedSplats, seen
 from mosa.modules.gauss_newton import Posterior
 from mosa.modules.identification import each_law, read_numbers
-from mosa.modules.observer import deformed_covariances, observe
 from mosa.npz import write_npz
 from mosa.physics.collider_overlap import check_clear
 from mosa.physics.colliders import Collider, colliders_from_config
@@ -57,9 +57,12 @@ class Twin:
 
         checkpoint = read_checkpoint(path)
         config, begun, tensors = checked(checkpoint, path)
+        splats = checked_splats(checkpoint, path)
         try:
             body = build_body(config, {name: tensors[name] for name in TENSORS})
             body.load_state_dict(tensors)
+            if splats is not None:
+                body.splats = CarriedSplats.read(splats, body.rest)
             world, start = build_world(config["world"]), Start.read(begun)
         except Exception as error:  # every part has been checked; a file of a stranger may still fit no body
             reason = str(error) if isinstance(error, MosaError) else f"{type(error).__name__}: {error}"
@@ -219,8 +222,7 @@ class Twin:
         eye = target + distance * (side / side.norm() + 0.25 * up)
         K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
         camera = Cameras(K[None].to(body.rest), look_at(eye, target, up)[None].to(body.rest), size, size, ("view",))
-        return observe(rollout.x, deformed_covariances(rollout.F_tot, body.covariances), body.opacities, body.colors, camera,
-                       torch.ones(3).to(body.rest)).images[0].cpu()
+        return seen(body, rollout.x, rollout.F_tot).images(camera, torch.ones(3).to(body.rest))[0].clamp(0, 1).cpu()
 
     def export(self, rollout: Rollout, folder: str | Path, *, video: bool = True, title: str = "learned twin") -> Path:
         """Write `rollout.npz`, one PLY a frame (x y z red green blue) and `simulation.mp4` into `folder`."""

@@ -61,6 +61,11 @@ def colors_in(coefficients: Tensor, directions: Tensor) -> Tensor:
     return (torch.einsum("...nk,nkc->...nc", values, coefficients) + 0.5).clamp(min=0)
 
 
+def camera_centers(cameras: Cameras) -> Tensor:
+    """Where the cameras are, (V, 3) [m]."""
+    return -(cameras.w2c[:, :3, :3].transpose(1, 2) @ cameras.w2c[:, :3, 3:])[..., 0]
+
+
 def view_colors(coefficients: Tensor, means: Tensor, cameras: Cameras, state_index: Tensor) -> Tensor:
     """Features (B, N, 3) for `rasterize`: the colour of every Gaussian as each camera sees it.
 
@@ -68,9 +73,7 @@ def view_colors(coefficients: Tensor, means: Tensor, cameras: Cameras, state_ind
     means and the cameras' w2c. The directions are those of the world: a body that turns takes its coefficients along
     only if they are turned with it. Errors: ConfigError for another K.
     """
-    w2c = cameras.w2c.to(means)
-    centers = -(w2c[:, :3, :3].transpose(1, 2) @ w2c[:, :3, 3:])[..., 0]
-    return colors_in(coefficients, means[state_index] - centers[:, None])
+    return colors_in(coefficients, means[state_index] - camera_centers(cameras).to(means)[:, None])
 
 
 def rotated(coefficients: Tensor, rotation: Tensor) -> Tensor:
