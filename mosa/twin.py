@@ -22,6 +22,7 @@ from torch import Tensor
 
 from mosa.analysis.figures import side_by_side, write_video
 from mosa.checkpoints import TENSORS, checked, checked_posterior, checked_splats, read_checkpoint
+from mosa.data.splat_files import save_frames
 from mosa.episode import Episode, Stepped, TwinState
 from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
 from mosa.limits import machine_memory
@@ -224,13 +225,18 @@ class Twin:
         camera = Cameras(K[None].to(body.rest), look_at(eye, target, up)[None].to(body.rest), size, size, ("view",))
         return seen(body, rollout.x, rollout.F_tot).images(camera, torch.ones(3).to(body.rest))[0].clamp(0, 1).cpu()
 
-    def export(self, rollout: Rollout, folder: str | Path, *, video: bool = True, title: str = "learned twin") -> Path:
-        """Write `rollout.npz`, one PLY a frame (x y z red green blue) and `simulation.mp4` into `folder`."""
+    def export(
+        self, rollout: Rollout, folder: str | Path, *, video: bool = True, title: str = "learned twin",
+        formats: Sequence[str] = ("ply",),
+    ) -> Path:  # fmt: skip
+        """Write `rollout.npz`, one PLY a frame (x y z red green blue), `simulation.mp4` and the Gaussians that its images show in
+        `formats` (`data.splat_files.FORMATS`: 3DGS PLY, splat, spz, usd) below `splats/` into `folder`."""
         folder = Path(folder)
         (folder / "ply").mkdir(parents=True, exist_ok=True)
         save_rollout(folder / "rollout.npz", {"simulation": rollout})
         for t, x in enumerate(rollout.x.cpu().numpy()):
             write_ply(folder / "ply" / f"{t:03d}.ply", x, self.body.colors.cpu().numpy())
+        save_frames(seen(self.body, rollout.x, rollout.F_tot), folder / "splats", formats, rate=1 / self.frame_dt, up=self.world.up)
         if video:
             moments = [f"frame {t}, {time:.3f} s" for t, time in enumerate(rollout.times.tolist())]
             frames = side_by_side({title: self.render(rollout)}, footer=moments)

@@ -14,7 +14,7 @@ from mosa.rendering.carrying import Binding, Carried, bind
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.lighting import LIGHT, shading
 from mosa.rendering.rasterizer import rasterize
-from mosa.rendering.spherical_harmonics import camera_centers, colors_in, constant_coefficients
+from mosa.rendering.spherical_harmonics import camera_centers, colors_in, constant_coefficients, mean_colors
 from mosa.types import Appearance, Cameras, Splats
 
 if TYPE_CHECKING:
@@ -103,6 +103,12 @@ class Seen:
             found.append(rasterize(self.means, self.covariances, self.opacities, colors, repeat_cameras(camera, frames), index,
                                    background)[0])
         return torch.stack(found)
+
+    def colors(self) -> Tensor:
+        """(T, M, 3) in [0, 1], averaged over all directions, in each frame's light."""
+        constant = mean_colors(self.harmonics)
+        shades = self.means.new_ones(self.means.shape[:2]) if self.shades is None else self.shades
+        return (constant * shades[..., None]).clamp(0, 1)
 
 
 def seen(body: Body, positions: Tensor, F_tot: Tensor | None) -> Seen:
