@@ -216,6 +216,34 @@ SIMULATION: dict[str, Kind] = {
     "simulate.colliders": or_null(ENTRIES),
     "simulate.frames": COUNT,
 }
+SPLATS: dict[str, Kind] = {
+    **{key: kind for key, kind in BODY.items() if key.split(".")[0] in ("seed", "prior", "simulation", "adapter", "heterogeneity")},
+    "ply": TEXT,
+    "ckpt_path": or_null(TEXT),
+    "device": TEXT,
+    "size": or_null(POSITIVE),
+    "up": THREE,
+    "box": or_null(Kind("two corners [[x, y, z], [x, y, z]]",
+                        lambda v: isinstance(v, list) and len(v) == 2 and all(map(THREE.fits, v)))),
+    "opacity": number(0, 1),
+    "open_below": FLAG,
+    "resolution": whole(8, 512),
+    "share": number(0, 1, above=True),
+    "density": or_null(POSITIVE),
+    "gravity": WEIGHT,
+    "height": WEIGHT,
+    "ground": SECTION,
+    "ground.mode": one_of("sticky", "slip", "separate"),
+    "ground.friction": WEIGHT,
+    "rotation": or_null(TURN),
+    "velocity": THREE,
+    "angular_velocity": THREE,
+    "frames": COUNT,
+    "rate": POSITIVE,
+    "formats": NAMES,
+    "video": FLAG,
+}
+"""Of conf/splats.yaml."""
 
 
 def check(values: Mapping[str, Any], *schemas: Mapping[str, Kind]) -> None:
