@@ -25,6 +25,7 @@ from mosa.checkpoints import check_same, read_checkpoint
 from mosa.config import build_body, build_fit, build_world, plain, run_config, world_config
 from mosa.data.datamodule import MultiViewDataModule, training_observations
 from mosa.data.sequences import load_sequences, taught_names
+from mosa.data.splats import save_ply
 from mosa.errors import ConfigError, DataError, MosaError
 from mosa.evaluation import (
     Sequence,
@@ -335,12 +336,15 @@ def start_figures(start: Start) -> dict[str, float]:
 
 
 def write_outputs(folder: Path, cfg: DictConfig, body: Body, evaluated: list[Sequence], figures: dict, kept: dict) -> None:
-    """rollout.npz and prior.npz, truth.npz where it is known; video.mp4 of the last held-out sequence, strip.png of all; tables in
-    results.md; metrics.json."""
+    """rollout.npz and prior.npz, truth.npz where it is known; splats.ply; video.mp4 of the last held-out sequence, strip.png of
+    all; tables in results.md; metrics.json."""
     for variant, name in (("adapted", "rollout.npz"), ("prior", "prior.npz")):
         save_rollout(folder / name, {prefix: variants[variant] for prefix, variants in kept.items()})
     if known := {s.prefix: true_motion(body, s.scene) for s in evaluated if s.scene.truth is not None}:
         save_truth(folder / "truth.npz", known)
+    if body.splats is not None:
+        known = body.splats.appearance
+        save_ply(folder / "splats.ply", known.splats.to("cpu"), known.harmonics.cpu())
     if cfg.evaluation.video:
         shown = [s for s in evaluated if s.prefix.startswith("test")] or evaluated[-1:]
         write_comparisons(folder, {s.prefix: compare(body, s, kept[s.prefix]) for s in shown})
