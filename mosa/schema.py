@@ -155,6 +155,7 @@ TRAINING: dict[str, Kind] = {
     "reconstruction.*.iterations": whole(0),
     "reconstruction.*.views": COUNT,
     "reconstruction.*.keep": WEIGHT,
+    "reconstruction.carried.keep_harmonics": WEIGHT,
     "reconstruction.*.lr*": WEIGHT,
     "reconstruction.*.ssim": number(0, 1),
     "reconstruction.*.matte": WEIGHT,

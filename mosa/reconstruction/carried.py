@@ -29,8 +29,9 @@ from mosa.types import Appearance, Splats
 @dataclass(frozen=True)
 class CarriedSettings(FitSettings):
     """As `FitSettings`, of Gaussians that start from the static ones; lr_colors counts for their mean colours. degree: of the
-    spherical harmonics, 0 to 3; lr_harmonics: of those of degree 1 and more, per coefficient; light: whether the light is fitted,
-    lr_light: its step."""
+    spherical harmonics, 0 to 3; lr_harmonics: of those of degree 1 and more, per coefficient; keep_harmonics: what those count for
+    in pixels of an image, since what no training camera sees along has no other reason to be dull; light: whether the light is
+    fitted, lr_light: its step."""
 
     views: int = 4
     keep: float = 1.0
@@ -38,6 +39,7 @@ class CarriedSettings(FitSettings):
     lr_colors: float = 0.03
     degree: int = 1
     lr_harmonics: float = 0.005
+    keep_harmonics: float = 10.0
     light: bool = True
     lr_light: float = 0.02
 
@@ -75,9 +77,10 @@ class RestGaussians:
         return covariance_from(self.log_scale.exp(), self.quaternion)
 
     def change(self) -> Tensor:
-        """Sum over the splats of the mean square by which their colours, in the mean over all directions, left the first ones."""
-        moved = torch.cat((self.constant - self.first, self.higher), 1)
-        return Y0**2 * moved.square().mean(2).sum()
+        """Sum over the splats of the squares by which their colours, in the mean over directions and channels, left the first ones,
+        each weighted by what it counts for."""
+        constant, higher = ((Y0 * moved).square().mean(2).sum() for moved in (self.constant - self.first, self.higher))
+        return self.settings.keep * constant + self.settings.keep_harmonics * higher
 
     def step(self, loss: Tensor, factor: float) -> None:
         """One of Adam's, at `factor` of the first; scales back between their bounds, as those of the static stage."""
@@ -138,7 +141,7 @@ def fit_carried(
             torch.arange(len(batch), device=means.device), background,
         )  # fmt: skip
         loss = image_loss(image, alpha, batch, ssim_weight=settings.ssim, matte_weight=settings.matte)
-        loss = loss + settings.keep * gaussians.change() / alpha.numel()
+        loss = loss + gaussians.change() / alpha.numel()
         gaussians.step(loss, 0.03 + 0.97 * 0.5 * (1 + math.cos(math.pi * step / settings.iterations)))
         if progress is not None:
             progress(1)
