@@ -49,7 +49,8 @@ def check_splats(values: Mapping[str, Any]) -> None:
         check_known(values, conf, "splats", SPLATS)
     check(values, SPLATS)
     check_formats(values["formats"])
-    check_particles("simulation.particles", values["simulation"]["particles"])
+    if values["simulation"]["particles"] != "auto":
+        check_particles("simulation.particles", values["simulation"]["particles"])
 
 
 def check_particles(key: str, count: float) -> None:

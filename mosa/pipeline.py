@@ -37,7 +37,7 @@ from mosa.evaluation import (
     test_means,
     true_motion,
 )
-from mosa.guards import check_begin, check_configuration, check_evaluation, check_seen, check_splats, check_starts, evaluated_scene
+from mosa.guards import check_begin, check_configuration, check_evaluation, check_seen, check_starts, evaluated_scene
 from mosa.loggers import build_loggers, chosen, log_outcome
 from mosa.modules.body import Body, Start, World
 from mosa.modules.carried_splats import CarriedSplats
@@ -405,32 +405,6 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         figures |= true_geometry(body, scene)
     write_outputs(folder, cfg, body, evaluated, figures, kept)
     return optimized(figures, "test/rms_m")
-
-
-def drop_splats(cfg: DictConfig) -> None:
-    """`python -m mosa.splats`: fill the Gaussians of a file, let them fall, write frames, video and a checkpoint of the body."""
-    from mosa.splats import object_twin, read_object, save_twin
-
-    quiet()
-    if OmegaConf.is_missing(cfg, "ply"):
-        raise ConfigError("ply: expected a 3DGS PLY file of an object, found none; python -m mosa.splats ply=object.ply")
-    values, folder = plain(cfg), run_folder()
-    check_splats(values)
-    found = read_object(cfg.ply, box=values["box"], opacity=cfg.opacity, size=cfg.size)
-    law = values if cfg.ckpt_path is None else Twin.load(cfg.ckpt_path)
-    names = ("density", "up", "gravity", "height", "ground", "resolution", "share", "open_below")
-    grid = {name: values["simulation"][name] for name in ("particles", "dx")}
-    twin = object_twin(found, law, frame_dt=1 / cfg.rate, **grid, **{name: values[name] for name in names})
-    device = named_device(cfg.device)
-    twin.body.to(device)
-    volume, size = float(twin.body.volume.sum()), twin.body.size
-    log.info("object: %d Gaussians, %d particles, %.4g cm^3, %.3g m long", len(twin.body.splats), len(twin.body.rest), 1e6 * volume,
-             size)
-    save_twin(twin, folder / "checkpoints" / "last.ckpt")
-    rollout = twin.simulate(frames=cfg.frames, progress=True,
-                            **{name: values[name] for name in ("height", "rotation", "velocity", "angular_velocity")})
-    twin.export(rollout, folder, video=cfg.video, title="object", formats=values["formats"])
-    log.info("%d frames in %s; look at them with mosa-view %s", len(rollout.x), folder, folder)
 
 
 def show(body: Body, appearance: str | None) -> None:

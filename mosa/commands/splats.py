@@ -14,9 +14,9 @@ from mosa.jobs import attempt, check_arguments
 @hydra.main(version_base="1.3", config_path=configuration(), config_name="splats")
 def run(cfg: DictConfig) -> None:
     def job(cfg: DictConfig) -> None:
-        from mosa.pipeline import drop_splats
+        from mosa.splats import drop
 
-        return drop_splats(cfg)
+        return drop(cfg)
 
     begin_log()
     return attempt(job, cfg)

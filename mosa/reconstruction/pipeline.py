@@ -98,6 +98,11 @@ def spacing_for(
     if particles is not None and particles < 8:
         raise ConfigError(f"simulation.particles: expected at least 8, found {particles}")
     body = object_geometry(scene, settings or ReconstructionSettings(), cache_dir=cache_dir, device=device).body
+    return filling_spacing(body, particles, per_cell=per_cell, most=most)
+
+
+def filling_spacing(body: Volume, particles: int | None, *, per_cell: float = PER_CELL, most: int = FEW) -> float:
+    """Particle spacing [m] that fills a solid; arguments as of `spacing_for`."""
     volume = body_volume(body)
     if particles is None:
         particles = particles_for(lambda spacing: fill(body, spacing=spacing).positions, volume, per_cell=per_cell, least=FEW,
