@@ -18,10 +18,16 @@ from torch import Tensor
 
 from mosa.errors import ConfigError, DataError
 from mosa.limits import machine_memory
+from mosa.rendering.lighting import LIGHT
+from mosa.rendering.spherical_harmonics import DEGREES
 from mosa.schema import BODY, POSITIVE, THREE, WEIGHT, Kind, check, is_number, one_of, or_null, whole
 
 TENSORS = {"rest": (3,), "volume": (), "colors": (3,), "opacities": (), "covariances": (3, 3)}
 """What a body is made of, with the shape for each particle."""
+SPLATS = {"means": (3,), "scales": (3,), "rotations": (4,), "opacities": (), "colors": (3,),
+          "normals": (3,)}  # fmt: skip
+BOUND_BYTES = 4000
+"""Of a splat while it is bound to its neighbours."""
 RESUMED = ("epoch", "global_step", "pytorch-lightning_version", "loops", "callbacks", "optimizer_states", "lr_schedulers")
 """What Lightning reads where a fit goes on."""
 NAMED = {"collections OrderedDict", "torch Size", "torch._utils _rebuild_tensor_v2", "torch._utils _rebuild_parameter",
@@ -176,6 +182,35 @@ def checked_posterior(checkpoint: Mapping[str, Any], numbers: int, path: str | P
     if not float(torch.linalg.eigvalsh(found["covariance"].double()).min()) > 0:
         raise DataError(f"{where}.covariance: expected a positive definite matrix")
     return found
+
+
+def checked_splats(checkpoint: Mapping[str, Any], path: str | Path) -> dict[str, Tensor] | None:
+    """What `CarriedSplats.read` takes; None where the run kept none. Errors: DataError naming file and part."""
+    found = checkpoint["mosa"].get("splats")
+    if found is None:
+        return None
+    where = f"ckpt_path: {path}: mosa.splats"
+    try:
+        parts(found, (*SPLATS, "harmonics", "light"), "mosa.splats")
+    except ConfigError as error:
+        raise DataError(f"ckpt_path: {path}: {error}") from error
+    tensors = {name: found[name] for name in (*SPLATS, "harmonics", "light")}
+    count = len(tensors["means"]) if isinstance(tensors["means"], Tensor) and tensors["means"].ndim else 0
+    if not 0 < count <= machine_memory() // (2 * BOUND_BYTES):
+        raise DataError(f"{where}.means: expected 1 to {machine_memory() // (2 * BOUND_BYTES)} splats, which take half of this "
+                        f"machine's memory, found {count}")
+    for name, value in tensors.items():
+        shapes = [(count, *SPLATS[name])] if name in SPLATS else [(count, k, 3) for k in DEGREES]
+        shapes = [(LIGHT,)] if name == "light" else shapes
+        if not isinstance(value, Tensor) or tuple(value.shape) not in shapes or not value.is_floating_point() or not bool(
+                torch.isfinite(value).all()):  # fmt: skip
+            raise DataError(f"{where}.{name}: expected finite numbers of shape {' or '.join(map(str, shapes))}")
+    turned = (tensors[name].norm(dim=1).min() for name in ("rotations", "normals"))
+    if not float(tensors["scales"].min()) > 0 or not all(map(float, turned)):
+        raise DataError(f"{where}: expected scales above 0 m, quaternions and normals that are not zero")
+    if float(tensors["opacities"].min()) < 0 or float(tensors["opacities"].max()) > 1:
+        raise DataError(f"{where}.opacities: expected numbers from 0 to 1")
+    return tensors
 
 
 def parts(found: Any, wanted: Iterable[str], where: str) -> None:

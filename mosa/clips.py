@@ -14,9 +14,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from scipy.spatial import cKDTree
 
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body import Body, World
+from mosa.modules.carried_splats import seen
 from mosa.modules.observer import deformed_covariances
 from mosa.npz import read_npz
 from mosa.reconstruction.cues import neighbourhood
@@ -61,11 +63,22 @@ class Scale:
 
 
 @dataclass(frozen=True)
-class Motion:
-    """N splats over T frames: centers (T, N, 3) [m], covariances (T, N, 3, 3) [m^2]."""
+class Carried:
+    """M splats that a body's particles carry, over T frames: centers (T, M, 3) [m], covariances (T, M, 3, 3) [m^2], colors
+    (T, M, 3) in [0, 1], in the light of each frame."""
 
     centers: np.ndarray
     covariances: np.ndarray
+    colors: np.ndarray
+
+
+@dataclass(frozen=True)
+class Motion:
+    """N particles over T frames: centers (T, N, 3) [m], covariances (T, N, 3, 3) [m^2]; carried: the splats that they carry."""
+
+    centers: np.ndarray
+    covariances: np.ndarray
+    carried: Carried | None = None
 
 
 @dataclass(frozen=True)
@@ -74,7 +87,8 @@ class Clip:
     calibrated law's without adapter and heterogeneity, where the run left it; one of observed, over the frames that were learned
     from, and truth, or neither; appearance: (N, 3) in [0, 1]; opacities: (N,); factor: (N,) 1 + a tanh eta, by which a particle's
     stiffness differs from the law's; spread: (T, N) [m] predicted standard deviation of the learned positions, None where the run
-    left none."""
+    left none; splat_opacities: (M,), splat_particles: (M,) nearest particles of the splats that all bodies carry, where the run has
+    them."""
 
     name: str
     times: np.ndarray
@@ -84,6 +98,8 @@ class Clip:
     factor: np.ndarray
     world: World
     spread: np.ndarray | None = None
+    splat_opacities: np.ndarray | None = None
+    splat_particles: np.ndarray | None = None
 
     @property
     def learned(self) -> Motion:
@@ -175,6 +191,17 @@ class Clip:
         far = self.deviation(frame, model)
         return np.full_like(self.appearance, GRAY) if far is None else self.scales[by].paint(1e3 * far)
 
+    def splats(self, name: str, frame: int, by: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Centers (M, 3) [m], covariances (M, 3, 3) [m^2], colours (M, 3) and opacities (M,) of a body's splats: those it carries,
+        where it carries some, painted as the particles nearest to them at rest; else the particles themselves."""
+        motion = self.bodies[name]
+        plain = by == "appearance" or name == self.reference
+        colors = self.appearance if plain else self.paint(frame, by, name)
+        if motion.carried is None:
+            return motion.centers[frame], motion.covariances[frame], colors, self.opacities
+        colors = motion.carried.colors[frame] if plain else colors[self.splat_particles]
+        return motion.carried.centers[frame], motion.carried.covariances[frame], colors, self.splat_opacities
+
     def caption(self, frame: int) -> str:
         """What a frame is, and what the scene leaves out."""
         said = f"**{self.name}**, frame {frame}, {self.times[frame] - self.times[0]:.3f} s  \n"
@@ -230,12 +257,30 @@ def read_run(folder: str | Path) -> list[Clip]:
                 raise DataError(f"{paths[kind]}: {name}: expected the checkpoint's {shape[1]} particles in the rollout's "
                                 f"{shape[0]} frames, found {particles} in {frames}; all files must be of one run")
             check_motion(stored, name, paths[kind], ("F_tot", "covariances"))
-            bodies[kind] = Motion(stored[f"{name}/x"], covariances(stored, name, body))
+            x = stored[f"{name}/x"]
+            bodies[kind] = Motion(x, covariances(stored, name, body), carried_by(body, x))
         clips.append(Clip(name, rollouts[f"{name}/times"], bodies, body.colors.clamp(0, 1).numpy(), body.opacities.numpy(),
-                          factor.numpy(), twin.world, spread_of(spreads, name, shape, folder / "uncertainty.npz")))  # fmt: skip
+                          factor.numpy(), twin.world, spread_of(spreads, name, shape, folder / "uncertainty.npz"),
+                          **splat_keys(body)))  # fmt: skip
     if not clips:
         raise DataError(f"{folder / 'rollout.npz'}: expected the rollouts of a run, found none")
     return clips
+
+
+def carried_by(body: Body, x: np.ndarray) -> Carried | None:
+    """The body's splats with its particles at (T, N, 3) [m]; None where it has none."""
+    if body.splats is None:
+        return None
+    shown = seen(body, torch.from_numpy(x).to(body.rest), None)
+    return Carried(*(value.numpy() for value in (shown.means, shown.covariances, shown.colors())))
+
+
+def splat_keys(body: Body) -> dict[str, np.ndarray]:
+    """What clips say of the splats that the body carries."""
+    if body.splats is None:
+        return {}
+    nearest = cKDTree(body.rest.numpy()).query(body.splats.means.numpy())[1]
+    return {"splat_opacities": body.splats.opacities.numpy(), "splat_particles": nearest}
 
 
 def spread_of(stored: dict[str, np.ndarray], name: str, shape: tuple[int, int], path: Path) -> np.ndarray | None:

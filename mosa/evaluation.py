@@ -17,9 +17,9 @@ from mosa.analysis.stiffness import angle_between, stiffest
 from mosa.analysis.vibration import GROWTH_LIMIT, vibration_growth
 from mosa.errors import SimulationDiverged
 from mosa.modules.body import VARIANTS, Body, Start, World
+from mosa.modules.carried_splats import seen
 from mosa.modules.hyperelastic import HyperelasticAdapter
 from mosa.modules.material import material_states
-from mosa.modules.observer import deformed_covariances, observe
 from mosa.progress import tqdm
 from mosa.rendering.cameras import crop_boxes
 from mosa.threads import threaded
@@ -61,14 +61,10 @@ def rollouts(
 
 @torch.no_grad()
 def render(body: Body, rollout: Rollout, scene: Scene, cameras: list[int]) -> Tensor:
-    """(V, T, H, W, 3) images of a rollout from the given cameras, one camera at a time to bound memory; on the body's device."""
+    """(V, T, H, W, 3) images of a rollout from the given cameras, on the body's device: of its splats where it has some."""
     device = body.rest.device
-    views = [
-        observe(rollout.x, deformed_covariances(rollout.F_tot, body.covariances), body.opacities, body.colors,
-                scene.cameras.select([c]).to(device), scene.background.to(device)).images
-        for c in cameras
-    ]
-    return torch.cat(views).clamp_(0, 1)
+    shown = seen(body, rollout.x, rollout.F_tot)
+    return shown.images(scene.cameras.select(cameras).to(device), scene.background.to(device)).clamp_(0, 1)
 
 
 def image_metrics(images: Tensor, scene: Scene, cameras: list[int], frames: list[int]) -> dict[str, float]:

@@ -10,13 +10,14 @@ from omegaconf import DictConfig, OmegaConf
 from mosa.checkpoints import check_resumed, read_checkpoint
 from mosa.config import plain, rehearse
 from mosa.data.agreement import lines_of_sight, misses
+from mosa.data.splat_files import check_formats
 from mosa.errors import ConfigError, DataError
 from mosa.known import check_known, conf_folder
 from mosa.limits import machine_memory
 from mosa.modules.body import Body, Start, World
 from mosa.physics.collider_overlap import check_clear
 from mosa.physics.colliders import colliders_from_config
-from mosa.schema import EVALUATION, SIMULATION, TRAINING, check
+from mosa.schema import EVALUATION, SIMULATION, SPLATS, TRAINING, check
 from mosa.twin import Twin
 from mosa.types import Scene
 
@@ -40,6 +41,16 @@ def check_evaluation(values: Mapping[str, Any]) -> None:
     if (conf := conf_folder()) is not None:
         check_known({k: v for k, v in values.items() if k != "scene"}, conf, "eval", EVALUATION, SIMULATION)
     check(values, EVALUATION, SIMULATION)
+
+
+def check_splats(values: Mapping[str, Any]) -> None:
+    """All that the configuration of `python -m mosa.splats` says by itself. Errors: ConfigError naming the key."""
+    if (conf := conf_folder()) is not None:
+        check_known(values, conf, "splats", SPLATS)
+    check(values, SPLATS)
+    check_formats(values["formats"])
+    if values["simulation"]["particles"] != "auto":
+        check_particles("simulation.particles", values["simulation"]["particles"])
 
 
 def check_particles(key: str, count: float) -> None:

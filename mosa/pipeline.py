@@ -25,6 +25,7 @@ from mosa.checkpoints import check_same, read_checkpoint
 from mosa.config import build_body, build_fit, build_world, plain, run_config, world_config
 from mosa.data.datamodule import MultiViewDataModule, training_observations
 from mosa.data.sequences import load_sequences, taught_names
+from mosa.data.splats import save_ply
 from mosa.errors import ConfigError, DataError, MosaError
 from mosa.evaluation import (
     Sequence,
@@ -39,6 +40,7 @@ from mosa.evaluation import (
 from mosa.guards import check_begin, check_configuration, check_evaluation, check_seen, check_starts, evaluated_scene
 from mosa.loggers import build_loggers, chosen, log_outcome
 from mosa.modules.body import Body, Start, World
+from mosa.modules.carried_splats import CarriedSplats
 from mosa.modules.gauss_newton import Posterior
 from mosa.modules.lit_mosa import LitMosa, Take
 from mosa.physics.memory import KEPT_ON_CPU
@@ -220,11 +222,14 @@ def posterior_figures(body: Body, posterior: Posterior | None, evaluated: list[S
 
 
 def body_of(reconstruction: Reconstruction, config: dict) -> Body:
-    """The body of a reconstruction, with the law and settings of the run."""
+    """The body of a reconstruction, with the law, settings and appearance of the run."""
     splats = reconstruction.splats
-    return build_body(config, {"rest": splats.means, "volume": reconstruction.volume, "colors": splats.colors,
+    body = build_body(config, {"rest": splats.means, "volume": reconstruction.volume, "colors": splats.colors,
                                "opacities": splats.opacities,
                                "covariances": covariance_from(splats.scales, splats.rotations)})
+    if reconstruction.appearance is not None and config["cfg"]["rendering"].get("appearance", "splats") == "splats":
+        body.splats = CarriedSplats(reconstruction.appearance, body.rest)
+    return body
 
 
 def assemble_fit(
@@ -331,12 +336,15 @@ def start_figures(start: Start) -> dict[str, float]:
 
 
 def write_outputs(folder: Path, cfg: DictConfig, body: Body, evaluated: list[Sequence], figures: dict, kept: dict) -> None:
-    """rollout.npz and prior.npz, truth.npz where it is known; video.mp4 of the last held-out sequence, strip.png of all; tables in
-    results.md; metrics.json."""
+    """rollout.npz and prior.npz, truth.npz where it is known; splats.ply; video.mp4 of the last held-out sequence, strip.png of
+    all; tables in results.md; metrics.json."""
     for variant, name in (("adapted", "rollout.npz"), ("prior", "prior.npz")):
         save_rollout(folder / name, {prefix: variants[variant] for prefix, variants in kept.items()})
     if known := {s.prefix: true_motion(body, s.scene) for s in evaluated if s.scene.truth is not None}:
         save_truth(folder / "truth.npz", known)
+    if body.splats is not None:
+        known = body.splats.appearance
+        save_ply(folder / "splats.ply", known.splats.to("cpu"), known.harmonics.cpu())
     if cfg.evaluation.video:
         shown = [s for s in evaluated if s.prefix.startswith("test")] or evaluated[-1:]
         write_comparisons(folder, {s.prefix: compare(body, s, kept[s.prefix]) for s in shown})
@@ -369,6 +377,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         log.info("\n%s", plan_text(ranked))
         (folder / "plan.md").write_text(plan_text(ranked) + "\n")
         return -ranked[0].gain
+    show(twin.body, cfg.appearance)
     simulate = plain(cfg.simulate)
     if any(simulate[k] is not None for k in ("velocity", "rotation", "position", "height", "angular_velocity", "colliders")):
         rollout = twin.simulate(**simulate, progress=True)
@@ -396,6 +405,15 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         figures |= true_geometry(body, scene)
     write_outputs(folder, cfg, body, evaluated, figures, kept)
     return optimized(figures, "test/rms_m")
+
+
+def show(body: Body, appearance: str | None) -> None:
+    """What the body's images show from now on: splats or particles, None for what they are. Errors: ConfigError without splats."""
+    if appearance == "splats" and body.splats is None:
+        raise ConfigError("appearance: expected particles, found splats: the run kept none (rendering.appearance=particles, or an "
+                          "older one)")
+    if appearance == "particles":
+        body.splats = None
 
 
 def quiet() -> None:

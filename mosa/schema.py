@@ -73,7 +73,7 @@ WIDEST = 4096
 SECTIONS = ("scene", "prior", "adapter", "reconstruction", "simulation", "fit", "rendering", "trainer", "logger", "evaluation",
             "heterogeneity", "losses", "world", "criterion", "identification",
             "fit.prior", "fit.prior_eta", "fit.joint", "reconstruction.static",
-            "reconstruction.appearance", "reconstruction.dynamic")  # fmt: skip
+            "reconstruction.appearance", "reconstruction.dynamic", "reconstruction.carried")  # fmt: skip
 
 FIGURE = Kind("a figure's name like test/rms_m (docs/figures.md)",
               lambda v: isinstance(v, str) and v.split("/")[0] in FIGURES and "/" in v)
@@ -155,9 +155,12 @@ TRAINING: dict[str, Kind] = {
     "reconstruction.*.iterations": whole(0),
     "reconstruction.*.views": COUNT,
     "reconstruction.*.keep": WEIGHT,
+    "reconstruction.carried.keep_harmonics": WEIGHT,
     "reconstruction.*.lr*": WEIGHT,
     "reconstruction.*.ssim": number(0, 1),
     "reconstruction.*.matte": WEIGHT,
+    "reconstruction.carried.degree": whole(0, 3),
+    "reconstruction.carried.light": FLAG,
     "reconstruction.*.shape": one_of("isotropic", "anisotropic"),
     "reconstruction.*.largest": number(1),
     "reconstruction.*.axis_ratio": number(1),
@@ -185,6 +188,7 @@ TRAINING: dict[str, Kind] = {
     "logger.wandb.offline": FLAG,
     "logger.wandb.tags": or_null(NAMES),
     "rendering.backend": TEXT,
+    "rendering.appearance": one_of("splats", "particles"),
     "ckpt_path": or_null(TEXT),
     "optimized_metric": FIGURE,
     "scene.cache": or_null(TEXT),
@@ -204,6 +208,7 @@ SIMULATION: dict[str, Kind] = {
     "ckpt_path": TEXT,
     "cache": or_null(TEXT),
     "plan": or_null(whole(2)),
+    "appearance": or_null(one_of("splats", "particles")),
     "simulate.variant": one_of("adapted", "prior_eta", "prior"),
     "simulate.velocity": or_null(THREE),
     "simulate.angular_velocity": or_null(THREE),
@@ -213,6 +218,34 @@ SIMULATION: dict[str, Kind] = {
     "simulate.colliders": or_null(ENTRIES),
     "simulate.frames": COUNT,
 }
+SPLATS: dict[str, Kind] = {
+    **{key: kind for key, kind in BODY.items() if key.split(".")[0] in ("seed", "prior", "simulation", "adapter", "heterogeneity")},
+    "ply": TEXT,
+    "ckpt_path": or_null(TEXT),
+    "device": TEXT,
+    "size": or_null(POSITIVE),
+    "up": THREE,
+    "box": or_null(Kind("two corners [[x, y, z], [x, y, z]]",
+                        lambda v: isinstance(v, list) and len(v) == 2 and all(map(THREE.fits, v)))),
+    "opacity": number(0, 1),
+    "open_below": FLAG,
+    "resolution": whole(8, 512),
+    "share": number(0, 1, above=True),
+    "density": or_null(POSITIVE),
+    "gravity": WEIGHT,
+    "height": WEIGHT,
+    "ground": SECTION,
+    "ground.mode": one_of("sticky", "slip", "separate"),
+    "ground.friction": WEIGHT,
+    "rotation": or_null(TURN),
+    "velocity": THREE,
+    "angular_velocity": THREE,
+    "frames": COUNT,
+    "rate": POSITIVE,
+    "formats": NAMES,
+    "video": FLAG,
+}
+"""Of conf/splats.yaml."""
 
 
 def check(values: Mapping[str, Any], *schemas: Mapping[str, Kind]) -> None:

@@ -21,14 +21,15 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from mosa.analysis.figures import side_by_side, write_video
-from mosa.checkpoints import TENSORS, checked, checked_posterior, read_checkpoint
+from mosa.checkpoints import TENSORS, checked, checked_posterior, checked_splats, read_checkpoint
+from mosa.data.splat_files import save_frames
 from mosa.episode import Episode, Stepped, TwinState
 from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
 from mosa.limits import machine_memory
 from mosa.modules.body import VARIANTS, Body, Start, World
+from mosa.modules.carried_splats import CarriedSplats, seen
 from mosa.modules.gauss_newton import Posterior
 from mosa.modules.identification import each_law, read_numbers
-from mosa.modules.observer import deformed_covariances, observe
 from mosa.npz import write_npz
 from mosa.physics.collider_overlap import check_clear
 from mosa.physics.colliders import Collider, colliders_from_config
@@ -57,9 +58,12 @@ class Twin:
 
         checkpoint = read_checkpoint(path)
         config, begun, tensors = checked(checkpoint, path)
+        splats = checked_splats(checkpoint, path)
         try:
             body = build_body(config, {name: tensors[name] for name in TENSORS})
             body.load_state_dict(tensors)
+            if splats is not None:
+                body.splats = CarriedSplats.read(splats, body.rest)
             world, start = build_world(config["world"]), Start.read(begun)
         except Exception as error:  # every part has been checked; a file of a stranger may still fit no body
             reason = str(error) if isinstance(error, MosaError) else f"{type(error).__name__}: {error}"
@@ -219,16 +223,20 @@ class Twin:
         eye = target + distance * (side / side.norm() + 0.25 * up)
         K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
         camera = Cameras(K[None].to(body.rest), look_at(eye, target, up)[None].to(body.rest), size, size, ("view",))
-        return observe(rollout.x, deformed_covariances(rollout.F_tot, body.covariances), body.opacities, body.colors, camera,
-                       torch.ones(3).to(body.rest)).images[0].cpu()
+        return seen(body, rollout.x, rollout.F_tot).images(camera, torch.ones(3).to(body.rest))[0].clamp(0, 1).cpu()
 
-    def export(self, rollout: Rollout, folder: str | Path, *, video: bool = True, title: str = "learned twin") -> Path:
-        """Write `rollout.npz`, one PLY a frame (x y z red green blue) and `simulation.mp4` into `folder`."""
+    def export(
+        self, rollout: Rollout, folder: str | Path, *, video: bool = True, title: str = "learned twin",
+        formats: Sequence[str] = ("ply",),
+    ) -> Path:  # fmt: skip
+        """Write `rollout.npz`, one PLY a frame (x y z red green blue), `simulation.mp4` and the Gaussians that its images show in
+        `formats` (`data.splat_files.FORMATS`: 3DGS PLY, splat, spz, usd) below `splats/` into `folder`."""
         folder = Path(folder)
         (folder / "ply").mkdir(parents=True, exist_ok=True)
         save_rollout(folder / "rollout.npz", {"simulation": rollout})
         for t, x in enumerate(rollout.x.cpu().numpy()):
             write_ply(folder / "ply" / f"{t:03d}.ply", x, self.body.colors.cpu().numpy())
+        save_frames(seen(self.body, rollout.x, rollout.F_tot), folder / "splats", formats, rate=1 / self.frame_dt, up=self.world.up)
         if video:
             moments = [f"frame {t}, {time:.3f} s" for t, time in enumerate(rollout.times.tolist())]
             frames = side_by_side({title: self.render(rollout)}, footer=moments)

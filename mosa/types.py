@@ -118,6 +118,23 @@ class Splats:
 
 
 @dataclass(frozen=True)
+class Appearance:
+    """Splats whose colours depend on the line of sight and on the light. harmonics: (N, K, 3), K = 1, 4, 9, 16 coefficients of real
+    spherical harmonics in the axes of the rest shape (`mosa.rendering.spherical_harmonics`); `splats.colors` are their means.
+    normals: (N, 3) of the surface at rest and light: (8,) by which the colours change as these turn (`mosa.rendering.lighting`);
+    None: they do not."""
+
+    splats: Splats
+    harmonics: Tensor
+    normals: Tensor | None = None
+    light: Tensor | None = None
+
+    def to(self, device: torch.device | str) -> Appearance:
+        moved = (None if value is None else value.to(device) for value in (self.harmonics, self.normals, self.light))
+        return Appearance(self.splats.to(device), *moved)
+
+
+@dataclass(frozen=True)
 class MotionCues:
     """What the dynamic reconstruction saw, per particle and frame, frame 0 first.
 
@@ -137,7 +154,8 @@ class MotionCues:
 class Reconstruction:
     """Particles P_0 with their appearance at frame 0 and the motion cues. spacing [m]; volume: (N,) [m^3] initial volume;
     static: Gaussians of the static stage, which carry the images where other sequences of the body are followed; geometry: figures
-    of the body that was filled (`mosa.reconstruction.geometry`)."""
+    of the body that was filled (`mosa.reconstruction.geometry`); appearance: splats at frame 0 that the particles' motion carries
+    (`mosa.reconstruction.carried`)."""
 
     splats: Splats
     spacing: float
@@ -145,6 +163,7 @@ class Reconstruction:
     cues: MotionCues
     static: Splats | None = None
     geometry: dict[str, float] = field(default_factory=dict)
+    appearance: Appearance | None = None
 
 
 @dataclass(frozen=True)

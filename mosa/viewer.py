@@ -1,6 +1,6 @@
 """What a run saw, calibrated and learned, side by side in a browser:  python -m mosa.viewer run=outputs/train/<date>/<time>
 
-The observed motion (the reconstruction's splats, of the sequences learned from) or, of other sequences, the true one where it is
+The observed motion (the reconstruction's, of the sequences learned from) or, of other sequences, the true one where it is
 known; beside it the calibrated prior's and the learned body's. Needs viser: the extra `viewer`.
 """
 
@@ -98,12 +98,13 @@ class Viewer:
             scene.add_grid("/ground", extent, extent, plane="xy", cell_size=width, section_size=10 * width, position=at,
                            wxyz=np.roll(Rotation.from_matrix(axes).as_quat(), 1))
         # viser keeps covariances as float16, whose steps are 6e-8 below 6e-5: in m^2 a splat of 0.5 mm would lose its shape
-        self.unit = float(np.sqrt(np.linalg.eigvalsh(clip.learned.covariances[0]).max()))
+        self.unit = float(np.sqrt(np.linalg.eigvalsh(clip.splats("learned", 0, "appearance")[1]).max()))
         self.nodes = {}
         for name in (name for name in BODIES if any(name in clip.bodies for clip in clips)):
             centers, colors = clip.learned.centers[0].astype(np.float32), clip.appearance.astype(np.float32)
-            splats = scene.add_gaussian_splats(f"/{name}/splats", centers, clip.learned.covariances[0], colors,
-                                               clip.opacities[:, None], scale=self.unit, visible=False)
+            means, covariances, painted, opacities = clip.splats("learned", 0, "appearance")
+            splats = scene.add_gaussian_splats(f"/{name}/splats", means.astype(np.float32), covariances, painted,
+                                               opacities[:, None], scale=self.unit, visible=False)
             spacing = 0.5 * clip.size / len(centers) ** (1 / 3)
             points = scene.add_point_cloud(f"/{name}/particles", centers, colors, point_size=spacing, point_shape="circle",
                                            precision="float32", visible=False)
@@ -160,12 +161,14 @@ class Viewer:
         """One of the bodies. under: gray, its splats faint, its label above that of the body over it."""
         clip, (splats, points, label) = self.clip, self.nodes[name]
         centers = clip.bodies[name].centers[frame] + shift
-        colors = clip.appearance if name == clip.reference else clip.paint(frame, self.color.value, name)
-        colors, opacities = (np.full_like(colors, GRAY), FAINT * clip.opacities) if under else (colors, clip.opacities)
         if splats.visible:
-            splats.set_gaussians((centers / self.unit).astype(np.float32), clip.bodies[name].covariances[frame] / self.unit**2,
-                                 colors, opacities[:, None])
+            means, covariances, colors, opacities = clip.splats(name, frame, self.color.value)
+            colors, opacities = (np.full_like(colors, GRAY), FAINT * opacities) if under else (colors, opacities)
+            splats.set_gaussians(((means + shift) / self.unit).astype(np.float32), covariances / self.unit**2, colors,
+                                 opacities[:, None])
         else:
+            colors = clip.appearance if name == clip.reference else clip.paint(frame, self.color.value, name)
+            colors = np.full_like(colors, GRAY) if under else colors
             points.points, points.colors = centers.astype(np.float32), (255 * colors).astype(np.uint8)
         label.text = f"{name} (gray)" if under else name
         top = (centers @ clip.up).max() + (0.15 if under else 0.05) * clip.size

@@ -75,7 +75,7 @@ def test_there_is_one_version_and_every_command_has_its_function():
     for target in project["project"]["scripts"].values():
         module, function = target.split(":")
         assert callable(getattr(__import__(module, fromlist=[function]), function))
-    assert set(project["project"]["scripts"]) == {"mosa-train", "mosa-eval", "mosa-view"}
+    assert set(project["project"]["scripts"]) == {"mosa-train", "mosa-eval", "mosa-view", "mosa-splats"}
 
 
 @pytest.mark.parametrize("flag", ["--help", "-h"])

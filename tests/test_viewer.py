@@ -16,11 +16,12 @@ from mosa.clips import GRAY, Scale, covariances, read_run
 from mosa.config import build_world
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body import Body, SimulationSettings, Start
+from mosa.modules.carried_splats import CarriedSplats
 from mosa.modules.heterogeneity import HeterogeneityField
 from mosa.modules.material import Material
 from mosa.physics.colliders import domain_walls
 from mosa.twin import Twin, save_observed, save_rollout
-from mosa.types import MotionCues, Rollout
+from mosa.types import Appearance, MotionCues, Rollout, Splats
 
 N, T, SEEN = 27, 5, 3
 GROUND = -0.2
@@ -104,6 +105,27 @@ def test_a_run_of_fewer_files_is_read(run):
     train = read_run(run)[0]
     assert list(train.bodies) == ["prior", "learned"] and train.reference is None
     assert viewer.layouts(train) == ("side by side", "learned over prior", "prior", "learned")
+
+
+def test_splats_that_the_particles_carry_are_shown(run):
+    """In each frame's place and light; by a quantity they have the colour of the particle nearest at rest."""
+    body = Twin.load("").body
+    means = body.rest[[0, 13]] + 0.001
+    upright = torch.tensor([1.0, 0, 0, 0]).repeat(2, 1)
+    splats = Splats(means, torch.full((2, 3), 0.02), upright, torch.full((2,), 0.7), torch.full((2, 3), 0.5))
+    body.splats = CarriedSplats(Appearance(splats, torch.zeros(2, 1, 3)), body.rest)
+    try:
+        train, test = read_run(run)
+        centers, shapes, colors, opacities = train.splats("learned", 4, "appearance")
+        assert np.allclose(centers, train.learned.centers[4][[0, 13]] + 0.001, atol=1e-3) and (opacities == 0.7).all()
+        assert shapes.shape == (2, 3, 3) and np.allclose(colors, 0.5)
+        assert np.allclose(train.splats("learned", 4, "deviation")[2], train.paint(4, "deviation")[[0, 13]])
+        assert np.allclose(train.splats("observed", 1, "deviation")[2], 0.5)
+        stretched = test.splats("truth", 0, "appearance")[1]  # to double along y, by positions alone; squashed bodies rest so
+        assert np.allclose(stretched[0], 4e-4 * np.diag([1, 4, 1]), rtol=1e-3)
+    finally:
+        body.splats = None
+    assert read_run(run)[0].splats("learned", 0, "appearance")[0].shape == (N, 3)
 
 
 def test_flat_bodies_keep_the_truth_s_splats(run):

@@ -15,6 +15,7 @@ from torch import Tensor
 from mosa.analysis.figures import side_by_side, to_uint8, write_strip, write_video
 from mosa.evaluation import Sequence, true_motion
 from mosa.modules.body import Body
+from mosa.modules.carried_splats import seen
 from mosa.modules.observer import deformed_covariances, observe
 from mosa.rendering.cameras import crop_boxes, crop_cameras, crop_images
 from mosa.types import Cameras, Rollout, Scene
@@ -76,13 +77,16 @@ def compare(body: Body, shown: Sequence, variants: Mapping[str, Rollout], *, wid
 
 
 def drawn(body: Body, rollout: Rollout, cameras: Cameras, scene: Scene, colors: Tensor | None = None) -> Tensor:
-    """(T, H, W, 3) images of a rollout from one camera, on the CPU. colors: (T, N, 3) in place of the body's."""
-    covariances, device = deformed_covariances(rollout.F_tot, body.covariances), body.rest.device
-    frames = [slice(None)] if colors is None else [slice(t, t + 1) for t in range(len(rollout.x))]
+    """(T, H, W, 3) images of a rollout from one camera, on the CPU. colors: (T, N, 3) of its particles in place of
+    the body's appearance."""
+    device = body.rest.device
+    cameras, background = cameras.to(device), scene.background.to(device)
+    if colors is None:
+        return seen(body, rollout.x, rollout.F_tot).images(cameras, background)[0].clamp(0, 1).cpu()
+    covariances = deformed_covariances(rollout.F_tot, body.covariances)
     parts = [
-        observe(rollout.x[f], covariances[f], body.opacities, body.colors if colors is None else colors[f][0].to(body.colors),
-                cameras.to(device), scene.background.to(device)).images[0]
-        for f in frames
+        observe(rollout.x[[t]], covariances[[t]], body.opacities, colors[t].to(body.colors), cameras, background).images[0]
+        for t in range(len(rollout.x))
     ]
     return torch.cat(parts).clamp(0, 1).cpu()
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError
+from mosa.modules.carried_splats import CarriedSplats
 from mosa.modules.criteria import corrected_rollout
 from mosa.modules.heterogeneity import HeterogeneityField
 from mosa.modules.material import Material
@@ -199,6 +200,7 @@ class ContactOffset(nn.Module):
 
 class Body(nn.Module):
     """N particles with a law. Buffers: rest (N, 3) [m], volume (N,) [m^3], colors (N, 3), opacities (N,), covariances (N, 3, 3).
+    splats: what its images show, None where that is the particles; a fit to images looks at the particles.
     """
 
     def __init__(
@@ -221,6 +223,7 @@ class Body(nn.Module):
             ("rest", rest), ("volume", volume), ("colors", colors), ("opacities", opacities), ("covariances", covariances),
         ):
             self.register_buffer(name, value.detach().clone())
+        self.splats: CarriedSplats | None = None
         self.density, self.settings, self.law_options = float(density), settings, law_options or {}
         self.material, self.heterogeneity, self.adapter = material, heterogeneity, adapter
         if isinstance(heterogeneity, StiffnessModes):

@@ -90,7 +90,8 @@ class LitMosa(Restorable, L.LightningModule):
                               "start": self.takes[0].start.written(),
                               "identification": self.identification.state() if self.identification else None,
                               "compared": self.compared,
-                              "posterior": self.posterior.written() if self.posterior else None}
+                              "posterior": self.posterior.written() if self.posterior else None,
+                              "splats": self.body.splats.written() if self.body.splats is not None else None}
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
         if "mosa" not in checkpoint:

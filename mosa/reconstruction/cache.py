@@ -17,14 +17,17 @@ import torch
 from torch import Tensor
 
 from mosa.reconstruction.observed import Windows
+from mosa.rendering.lighting import LIGHT
+from mosa.rendering.spherical_harmonics import degree_of
 
 log = logging.getLogger(__name__)
 SPLATS = {"means": (3,), "scales": (3,), "rotations": (4,), "opacities": (), "colors": (3,)}
 RESULTS: dict[str, dict[str, tuple[int, ...]]] = {
     "static": SPLATS, "particles": SPLATS | {"volume": ()}, "motion": {"positions": (3,), "covariances": (3, 3)},
+    "carried": SPLATS | {"normals": (3,)},
 }  # fmt: skip
 """Tensors of a stage, with their last dimensions."""
-LEADING = {"static": 1, "particles": 1, "motion": 2}
+LEADING = {"static": 1, "particles": 1, "motion": 2, "carried": 1}
 """How many dimensions are before those, the same in all tensors of a stage."""
 
 
@@ -38,6 +41,12 @@ def check_result(name: str, result: Any, leading: tuple[int, ...] | None) -> Non
         leading = found[: LEADING[name]] if leading is None else leading
         if found != (*leading, *last) or 0 in found or not bool(torch.isfinite(result[key]).all()):
             raise ValueError(f"{key} of shape {found}, expected {(*leading, *last)} finite numbers")
+    if name == "carried":
+        degree_of(result["harmonics"])
+        if result["light"].shape != (LIGHT,) or not bool(torch.isfinite(result["light"]).all()):
+            raise ValueError("not a light")
+        if len(result["harmonics"]) != leading[0] or not bool(torch.isfinite(result["harmonics"]).all()):
+            raise ValueError(f"harmonics of shape {tuple(result['harmonics'].shape)}, expected {leading[0]} splats' finite numbers")
 
 
 class StageCache:

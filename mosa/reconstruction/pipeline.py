@@ -1,5 +1,5 @@
-"""Reconstruction of a sequence: hull -> geometry -> static Gaussians -> filling -> appearance -> motion -> cues; stages are
-cached."""
+"""Reconstruction of a sequence: hull -> geometry -> static Gaussians -> filling -> appearance -> motion -> cues, carried
+Gaussians; stages are cached."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from mosa.data.splats import load_ply
 from mosa.errors import ConfigError, DataError
 from mosa.progress import tqdm
 from mosa.reconstruction.cache import StageCache
+from mosa.reconstruction.carried import fit_carried
 from mosa.reconstruction.cues import gaussian_cues, neighbourhood, neighbourhood_cues
 from mosa.reconstruction.dynamic import Scaffold, fit_motion
 from mosa.reconstruction.filling import Particles, body_volume, fill
@@ -30,8 +31,9 @@ from mosa.reconstruction.settings import ReconstructionSettings
 from mosa.reconstruction.static import fit_splats, start_splats
 from mosa.rendering.covariance import covariance_from, matrix_to_quaternion, quaternion_multiply
 from mosa.rendering.rasterizer import rasterize
+from mosa.rendering.spherical_harmonics import constant_coefficients
 from mosa.threads import threaded
-from mosa.types import MotionCues, Reconstruction, Scene, Splats
+from mosa.types import Appearance, MotionCues, Reconstruction, Scene, Splats
 
 CACHE_VERSION = 3
 """Raised when a stage computes something else from the same settings."""
@@ -96,6 +98,11 @@ def spacing_for(
     if particles is not None and particles < 8:
         raise ConfigError(f"simulation.particles: expected at least 8, found {particles}")
     body = object_geometry(scene, settings or ReconstructionSettings(), cache_dir=cache_dir, device=device).body
+    return filling_spacing(body, particles, per_cell=per_cell, most=most)
+
+
+def filling_spacing(body: Volume, particles: int | None, *, per_cell: float = PER_CELL, most: int = FEW) -> float:
+    """Particle spacing [m] that fills a solid; arguments as of `spacing_for`."""
     volume = body_volume(body)
     if particles is None:
         particles = particles_for(lambda spacing: fill(body, spacing=spacing).positions, volume, per_cell=per_cell, least=FEW,
@@ -122,12 +129,17 @@ def _tensors(splats: Splats) -> dict[str, Tensor]:
     return {f.name: getattr(splats, f.name).cpu() for f in fields(Splats)}
 
 
-def imported_splats(path: str, scene: Scene) -> Splats:
-    """Gaussians of a 3DGS PLY inside the scene's box, in the colours they have on average over directions.
+def _motion_settings(settings: ReconstructionSettings) -> dict[str, Any]:
+    """What particles and their motion depend on."""
+    return {name: value for name, value in asdict(settings).items() if name != "carried"}
+
+
+def imported_splats(path: str, scene: Scene) -> Appearance:
+    """Gaussians of a 3DGS PLY inside the scene's box, with their harmonics.
 
     Errors: DataError where the file is not one, or fewer than eight of its Gaussians lie in the box.
     """
-    splats, _ = load_ply(path)
+    splats, harmonics = load_ply(path)
     inside = ((splats.means > scene.box[0]) & (splats.means < scene.box[1])).all(1)
     if int(inside.sum()) < 8:
         low, high = (x.tolist() for x in (splats.means.amin(0), splats.means.amax(0)))
@@ -135,7 +147,7 @@ def imported_splats(path: str, scene: Scene) -> Splats:
             f"{path}: expected Gaussians in the scene's box {scene.box.tolist()} m, found {int(inside.sum())} of {len(inside)}: "
             f"the file spans {low} to {high}; bring it into the scene's world and metres first"
         )
-    return Splats(*(getattr(splats, f.name)[inside] for f in fields(Splats)))
+    return Appearance(Splats(*(getattr(splats, f.name)[inside] for f in fields(Splats))), harmonics[inside])
 
 
 def _render_still(splats: Splats, windows: Windows, background: Tensor) -> Tensor:
@@ -162,7 +174,8 @@ def reconstruct(
     device: torch.device | str = "cpu",
     progress: bool = True,
 ) -> Reconstruction:
-    """Particles at frame 0 with their appearance, and their motion through the training frames, from images alone.
+    """Particles at frame 0 with their appearance, and their motion through the training frames, from images alone; and the splats
+    that this motion carries, fitted to the same frames (imported ones stay as they are).
 
     scene: only its training cameras and training frames are read, never its truth. spacing [m] of the particles;
     cache_dir: root of the cache, None for no cache. A stopped run goes on with the first stage that is
@@ -176,7 +189,7 @@ def reconstruct(
     if settings.splats is not None:
         imported = imported_splats(settings.splats, scene)
         more["splats"] = hashlib.sha256(Path(settings.splats).read_bytes()).hexdigest()[:16]
-    cache = _open_cache(cache_dir, scene, asdict(settings), seed, **more)
+    cache = _open_cache(cache_dir, scene, _motion_settings(settings), seed, **more)
     geometry = object_geometry(scene, settings, cache_dir=cache_dir, device=device)
     windows = object_windows(scene, views, frames, margin=settings.margin).to(device)
     still, background = windows.of_frame(0), scene.background.to(device)
@@ -187,8 +200,8 @@ def reconstruct(
     @functools.cache  # more than one stage reads it, also where there is no cache folder
     def static_stage() -> dict[str, Tensor]:
         if settings.splats is not None:
-            cache.strip("static", still, _render_still(imported.to(device), still, background))
-            return _tensors(imported)
+            cache.strip("static", still, _render_still(imported.splats.to(device), still, background))
+            return _tensors(imported.splats)
         start = start_splats(geometry.body, still, settings.static, count=settings.points, seed=seed)
         with bar("static Gaussians", settings.static.iterations) as steps:
             fitted = fit_splats(start, still, background, settings.static, move=True, seed=seed, progress=steps.update)
@@ -214,7 +227,23 @@ def reconstruct(
 
     motion = cache.stage("motion", motion_stage, (len(frames), len(splats.means)))
     static = Splats(**cache.stage("static", static_stage))
-    return Reconstruction(splats, spacing, volume, cues_of(motion, splats, settings), static, geometry.figures(spacing))
+
+    def carried_stage() -> dict[str, Tensor]:
+        with bar("carried Gaussians", settings.carried.iterations) as steps:
+            found = fit_carried(static.to(device), splats.means.to(device), motion["positions"].to(device), windows, background,
+                                settings.carried, seed=seed, progress=steps.update).to("cpu")
+        return _tensors(found.splats) | {"harmonics": found.harmonics, "normals": found.normals, "light": found.light}
+
+    if settings.splats is not None:
+        appearance = imported
+    elif settings.carried.iterations == 0:
+        appearance = Appearance(static, constant_coefficients(static.colors))
+    else:  # a folder of its own: nothing else depends on its settings
+        apart = _open_cache(cache_dir, scene, asdict(settings), seed, **more)
+        stored = apart.stage("carried", carried_stage)
+        colored = {name: stored.pop(name) for name in ("harmonics", "normals", "light")}
+        appearance = Appearance(Splats(**stored), **colored)
+    return Reconstruction(splats, spacing, volume, cues_of(motion, splats, settings), static, geometry.figures(spacing), appearance)
 
 
 def cues_of(motion: dict[str, Tensor], splats: Splats, settings: ReconstructionSettings) -> MotionCues:
@@ -256,7 +285,7 @@ def follow(
     _first_frame(scene)
     pose = (rotation, center, rest_center)
     cache = _open_cache(
-        cache_dir, scene, asdict(settings), seed,
+        cache_dir, scene, _motion_settings(settings), seed,
         body=[first.fingerprint, first.training_cameras, first.training_frames, reconstruction.spacing],
         pose=[[round(v, 6) for v in part.flatten().tolist()] for part in pose],
     )  # fmt: skip

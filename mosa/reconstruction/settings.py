@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from mosa.errors import ConfigError
+from mosa.reconstruction.carried import CarriedSettings
 from mosa.reconstruction.dynamic import DynamicSettings
 from mosa.reconstruction.geometry import GeometrySettings
 from mosa.reconstruction.static import FitSettings, StaticSettings
@@ -31,6 +32,7 @@ class ReconstructionSettings:
     static: StaticSettings = field(default_factory=StaticSettings)
     appearance: FitSettings = field(default_factory=lambda: FitSettings(keep=1.0))
     dynamic: DynamicSettings = field(default_factory=DynamicSettings)
+    carried: CarriedSettings = field(default_factory=CarriedSettings)
 
     def __post_init__(self) -> None:
         if self.cue not in ("neighbourhood", "gaussian"):
@@ -59,7 +61,8 @@ def _section(cls: type, values: Mapping[str, Any], where: str) -> Any:
 def build_settings(**keys: Any) -> ReconstructionSettings:
     """Settings from the plain keys of conf/reconstruction; ConfigError names an unknown key."""
     keys = dict(keys)
-    sections = {"geometry": GeometrySettings, "static": StaticSettings, "appearance": FitSettings, "dynamic": DynamicSettings}
+    sections = {"geometry": GeometrySettings, "static": StaticSettings, "appearance": FitSettings, "dynamic": DynamicSettings,
+                "carried": CarriedSettings}  # fmt: skip
     for name, cls in sections.items():
         if name in keys:
             keys[name] = _section(cls, keys[name] or {}, f"reconstruction.{name}")

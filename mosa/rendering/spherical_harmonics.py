@@ -6,6 +6,7 @@ The basis is the real one with the Condon-Shortley phase, in the order l = 0, 1,
 
 from __future__ import annotations
 
+import functools
 import math
 
 import torch
@@ -60,6 +61,11 @@ def colors_in(coefficients: Tensor, directions: Tensor) -> Tensor:
     return (torch.einsum("...nk,nkc->...nc", values, coefficients) + 0.5).clamp(min=0)
 
 
+def camera_centers(cameras: Cameras) -> Tensor:
+    """Where the cameras are, (V, 3) [m]."""
+    return -(cameras.w2c[:, :3, :3].transpose(1, 2) @ cameras.w2c[:, :3, 3:])[..., 0]
+
+
 def view_colors(coefficients: Tensor, means: Tensor, cameras: Cameras, state_index: Tensor) -> Tensor:
     """Features (B, N, 3) for `rasterize`: the colour of every Gaussian as each camera sees it.
 
@@ -67,9 +73,42 @@ def view_colors(coefficients: Tensor, means: Tensor, cameras: Cameras, state_ind
     means and the cameras' w2c. The directions are those of the world: a body that turns takes its coefficients along
     only if they are turned with it. Errors: ConfigError for another K.
     """
-    w2c = cameras.w2c.to(means)
-    centers = -(w2c[:, :3, :3].transpose(1, 2) @ w2c[:, :3, 3:])[..., 0]
-    return colors_in(coefficients, means[state_index] - centers[:, None])
+    return colors_in(coefficients, means[state_index] - camera_centers(cameras).to(means)[:, None])
+
+
+def rotated(coefficients: Tensor, rotation: Tensor) -> Tensor:
+    """Coefficients (..., K, 3) of the colours of `coefficients` (..., K, 3) turned with their body by R, rotations (..., 3, 3):
+    seen along d they have the colour that the given ones have along R^T d. Leading axes broadcast.
+
+    Degree by degree, as a rotation mixes the harmonics of one degree alone. Its matrix (Wigner's, of real harmonics) is found by
+    projection, Y(d)^+ Y(R^T d) over `DIRECTIONS` directions d: exact to rounding for every R, as degree l is closed under rotation,
+    and without Euler angles or recursion. Gradients to both. Errors: ConfigError for another K.
+    """
+    degree = degree_of(coefficients)
+    parts = [coefficients[..., :1, :].expand(*torch.broadcast_shapes(coefficients.shape[:-2], rotation.shape[:-2]), 1, 3)]
+    if degree:
+        spread, inverses = _projections()
+        turned = spread.to(rotation) @ rotation  # rows are R^T d
+        values = basis(turned, degree)
+        for l in range(1, degree + 1):
+            matrix = inverses[l].to(rotation) @ values[..., l * l : (l + 1) ** 2]
+            parts.append(matrix @ coefficients[..., l * l : (l + 1) ** 2, :])
+    return torch.cat(parts, -2)
+
+
+DIRECTIONS = 24
+"""On a spiral: more than the 7 harmonics of degree 3 need, so that the projection is well conditioned for each degree."""
+
+
+@functools.cache
+def _projections() -> tuple[Tensor, dict[int, Tensor]]:
+    """Directions (n, 3) spread over the sphere and the pseudo-inverse (2 l + 1, n) of the harmonics of each degree there."""
+    place = torch.arange(DIRECTIONS, dtype=torch.float64) + 0.5
+    z, angle = 1 - 2 * place / DIRECTIONS, math.pi * (1 + math.sqrt(5)) * place
+    flat = (1 - z * z).sqrt()
+    directions = torch.stack((flat * angle.cos(), flat * angle.sin(), z), -1)
+    values = basis(directions, 3)
+    return directions, {l: torch.linalg.pinv(values[:, l * l : (l + 1) ** 2]) for l in range(1, 4)}
 
 
 def constant_coefficients(colors: Tensor) -> Tensor:

@@ -92,11 +92,14 @@ def test_free_fall_gives_the_velocity(squashed, found):
 def test_results_come_from_the_cache(squashed, found, spacing, cache, monkeypatch):
     monkeypatch.setattr(pipeline, "fit_splats", None)
     monkeypatch.setattr(pipeline, "fit_motion", None)
+    monkeypatch.setattr(pipeline, "fit_carried", None)
     again = reconstruct(squashed, settings=SETTINGS, spacing=spacing, cache_dir=cache, progress=False)
     assert torch.equal(again.cues.positions, found.cues.positions) and torch.equal(again.splats.colors, found.splats.colors)
+    assert torch.equal(again.appearance.harmonics, found.appearance.harmonics)
     folders = [{p.name for p in folder.iterdir()} for folder in sorted((cache / "reconstruction").iterdir())]
-    geometry, rest = sorted(folders, key=len)  # the geometry does not depend on the particles' spacing
-    assert geometry == {"key.json", "geometry.pt"}
+    # the geometry does not depend on the particles' spacing, and nothing on the carried splats
+    carried, geometry, rest = sorted(folders, key=lambda names: (len(names), "geometry.pt" in names))
+    assert carried == {"key.json", "carried.pt"} and geometry == {"key.json", "geometry.pt"}
     assert {"static.png", "particles.png", "motion.png", "key.json", "motion.pt"} <= rest
     assert not any(n.endswith(".tmp") for n in rest)
 
@@ -113,7 +116,7 @@ def test_a_damaged_stage_is_computed_again_and_the_rest_kept(squashed, found, sp
 def test_held_out_cameras_and_frames_have_no_influence(squashed):
     """Garbage in held-out images and mattes leaves the result bit-equal."""
     quick = build_settings(resolution=32, ridge_passes=4, points=200, static={"iterations": 3}, appearance={"iterations": 3},
-                           dynamic={"modes": 8, "track_iterations": 2, "iterations": 2})  # fmt: skip
+                           dynamic={"modes": 8, "track_iterations": 2, "iterations": 2}, carried={"iterations": 3})  # fmt: skip
     held = replace(squashed, holdout_cameras=(2,), holdout_frames=(4,))
     images, mattes = squashed.images.clone(), squashed.mattes.clone()
     images[2], mattes[2], images[:, 4], mattes[:, 4] = 0.1, 0.0, 0.9, 0.0
@@ -125,10 +128,12 @@ def test_held_out_cameras_and_frames_have_no_influence(squashed):
     assert results[0].cues.positions.shape[0] == 4
     assert torch.equal(results[0].cues.positions, results[1].cues.positions)
     assert torch.equal(results[0].splats.colors, results[1].splats.colors)
+    assert torch.equal(results[0].appearance.harmonics, results[1].appearance.harmonics)
 
 
 def test_gaussian_cues_come_from_free_shapes(squashed):
-    quick = {"resolution": 32, "ridge_passes": 4, "points": 200, "static": {"iterations": 3}, "appearance": {"iterations": 3}}
+    quick = {"resolution": 32, "ridge_passes": 4, "points": 200, "static": {"iterations": 3}, "appearance": {"iterations": 3},
+             "carried": {"iterations": 3}}  # fmt: skip
     dynamic = {"modes": 8, "track_iterations": 2, "iterations": 2}
     with pytest.raises(ConfigError, match="free_shape=true"):
         build_settings(**quick, cue="gaussian", dynamic=dynamic)

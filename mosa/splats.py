@@ -1,0 +1,201 @@
+"""A 3DGS file of an object becomes a body that falls, without any video:  python -m mosa.splats ply=object.ply
+
+The Gaussians' inside is filled with particles, a law is chosen (`prior=...`) or taken from a checkpoint (`ckpt_path=...`), and the
+rollout carries the Gaussians, harmonics and all.
+"""
+
+from __future__ import annotations
+
+import copy
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from mosa.config import build_body, build_world, plain
+from mosa.data.splats import load_ply
+from mosa.errors import ConfigError, DataError
+from mosa.guards import check_splats
+from mosa.modules.body import Body, Start
+from mosa.modules.carried_splats import CarriedSplats
+from mosa.reconstruction.filling import fill
+from mosa.reconstruction.initial import inherited_colors
+from mosa.reconstruction.pipeline import FEW, filling_spacing
+from mosa.reconstruction.resolution import PER_CELL, grid_spacing
+from mosa.reconstruction.shell import solid_of
+from mosa.run import named_device
+from mosa.twin import Twin, numbers
+from mosa.types import Appearance, Splats
+
+log = logging.getLogger(__name__)
+
+ROOM = 4.0
+"""Of the object's size, to each side of what it falls through."""
+NEAR = 3.0
+"""Spacings from the nearest particle beyond which a Gaussian does not belong to the body."""
+HALF_CELL = 0.35
+"""Standard deviation of a particle's own Gaussian, in spacings, as in the reconstruction."""
+
+
+def read_object(
+    path: str | Path, *, box: Sequence[Sequence[float]] | None = None, opacity: float = 0.1, size: float | None = None
+) -> Appearance:
+    """The Gaussians of a 3DGS PLY that are the object.
+
+    box: two corners in the file's units; opacity: the least that is kept; size [m] that the longest side gets, None where the file
+    is in metres. Errors: DataError (damaged, fewer than 100 Gaussians left), ConfigError naming the argument.
+    """
+    splats, harmonics = load_ply(path)
+    chosen = splats.opacities >= opacity
+    if box is not None:
+        corners = numbers("box", box, "two corners [[x, y, z], [x, y, z]], min below max")
+        if corners.shape != (2, 3) or not bool((corners[0] < corners[1]).all()):
+            raise ConfigError(f"box: expected two corners [[x, y, z], [x, y, z]], min below max, found {box}")
+        chosen &= ((splats.means > corners[0]) & (splats.means < corners[1])).all(1)
+    if int(chosen.sum()) < 100:
+        low, high = ([round(v, 3) for v in x.tolist()] for x in (splats.means.amin(0), splats.means.amax(0)))
+        where = "" if box is None else " in the box"
+        raise DataError(f"{path}: expected at least 100 Gaussians of an opacity of {opacity:g} or more{where}, found "
+                        f"{int(chosen.sum())} of {len(chosen)}; the file spans {low} to {high}")
+    splats, harmonics = Splats(*(getattr(splats, f.name)[chosen] for f in fields(Splats))), harmonics[chosen]
+    if size is not None:
+        factor = size / float((splats.means.amax(0) - splats.means.amin(0)).max())
+        splats = replace(splats, means=factor * splats.means, scales=factor * splats.scales)
+    return Appearance(splats, harmonics)
+
+
+def fill_object(
+    appearance: Appearance, *, particles: int | None, dx: float | None = None, per_cell: float = PER_CELL, most: int = FEW,
+    resolution: int = 80, share: float = 0.9, open_below: Tensor | None = None,
+) -> tuple[dict[str, Tensor], Appearance, float]:
+    """(tensors of a body of about so many particles inside the Gaussians, the Gaussians that belong to it, grid spacing [m]).
+
+    particles, per_cell, most: as `reconstruction.pipeline.spacing_for` takes them; dx: grid spacing [m] in place of their number;
+    resolution, share: as `solid_of` takes them; open_below: up (3,), where the underside is open. Errors: DataError.
+    """
+    solid = solid_of(appearance.splats, resolution=resolution, share=share, up=open_below)
+    spacing = filling_spacing(solid, particles, per_cell=per_cell, most=most) if dx is None else dx / grid_spacing(1.0, per_cell)
+    found = fill(solid, spacing=spacing)
+    near = torch.from_numpy(cKDTree(found.positions.numpy()).query(appearance.splats.means.numpy())[0])
+    kept = near < NEAR * found.spacing
+    splats = Splats(*(getattr(appearance.splats, f.name)[kept] for f in fields(Splats)))
+    n = len(found.positions)
+    shapes = (HALF_CELL * spacing) ** 2 * torch.eye(3).expand(n, 3, 3)
+    tensors = {"rest": found.positions, "volume": found.volume, "colors": inherited_colors(found.positions, splats),
+               "opacities": torch.full((n,), 0.8), "covariances": shapes.contiguous()}  # fmt: skip
+    return tensors, Appearance(splats, appearance.harmonics[kept]), grid_spacing(spacing, per_cell)
+
+
+def object_twin(
+    appearance: Appearance,
+    law: Mapping[str, Any] | Twin,
+    *,
+    particles: int | None,
+    dx: float | None = None,
+    per_cell: float = PER_CELL,
+    most: int = FEW,
+    density: float | None = None,
+    up: Sequence[float] = (0, 1, 0),
+    gravity: float = 9.81,
+    height: float = 0.2,
+    ground: Mapping[str, Any] | None = None,
+    frame_dt: float = 1 / 30,
+    resolution: int = 80,
+    share: float = 0.9,
+    open_below: bool = False,
+) -> Twin:
+    """A twin of the object that Gaussians show.
+
+    law: configuration with seed, simulation, prior, heterogeneity and adapter, as conf/splats.yaml composes it; or a learned twin,
+    of which material, adapter and contact are taken, and no stiffness field, which is of another body's places. particles, dx,
+    per_cell, most: as `fill_object` takes them; density [kg/m^3]:
+    None for the learned one's, or 1000; up: (3,) in the file's axes; height [m] of its lowest particle above the ground; ground:
+    mode and friction. Errors: ConfigError, DataError.
+    """
+    direction = numbers("up", up, "a direction (x, y, z)")
+    if direction.shape != (3,) or not float(direction.norm()) > 0:
+        raise ConfigError(f"up: expected a direction (x, y, z), found {list(up)}")
+    direction = direction / direction.norm()
+    tensors, shown, cell = fill_object(appearance, particles=particles, dx=dx, per_cell=per_cell, most=most, resolution=resolution,
+                                       share=share, open_below=direction if open_below else None)
+    rest = tensors["rest"]
+    learned = law if isinstance(law, Twin) else None
+    cfg = copy.deepcopy(dict(learned.config["cfg"] if learned is not None else law))
+    cfg["heterogeneity"] = {**cfg["heterogeneity"], "enabled": False}
+    room = ROOM * float((rest.amax(0) - rest.amin(0)).max()) + height
+    world = {"ground": {"height": float((rest @ direction).min()) - height, "mode": "sticky", "friction": 0.0, **(ground or {})},
+             "gravity": (-gravity * direction).tolist(), "up": direction.tolist(),
+             "box": [(rest.amin(0) - room).tolist(), (rest.amax(0) + room).tolist()]}  # fmt: skip
+    if density is None:
+        density = learned.body.density if learned is not None else 1000.0
+    config = {"cfg": cfg, "world": world, "density": density, "dx": cell, "frame_dt": frame_dt, "starts": {}}
+    body = build_body(config, tensors)
+    if learned is not None:
+        take_law(body, learned.body)
+    body.splats = CarriedSplats(shown, body.rest)
+    start = Start(torch.eye(3), body.center, torch.zeros(3), torch.zeros(3))
+    return Twin(body.eval(), build_world(world), frame_dt, config, start)
+
+
+@torch.no_grad()
+def take_law(body: Body, learned: Body) -> None:
+    """Material, adapter and contact of another body, calibrated variants included; a stiffness field stays with its own."""
+    foreign = ("heterogeneity", "rest", "volume", "colors", "opacities", "covariances")
+    state = {k: v for k, v in learned.state_dict().items() if not any(part in foreign for part in k.split("."))}
+    missing, unexpected = body.load_state_dict(state, strict=False)
+    if unexpected or [name for name in missing if name not in foreign]:
+        raise DataError(f"ckpt_path: expected a law that fits the object, found {unexpected or missing}")
+
+
+def save_twin(twin: Twin, path: str | Path) -> Path:
+    """A checkpoint that `Twin.load` reads: nothing was fitted, so that no fit can go on from it."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    written = twin.training_start.written()
+    splats = twin.body.splats
+    torch.save({
+        "state_dict": {f"body.{k}": v.cpu() for k, v in twin.body.state_dict().items()},
+        "mosa": {"config": {**twin.config, "starts": {"train": written}}, "stage": 0, "losses": [], "steps_done": 0,
+                 "particles": len(twin.body.rest), "start": written, "splats": None if splats is None else splats.written()},
+    }, path)  # fmt: skip
+    return path
+
+
+def drop(cfg: DictConfig) -> None:
+    """`python -m mosa.splats`: fill the Gaussians of a file, let them fall, write frames, video and a checkpoint of the body."""
+    from mosa.pipeline import MOST_PARTICLES, quiet, run_folder
+
+    quiet()
+    if OmegaConf.is_missing(cfg, "ply"):
+        raise ConfigError("ply: expected a 3DGS PLY file of an object, found none; python -m mosa.splats ply=object.ply")
+    values, folder = plain(cfg), run_folder()
+    check_splats(values)
+    found = read_object(cfg.ply, box=values["box"], opacity=cfg.opacity, size=cfg.size)
+    law = values if cfg.ckpt_path is None else Twin.load(cfg.ckpt_path)
+    names = ("density", "up", "gravity", "height", "ground", "resolution", "share", "open_below")
+    simulation, device = values["simulation"], named_device(cfg.device)
+    particles = None if simulation["particles"] == "auto" else simulation["particles"]
+    grid = {"particles": particles, "dx": simulation["dx"], "per_cell": simulation["particles_per_cell"],
+            "most": MOST_PARTICLES["cpu" if device == "cpu" else "cuda"]}  # fmt: skip
+    twin = object_twin(found, law, frame_dt=1 / cfg.rate, **grid, **{name: values[name] for name in names})
+    twin.body.to(device)
+    volume, size = float(twin.body.volume.sum()), twin.body.size
+    log.info("object: %d Gaussians, %d particles, %.4g cm^3, %.3g m long", len(twin.body.splats), len(twin.body.rest), 1e6 * volume,
+             size)
+    save_twin(twin, folder / "checkpoints" / "last.ckpt")
+    rollout = twin.simulate(frames=cfg.frames, progress=True,
+                            **{name: values[name] for name in ("height", "rotation", "velocity", "angular_velocity")})
+    twin.export(rollout, folder, video=cfg.video, title="object", formats=values["formats"])
+    log.info("%d frames in %s; look at them with mosa-view %s", len(rollout.x), folder, folder)
+
+
+if __name__ == "__main__":
+    from mosa.commands.splats import main
+
+    main()

@@ -1,0 +1,152 @@
+"""A 3DGS file becomes a body without any video: filled, given a law, dropped, exported, and read again."""
+
+import math
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from plyfile import PlyData
+from scipy.spatial.transform import Rotation
+from strangers import ROOT, checkpoint
+
+from mosa.clips import read_run
+from mosa.data.splats import save_ply
+from mosa.errors import ConfigError, DataError
+from mosa.guards import check_splats
+from mosa.reconstruction.filling import body_volume
+from mosa.reconstruction.shell import blocked, solid_of
+from mosa.splats import object_twin, read_object, save_twin
+from mosa.twin import Twin
+from mosa.types import Appearance, Splats
+
+RADIUS = 0.1
+BALL = 4 / 3 * math.pi * RADIUS**3
+LAW = {"seed": 0, "prior": {"law": "neo_hookean", "parameters": {"E": 5e4, "nu": 0.3}, "frozen": []},
+       "simulation": {"stride": 8, "max_substeps": 400, "courant": 0.6, "precision": 32, "contact_offset": True},
+       "heterogeneity": {"enabled": False}, "adapter": {"name": None}}  # fmt: skip
+
+
+def ball(count: int = 1500, scale: float = 0.004, open_at: float | None = None) -> Appearance:
+    """Flat Gaussians on a sphere, harmonics of degree 1; open_at: none below this height."""
+    g = torch.Generator().manual_seed(0)
+    normal = torch.nn.functional.normalize(torch.randn(count, 3, generator=g), dim=1)
+    if open_at is not None:
+        normal = normal[RADIUS * normal[:, 1] > open_at]
+    axis = torch.linalg.cross(torch.tensor([0.0, 0, 1]).expand_as(normal), normal)
+    turns = Rotation.from_rotvec((torch.nn.functional.normalize(axis, dim=1) * normal[:, 2:].clamp(-1, 1).acos()).numpy())
+    rotations = torch.as_tensor(turns.as_quat(scalar_first=True)).float()
+    scales = scale * torch.tensor([1.0, 1, 0.3]).expand_as(normal)
+    harmonics = 0.2 * torch.randn(len(normal), 4, 3, generator=g)
+    colors = 0.5 + 0.28209479 * harmonics[:, 0]
+    return Appearance(Splats(RADIUS * normal, scales, rotations, torch.full((len(normal),), 0.9), colors), harmonics)
+
+
+def test_a_line_is_blocked_where_it_meets_the_shell():
+    shell = np.zeros((5, 6, 7), bool)
+    shell[3, 4, 5] = True
+    assert np.argwhere(blocked(shell, (1, 1, 1))).tolist() == [[0, 1, 2], [1, 2, 3], [2, 3, 4]]
+    assert np.argwhere(blocked(shell, (0, 0, -1))).tolist() == [[3, 4, 6]]
+    assert np.argwhere(blocked(shell, (-1, 1, 0))).tolist() == [[4, 3, 5]]
+
+
+@pytest.mark.parametrize(("resolution", "error"), [(40, 0.12), (80, 0.08)])
+def test_a_shell_is_filled(resolution, error):
+    assert body_volume(solid_of(ball().splats, resolution=resolution)) == pytest.approx(BALL, rel=error)
+
+
+def test_an_open_underside_is_closed_where_that_is_said():
+    opened = ball(open_at=-0.06).splats
+    cap = math.pi * 0.04**2 * (3 * RADIUS - 0.04) / 3
+    volume = body_volume(solid_of(opened, resolution=48, up=torch.tensor([0.0, 1, 0])))
+    assert volume == pytest.approx(BALL - cap, rel=0.12)
+
+
+def test_what_encloses_nothing_is_named(tmp_path):
+    point = ball().splats
+    with pytest.raises(DataError, match="all in one place"):
+        solid_of(replace(point, means=torch.zeros_like(point.means)))
+    path = save_ply(tmp_path / "a.ply", ball().splats)
+    with pytest.raises(DataError, match=r"a\.ply: expected at least 100 Gaussians .* in the box, found 0 of 1500; the file spans"):
+        read_object(path, box=[[1, 1, 1], [2, 2, 2]])
+    with pytest.raises(ConfigError, match="box: expected two corners"):
+        read_object(path, box=[[1, 1, 1], [0, 2, 2]])
+
+
+def test_a_file_in_other_units_gets_its_size(tmp_path):
+    source = ball()
+    path = save_ply(tmp_path / "a.ply", source.splats, source.harmonics)
+    found = read_object(path, size=0.5)
+    extent = (found.splats.means.amax(0) - found.splats.means.amin(0)).max()
+    assert float(extent) == pytest.approx(0.5) and torch.allclose(found.harmonics, source.harmonics)
+    factor = 0.5 / float((source.splats.means.amax(0) - source.splats.means.amin(0)).max())
+    assert torch.allclose(found.splats.scales, factor * source.splats.scales, rtol=1e-5)
+
+
+def test_the_object_falls_and_can_be_read_again(tmp_path):
+    """It bounces on its ground, the Gaussians stay on its surface, and its checkpoint gives the same motion."""
+    twin = object_twin(ball(), LAW, particles=300, height=0.1, up=(0, 0, 2.0), ground={"mode": "separate", "friction": 0.3})
+    assert 250 < len(twin.body.rest) < 380 and torch.allclose(twin.world.gravity, torch.tensor([0.0, 0, -9.81]))
+    assert float(twin.body.volume.sum()) == pytest.approx(BALL, rel=0.1)
+    rollout = twin.simulate(frames=10)
+    lowest = rollout.x[:, :, 2].amin(1) - twin.world.ground.height
+    assert float(lowest[0]) == pytest.approx(0.1, abs=1e-5) and -0.01 < float(lowest.min()) < 0.02
+    carried = twin.body.splats.carry(rollout.x)
+    far = torch.cdist(carried.means[-1], rollout.x[-1]).amin(1)
+    assert float(far.max()) < 0.05
+    folder = twin.export(rollout, tmp_path, video=False, formats=("ply", "splat"))
+    vertex = PlyData.read(folder / "splats" / "ply" / "009.ply")["vertex"]
+    assert len(vertex) == len(twin.body.splats) and np.allclose(vertex["z"], carried.means[-1, :, 2].numpy())
+    again = Twin.load(save_twin(twin, tmp_path / "checkpoints" / "last.ckpt"))
+    assert torch.equal(again.simulate(frames=10).x, rollout.x)
+    clip = read_run(tmp_path)[0]
+    assert clip.name == "simulation" and clip.splats("learned", 9, "appearance")[0].shape == (len(twin.body.splats), 3)
+
+
+def test_a_learned_law_is_taken_over(tmp_path):
+    """Material, contact and operator, not the stiffness field of another body's places."""
+
+    def stiffer(stored):
+        state = stored["state_dict"]
+        name = next(key for key in state if key.startswith("body.material") and state[key].ndim == 0)
+        state[name] = state[name] + 0.7
+
+    learned = Twin.load(checkpoint(tmp_path / "a.ckpt", change=stiffer))
+    twin = object_twin(ball(), learned, particles=200)
+    for name, value in learned.body.material.physical().items():
+        assert twin.body.material.physical()[name].item() == pytest.approx(value.item())
+    assert twin.body.heterogeneity is None and twin.body.density == learned.body.density
+    assert type(twin.body.adapter) is type(learned.body.adapter)
+    assert len(twin.simulate(frames=2).x) == 2
+
+
+def test_the_command_makes_all_of_it(tmp_path):
+    source = ball(count=600, scale=0.007)
+    path = save_ply(tmp_path / "ball.ply", source.splats, source.harmonics)
+    arguments = [f"ply={path}", "simulation.particles=150", "frames=3", "resolution=32", "formats=[ply,splat]", "prior=corotated",
+                 f"hydra.run.dir={tmp_path / 'run'}"]  # fmt: skip
+    done = subprocess.run([sys.executable, "-m", "mosa.splats", *arguments], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    for name in ("splats/ply/002.ply", "splats/splat/002.splat", "simulation.mp4", "rollout.npz", "checkpoints/last.ckpt"):
+        assert (tmp_path / "run" / name).is_file(), name
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("share", 2, "share: expected a number above 0 and at most 1, found 2"),
+        ("formats", ["obj"], "formats: expected some of ply, splat, spz, usd, found 'obj'"),
+        ("box", [[0, 0, 0]], "box: expected two corners"),
+        ("up", [0, 1], "up: expected three"),
+    ],
+)
+def test_a_wrong_value_is_named(key, value, message):
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        values = OmegaConf.to_container(compose("splats", overrides=["ply=a.ply"]), resolve=True)
+    check_splats(values)
+    with pytest.raises(ConfigError, match=message):
+        check_splats(values | {key: value})
