@@ -63,7 +63,8 @@ def field_of_triangles(
 ) -> SignedDistanceField:
     """Signed distances to a closed, consistently oriented mesh. vertices: (P, 3) [m]; triangles: (T, 3) indices.
 
-    spacing [m] of the lattice (None: the longest extent over 48); margin [m] beyond the mesh, at least two spacings.
+    spacing [m] of the lattice (None: the longest extent over 48); margin [m] beyond the mesh, at least two
+    spacings (None: a sixth of the longest extent).
     Errors: ConfigError: shapes, indices, no area, not closed, lattice too large.
     """
     points, index = np.asarray(vertices, dtype=np.float64), np.asarray(triangles, dtype=np.int64)
@@ -91,7 +92,7 @@ def field_of_triangles(
     spacing = extent / 48 if spacing is None else spacing
     if not spacing > 0:
         raise ConfigError(f"mesh: spacing: expected a positive number [m], found {spacing}")
-    margin = max(2 * spacing, margin or 0.0)
+    margin = max(2 * spacing, extent / 6 if margin is None else margin)
     low = points.min(0) - margin
     dims = np.ceil((points.max(0) + margin - low) / spacing) + 1
     if not dims.prod() <= MAX_LATTICE:  # in floating point, which does not overflow
