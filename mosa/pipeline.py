@@ -9,10 +9,10 @@ import time
 import warnings
 from collections.abc import Collection
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import lightning as L
-import torch
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.plugins.environments import LightningEnvironment
 from omegaconf import DictConfig, OmegaConf
@@ -23,6 +23,7 @@ from mosa.analysis.tables import determined_text, geometry_lines, parameter_tabl
 from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLast, Pace, StageNotes
 from mosa.checkpoints import check_same, read_checkpoint
 from mosa.config import build_body, build_fit, build_world, plain, run_config, world_config
+from mosa.costs import Costs, before_data, duration, estimate, seconds_of_fit, speed_of_rollouts
 from mosa.data.datamodule import MultiViewDataModule, training_observations
 from mosa.data.sequences import load_sequences, taught_names
 from mosa.errors import ConfigError, DataError, MosaError
@@ -41,7 +42,6 @@ from mosa.loggers import build_loggers, chosen, log_outcome
 from mosa.modules.body import Body, Start, World
 from mosa.modules.gauss_newton import Posterior
 from mosa.modules.lit_mosa import LitMosa, Take
-from mosa.physics.memory import KEPT_ON_CPU
 from mosa.plan import plan, plan_text
 from mosa.prediction import determined, predicted_spread
 from mosa.progress import tqdm
@@ -70,17 +70,18 @@ MOST_PARTICLES = {"cpu": 6000, "cuda": 30000}
 
 
 class Clock:
-    """Wall time per stage, into `time/<stage>_s`."""
+    """Wall time per stage, into `time/<stage>_s`. costs: of what is still to come, once that can be said."""
 
     def __init__(self) -> None:
         self.figures: dict[str, float] = {}
+        self.costs = Costs({}, 0.0)
 
     @contextmanager
     def measure(self, stage: str):
         began = time.perf_counter()
         yield
         self.figures[f"time/{stage}_s"] = self.figures.get(f"time/{stage}_s", 0.0) + time.perf_counter() - began
-        log.info("%s took %.1f s", stage, time.perf_counter() - began)
+        log.info(self.costs.done(stage, time.perf_counter() - began))
 
 
 def run_folder() -> Path:
@@ -102,6 +103,15 @@ def reconstruct_scene(cfg: DictConfig, scene: Scene, device: str) -> tuple[Recon
     reconstruction = reconstruct(scene, settings=settings, spacing=spacing, cache_dir=cache_folder(cfg), seed=cfg.seed,
                                  device=device)
     return reconstruction, grid_spacing(spacing, per_cell)
+
+
+def reconstructed(cfg: DictConfig, scene: Scene, device: str) -> bool:
+    """Whether the training sequence's reconstruction lies in the cache."""
+    from mosa.reconstruction.pipeline import stored
+    from mosa.reconstruction.settings import build_settings
+
+    return stored(scene, cfg.simulation.dx, cfg.simulation.particles, build_settings(**plain(cfg.reconstruction)),
+                  cache_dir=cache_folder(cfg), seed=cfg.seed, device=device)
 
 
 def cache_folder(cfg: DictConfig) -> Path:
@@ -157,11 +167,16 @@ def train(cfg: DictConfig) -> float | None:
     check_begin(cfg)
     device = device_of(cfg)
     use_backend(cfg.rendering.backend)
+    log.info(before_data(plain(cfg)))
     with clock.measure("data"):
         scene, held_out = scenes(cfg)
     taught = taught_names(plain(cfg.scene))
     parallel.check_share(len(device_names(cfg)), 1 + len(taught), min(cfg.fit.views, len(scene.training_cameras)))
     check_seen(cfg, scene)
+    clock.costs = estimate(plain(cfg), scene, len(held_out), 1 + len(taught), device, stored=reconstructed(cfg, scene, device),
+                           processes=len(device_names(cfg)))
+    if parallel.launched_rank() == 0:
+        log.info("this run takes %s; %.1f GB", clock.costs.said(), clock.costs.memory / 1e9)
     if scene.synthetic:
         log.info("scene %s: synthetic, made by this program; not a capture", scene.name)
     with clock.measure("reconstruction"):
@@ -186,7 +201,7 @@ def train(cfg: DictConfig) -> float | None:
         more = [(s, found[f"train/{s.sequence}"]) for s in held_out if s.sequence in taught]
         module, data = assemble_fit(cfg, scene, reconstruction, body, found["train"], config, device, more)
         if parallel.launched_rank() == 0:
-            log.info(fit_estimate(module, len(device_names(cfg))))
+            log.info(fit_estimate(module, clock.costs, len(device_names(cfg))))
         fit(cfg, module, data, folder, device)
     if parallel.launched_rank() != 0:
         return None
@@ -195,12 +210,12 @@ def train(cfg: DictConfig) -> float | None:
     with clock.measure("evaluation"):
         evaluated = sequences(body, scene, held_out, found)
         figures, kept = evaluate(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
-    figures |= identification(body, scene) | law_figures(body) | start_figures(found["train"]) | reconstruction.geometry
-    figures |= hidden_figures(body, scene, figures) | posterior_figures(body, module.posterior, evaluated, world, folder)
-    figures |= {f"id_prior/compared/{law}_m": distance for law, distance in module.compared.items()}
-    if cfg.evaluation.floor:
-        figures |= floor_figures(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
-        figures |= true_geometry(body, scene)
+        figures |= identification(body, scene) | law_figures(body) | start_figures(found["train"]) | reconstruction.geometry
+        figures |= hidden_figures(body, scene, figures) | posterior_figures(body, module.posterior, evaluated, world, folder)
+        figures |= {f"id_prior/compared/{law}_m": distance for law, distance in module.compared.items()}
+        if cfg.evaluation.floor:
+            figures |= floor_figures(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
+            figures |= true_geometry(body, scene)
     figures |= clock.figures | cost(device) | {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
     figures["geometry/cells_across"] = resolved.cells
     log_outcome(plain(cfg.logger), folder, plain(cfg), figures)
@@ -259,31 +274,17 @@ def take_of(cfg, scene: Scene, start: Start, reconstruction: Reconstruction, bod
                 first_contact(body, start, scene))
 
 
-BACKWARD = 2.5  # cost of a step with gradients over one without, measured on the rabbit
-ADAPTER_COST, ADAPTER_BYTES = 1.8, 4.8e3  # of a step with networks over one without; per particle and evaluation
-STATE_BYTES = 330  # per particle and substep kept for the backward pass, with its share of the grid; measured on the rabbit
-
-
-def fit_estimate(module: LitMosa, processes: int = 1) -> str:
-    """One line on how long the fit will take and what its networks will keep in memory, from one timed step without gradients."""
-    body, stages = module.body, module.stages
-    first = module.takes[0]
+def fit_estimate(module: LitMosa, costs: Costs, processes: int = 1) -> str:
+    """One line on how long the fit will take, from rollouts of the body that was found, which `costs` takes over."""
+    first, body = module.takes[0], module.body
     frames = len(first.cues.positions)
-    began = time.perf_counter()
-    with torch.no_grad():
-        module.terms(stages[0], [0, min(1, len(first.observations.cameras) - 1)], frames)
-        again = time.perf_counter()
-        body.simulate(first.start, module.world, frames, first.frame_dt, with_adapter=False)
-    rollout = time.perf_counter() - again
-    step = BACKWARD * (again - began) * -(-len(module.takes) // processes)
-    networks = body.adapter is not None and not body.adapter.steady
-    seconds = sum(s.iterations * step * (ADAPTER_COST if s.name == "joint" and networks else 1) for s in stages if not s.newton)
-    seconds += sum(module.rollouts(s) * rollout for s in stages if s.newton)
-    evaluations = (frames - 1) * body.last_substeps / body.settings.stride
-    memory = evaluations * len(body.rest) * ADAPTER_BYTES if networks else 0
-    kept = 0 if body.rest.is_cuda else min(KEPT_ON_CPU, (frames - 1) * body.last_substeps * len(body.rest) * STATE_BYTES)
+    frame = speed_of_rollouts(body, first.frame_dt, module.world.gravity, module.world.up)
+    speeds = replace(costs.speeds, frame=frame)
+    seconds = seconds_of_fit(module, speeds, frames, processes)
+    costs.known("fit", seconds)
     return (f"fit: {len(body.rest)} particles, {frames} frames of {body.last_substeps} substeps, at most "
-            f"{sum(s.iterations for s in stages)} steps, about {seconds / 60:.0f} minutes and {0.8 + (memory + kept) / 1e9:.1f} GB")
+            f"{sum(s.iterations for s in module.stages)} steps, about {duration(seconds)}; the run takes about "
+            f"{costs.memory / 1e9:.1f} GB")
 
 
 def fit(cfg, module: LitMosa, data: MultiViewDataModule, folder: Path, device: str) -> None:

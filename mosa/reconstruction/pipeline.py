@@ -62,8 +62,7 @@ def object_geometry(
 
     Errors: DataError (empty mattes, empty hull).
     """
-    parts = {"resolution": settings.resolution, "ridge_passes": settings.ridge_passes, "margin": settings.margin}
-    cache = _open_cache(cache_dir, scene, parts | {"geometry": asdict(settings.geometry)}, 0, free=scene.last_free_frame)
+    cache = _geometry_cache(scene, settings, cache_dir)
 
     def stage() -> dict[str, Any]:
         found = find_geometry(
@@ -101,6 +100,24 @@ def spacing_for(
         particles = particles_for(lambda spacing: fill(body, spacing=spacing).positions, volume, per_cell=per_cell, least=FEW,
                                   most=max(most, FEW))
     return (volume / particles) ** (1 / 3)
+
+
+def stored(
+    scene: Scene, dx: float | None, particles: int, settings: ReconstructionSettings, *, cache_dir: str | Path, seed: int = 0,
+    device: torch.device | str = "cpu",
+) -> bool:  # fmt: skip
+    """Whether the cache has the motion of `scene`, the last stage of its reconstruction. dx [m] of the grid, or particles."""
+    folder = _geometry_cache(scene, settings, cache_dir).folder
+    if folder is None or settings.splats is not None or (dx is None and not (folder / "geometry.pt").is_file()):
+        return False
+    spacing = dx / 2 if dx is not None else spacing_for(scene, particles, settings, cache_dir=cache_dir, device=device)
+    folder = _open_cache(cache_dir, scene, asdict(settings), seed, spacing=spacing).folder
+    return folder is not None and (folder / "motion.pt").is_file()
+
+
+def _geometry_cache(scene: Scene, settings: ReconstructionSettings, cache_dir: str | Path | None) -> StageCache:
+    parts = {"resolution": settings.resolution, "ridge_passes": settings.ridge_passes, "margin": settings.margin}
+    return _open_cache(cache_dir, scene, parts | {"geometry": asdict(settings.geometry)}, 0, free=scene.last_free_frame)
 
 
 def _open_cache(cache_dir: str | Path | None, scene: Scene, settings: Mapping[str, Any], seed: int, **more: Any) -> StageCache:

@@ -1,4 +1,4 @@
-"""A flat elastic block on an incline in plane strain by finite elements, with Coulomb's law at its lowest nodes: no grid, no particles.
+"""A flat elastic block on an incline in plane strain by finite elements, Coulomb's law at its lowest nodes: no grid, no particles.
 
 The control of `incline.released`: what the model itself does when gravity begins at once, with and without damping.
 """
