@@ -25,6 +25,7 @@ from mosa.modules.body import Body, Start, World
 from mosa.physics.memory import KEPT_ON_CPU
 from mosa.prediction import DRAWS
 from mosa.reconstruction.observed import object_windows
+from mosa.reconstruction.resolution import grid_spacing
 from mosa.rendering.rasterizer import rasterize
 from mosa.types import Cameras, Scene
 
@@ -130,15 +131,17 @@ def check_memory(cfg: Mapping[str, Any], size: Size) -> float:
 
 
 # ------------------------------------------------------------------------------------------------ calibration
-def size_of(cfg: Mapping[str, Any], scene: Scene, others: int, taught: int) -> tuple[Size, float]:
-    """The run's size, and the radius [m] of the object as frame 0 shows it."""
+def size_of(cfg: Mapping[str, Any], scene: Scene, others: int, taught: int, most: int) -> tuple[Size, float]:
+    """The run's size, and the radius [m] of the object as frame 0 shows it. most: particles where their number is left open."""
     chosen, origins, directions, tangents = lines_of_sight(scene, 0)
     radius = float((scene.box[1] - scene.box[0]).min()) / 6
     if len(chosen) >= 2:
         place, _ = misses(origins, directions, tangents)
         radius = float((tangents * ((place - origins) * directions).sum(1)).mean())
     dx = cfg["simulation"]["dx"]
-    particles = cfg["simulation"]["particles"] if dx is None else round(4.2 * (radius / (dx / 2)) ** 3)
+    particles = particles_of(cfg, most)
+    if dx is not None:
+        particles = round(4.2 * (radius / dx) ** 3 * cfg["simulation"]["particles_per_cell"])
     cameras, frames, height, width = scene.images.shape[:4]
     return Size(int(particles), cameras, frames, height * width, 1 + others, taught), radius
 
@@ -159,7 +162,8 @@ def body_like(cfg: Mapping[str, Any], scene: Scene, count: int, radius: float) -
     covariances = (torch.eye(3) * (0.35 * spacing) ** 2).expand(n, 3, 3)
     tensors = {"rest": points, "volume": torch.full((n,), spacing**3), "colors": torch.full((n, 3), 0.5),
                "opacities": torch.full((n,), 0.8), "covariances": covariances}
-    return build_body(run_config(dict(cfg), scene, 2 * spacing), tensors)
+    dx = grid_spacing(spacing, cfg["simulation"]["particles_per_cell"])
+    return build_body(run_config(dict(cfg), scene, dx), tensors)
 
 
 def speed_of_rollouts(body: Body, frame_dt: float, gravity: torch.Tensor, up: torch.Tensor) -> float:
@@ -204,9 +208,15 @@ def speed_of_pictures(count: int, side: int, device: str) -> float:
 
 
 # ------------------------------------------------------------------------------------------------ time
-def before_data(cfg: Mapping[str, Any]) -> str:
-    """One line on reading the data, from the configuration alone: seconds of a built-in scene. Errors: ConfigError where such a
-    run does not fit into this machine's memory."""
+def particles_of(cfg: Mapping[str, Any], most: int) -> int:
+    """Of the configuration, where it gives their number."""
+    particles = cfg["simulation"]["particles"]
+    return most if particles == "auto" else int(particles)
+
+
+def before_data(cfg: Mapping[str, Any], most: int) -> str:
+    """One line on reading the data, from the configuration alone: seconds of a built-in scene. most: particles where their number
+    is left open. Errors: ConfigError where such a run does not fit into this machine's memory."""
     keys = cfg["scene"]
     if keys.get("format") != "builtin":
         return "data: pictures of a folder; what the rest takes is said when they have been read"
@@ -220,7 +230,7 @@ def before_data(cfg: Mapping[str, Any]) -> str:
     if cfg["simulation"]["dx"] is None:
         pixels = round((film.size * keys["scale"]) ** 2)
         taught = 1 + len(keys.get("also_train") or ())
-        check_memory(cfg, Size(cfg["simulation"]["particles"], film.cameras, film.frames, pixels, len(names), taught))
+        check_memory(cfg, Size(particles_of(cfg, most), film.cameras, film.frames, pixels, len(names), taught))
     made = [take_file(keys["name"], s, keys["material"], keys["seed"], keys.get("cache")).is_file() for s in names]
     pixels = film.cameras * film.frames * film.size**2
     seconds = 1.5 + 4e-8 * pixels * len(names) + 2.3e-7 * pixels * made.count(False) + (0 if all(made) else 6)
@@ -267,9 +277,11 @@ def seconds_of_parts(cfg: Mapping[str, Any], size: Size, window: int, module: Li
 
 
 def estimate(cfg: Mapping[str, Any], scene: Scene, others: int, taught: int, device: str, *, stored: bool = False,
-             processes: int = 1) -> Costs:  # fmt: skip
-    """Of what follows the data. Changes no random state. Errors: ConfigError where this machine's memory does not hold the run."""
-    size, radius = size_of(cfg, scene, others, taught)
+             processes: int = 1, most: int = MEASURED) -> Costs:  # fmt: skip
+    """Of what follows the data. most: particles where their number is left open. Changes no random state.
+
+    Errors: ConfigError where this machine's memory does not hold the run."""
+    size, radius = size_of(cfg, scene, others, taught, most)
     memory = check_memory(cfg, size)
     windows = object_windows(scene, scene.training_cameras, scene.training_frames[:1], margin=cfg["reconstruction"]["margin"])
     window = windows.images.shape[1] * windows.images.shape[2]

@@ -90,19 +90,31 @@ def run_folder() -> Path:
 
 def reconstruct_scene(cfg: DictConfig, scene: Scene, device: str) -> tuple[Reconstruction, float]:
     """Reconstruction of the training sequence and the grid spacing that goes with it [m]."""
-    from mosa.reconstruction.pipeline import reconstruct, spacing_for
+    from mosa.reconstruction.pipeline import reconstruct
     from mosa.reconstruction.settings import build_settings
 
     settings = build_settings(**plain(cfg.reconstruction))
-    dx, particles, per_cell = cfg.simulation.dx, cfg.simulation.particles, cfg.simulation.particles_per_cell
-    if dx is not None:
-        spacing = dx / grid_spacing(1.0, per_cell)
-    else:
-        spacing = spacing_for(scene, None if particles == "auto" else particles, settings, per_cell=per_cell,
-                              most=MOST_PARTICLES["cpu" if device == "cpu" else "cuda"], cache_dir=cache_folder(cfg), device=device)
+    spacing, per_cell = spacing_of(cfg, scene, device), cfg.simulation.particles_per_cell
     reconstruction = reconstruct(scene, settings=settings, spacing=spacing, cache_dir=cache_folder(cfg), seed=cfg.seed,
                                  device=device)
     return reconstruction, grid_spacing(spacing, per_cell)
+
+
+def most_particles(device: str) -> int:
+    """Of simulation.particles=auto."""
+    return MOST_PARTICLES["cpu" if device == "cpu" else "cuda"]
+
+
+def spacing_of(cfg: DictConfig, scene: Scene, device: str) -> float:
+    """Of the particles [m]."""
+    from mosa.reconstruction.pipeline import spacing_for
+    from mosa.reconstruction.settings import build_settings
+
+    dx, particles, per_cell = cfg.simulation.dx, cfg.simulation.particles, cfg.simulation.particles_per_cell
+    if dx is not None:
+        return dx / grid_spacing(1.0, per_cell)
+    return spacing_for(scene, None if particles == "auto" else particles, build_settings(**plain(cfg.reconstruction)),
+                       per_cell=per_cell, most=most_particles(device), cache_dir=cache_folder(cfg), device=device)
 
 
 def reconstructed(cfg: DictConfig, scene: Scene, device: str) -> bool:
@@ -110,8 +122,8 @@ def reconstructed(cfg: DictConfig, scene: Scene, device: str) -> bool:
     from mosa.reconstruction.pipeline import stored
     from mosa.reconstruction.settings import build_settings
 
-    return stored(scene, cfg.simulation.dx, cfg.simulation.particles, build_settings(**plain(cfg.reconstruction)),
-                  cache_dir=cache_folder(cfg), seed=cfg.seed, device=device)
+    return stored(scene, lambda: spacing_of(cfg, scene, device), build_settings(**plain(cfg.reconstruction)),
+                  cache_dir=cache_folder(cfg), seed=cfg.seed)
 
 
 def cache_folder(cfg: DictConfig) -> Path:
@@ -167,14 +179,14 @@ def train(cfg: DictConfig) -> float | None:
     check_begin(cfg)
     device = device_of(cfg)
     use_backend(cfg.rendering.backend)
-    log.info(before_data(plain(cfg)))
+    log.info(before_data(plain(cfg), most_particles(device)))
     with clock.measure("data"):
         scene, held_out = scenes(cfg)
     taught = taught_names(plain(cfg.scene))
     parallel.check_share(len(device_names(cfg)), 1 + len(taught), min(cfg.fit.views, len(scene.training_cameras)))
     check_seen(cfg, scene)
     clock.costs = estimate(plain(cfg), scene, len(held_out), 1 + len(taught), device, stored=reconstructed(cfg, scene, device),
-                           processes=len(device_names(cfg)))
+                           processes=len(device_names(cfg)), most=most_particles(device))
     if parallel.launched_rank() == 0:
         log.info("this run takes %s; %.1f GB", clock.costs.said(), clock.costs.memory / 1e9)
     if scene.synthetic:

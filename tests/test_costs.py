@@ -52,12 +52,12 @@ def test_a_built_in_scene_is_refused_before_it_is_made(monkeypatch, tmp_path):
     monkeypatch.setattr(costs, "machine_memory", lambda: 2e9)
     cfg = configuration(f"scene.cache={tmp_path}", "simulation.particles=100000")
     with pytest.raises(ConfigError, match=r"simulation\.particles: 100000 take"):
-        costs.before_data(cfg)
+        costs.before_data(cfg, 4000)
     cfg["simulation"]["particles"] = 200
-    assert "3 sequences, 3 of them to be made" in costs.before_data(cfg) and not list(tmp_path.iterdir())
+    assert "3 sequences, 3 of them to be made" in costs.before_data(cfg, 4000) and not list(tmp_path.iterdir())
 
 
-def test_an_estimate_has_every_part_and_leaves_the_random_state_alone(tmp_path):
+def test_an_estimate_has_every_part_and_leaves_the_random_state_alone(tmp_path, monkeypatch):
     cfg = configuration(f"scene.cache={tmp_path}")
     scene = load_scene(**{k: v for k, v in cfg["scene"].items() if k != "also_train"})
     torch.manual_seed(3)
@@ -66,6 +66,9 @@ def test_an_estimate_has_every_part_and_leaves_the_random_state_alone(tmp_path):
     assert torch.equal(torch.get_rng_state(), before)
     assert list(found.parts) == ["reconstruction", "starts", "fit", "evaluation"]
     assert all(0 < seconds < 1000 for seconds in found.parts.values()) and 1e9 < found.memory < 2e9
+    monkeypatch.setattr(costs, "speed_of_rollouts", lambda *_: 0.05)
+    monkeypatch.setattr(costs, "speed_of_pictures", lambda *_: 0.01)
+    found = costs.estimate(cfg, scene, 2, 1, "cpu")
     twice = configuration(f"scene.cache={tmp_path}", "fit.joint.newton_iterations=40", "reconstruction.dynamic.iterations=3000")
     more = costs.estimate(twice, scene, 2, 1, "cpu")
     assert more.parts["fit"] > 2 * found.parts["fit"] - 2 * costs.KERNELS

@@ -103,15 +103,14 @@ def spacing_for(
 
 
 def stored(
-    scene: Scene, dx: float | None, particles: int, settings: ReconstructionSettings, *, cache_dir: str | Path, seed: int = 0,
-    device: torch.device | str = "cpu",
-) -> bool:  # fmt: skip
-    """Whether the cache has the motion of `scene`, the last stage of its reconstruction. dx [m] of the grid, or particles."""
+    scene: Scene, spacing: Callable[[], float], settings: ReconstructionSettings, *, cache_dir: str | Path, seed: int = 0
+) -> bool:
+    """Whether the cache has the motion of `scene`, the last stage of its reconstruction. spacing: gives that of the particles [m],
+    and is asked where the body it follows from is in the cache."""
     folder = _geometry_cache(scene, settings, cache_dir).folder
-    if folder is None or settings.splats is not None or (dx is None and not (folder / "geometry.pt").is_file()):
+    if folder is None or settings.splats is not None or not (folder / "geometry.pt").is_file():
         return False
-    spacing = dx / 2 if dx is not None else spacing_for(scene, particles, settings, cache_dir=cache_dir, device=device)
-    folder = _open_cache(cache_dir, scene, asdict(settings), seed, spacing=spacing).folder
+    folder = _open_cache(cache_dir, scene, asdict(settings), seed, spacing=spacing()).folder
     return folder is not None and (folder / "motion.pt").is_file()
 
 
