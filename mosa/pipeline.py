@@ -42,6 +42,7 @@ from mosa.loggers import build_loggers, chosen, log_outcome
 from mosa.modules.body import Body, Start, World
 from mosa.modules.gauss_newton import Posterior
 from mosa.modules.lit_mosa import LitMosa, Take
+from mosa.physics.colliders import colliders_from_config
 from mosa.plan import plan, plan_text
 from mosa.prediction import determined, predicted_spread
 from mosa.progress import tqdm
@@ -49,6 +50,7 @@ from mosa.reconstruction.resolution import ENOUGH, grid_spacing, resolution
 from mosa.reconstruction.starts import first_contact, sequence_start, splats_of
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import use_backend
+from mosa.rollout_file import save_rollout
 from mosa.run import (
     begins_from,
     cost,
@@ -59,7 +61,7 @@ from mosa.run import (
     shared_starts,
     write_figures,
 )  # fmt: skip
-from mosa.twin import Twin, save_observed, save_rollout, save_spread, save_truth
+from mosa.twin import Twin, save_observed, save_spread, save_truth
 from mosa.types import MotionCues, Reconstruction, Scene
 
 log = logging.getLogger(__name__)
@@ -231,7 +233,7 @@ def train(cfg: DictConfig) -> float | None:
     figures |= clock.figures | cost(device) | {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
     figures["geometry/cells_across"] = resolved.cells
     log_outcome(plain(cfg.logger), folder, plain(cfg), figures)
-    write_outputs(folder, cfg, body, evaluated, figures, kept)
+    write_outputs(folder, cfg, body, evaluated, figures, kept, world)
     return optimized(figures, cfg.optimized_metric)
 
 
@@ -343,11 +345,13 @@ def start_figures(start: Start) -> dict[str, float]:
         f"id/omega0_{n}": float(v) for n, v in zip(names, start.angular_velocity)}
 
 
-def write_outputs(folder: Path, cfg: DictConfig, body: Body, evaluated: list[Sequence], figures: dict, kept: dict) -> None:
+def write_outputs(
+    folder: Path, cfg: DictConfig, body: Body, evaluated: list[Sequence], figures: dict, kept: dict, world: World
+) -> None:
     """rollout.npz and prior.npz, truth.npz where it is known; video.mp4 of the last held-out sequence, strip.png of all; tables in
     results.md; metrics.json."""
     for variant, name in (("adapted", "rollout.npz"), ("prior", "prior.npz")):
-        save_rollout(folder / name, {prefix: variants[variant] for prefix, variants in kept.items()})
+        save_rollout(folder / name, {prefix: variants[variant] for prefix, variants in kept.items()}, world.colliders)
     if known := {s.prefix: true_motion(body, s.scene) for s in evaluated if s.scene.truth is not None}:
         save_truth(folder / "truth.npz", known)
     if cfg.evaluation.video:
@@ -386,6 +390,9 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     if any(simulate[k] is not None for k in ("velocity", "rotation", "position", "height", "angular_velocity", "colliders")):
         rollout = twin.simulate(**simulate, progress=True)
         log.info("simulated %d frames into %s", len(rollout.x), twin.export(rollout, folder))
+        given = simulate["colliders"]
+        solids = twin.world.colliders if given is None else colliders_from_config(given, "simulate.colliders")
+        save_rollout(folder / "rollout.npz", {"simulation": rollout}, solids)  # with what colliders did and felt
         return None
     scene, held_out = scenes(evaluated_scene(cfg, twin))
     body, world = twin.body, twin.world
@@ -407,7 +414,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     if cfg.evaluation.floor:
         figures |= floor_figures(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
         figures |= true_geometry(body, scene)
-    write_outputs(folder, cfg, body, evaluated, figures, kept)
+    write_outputs(folder, cfg, body, evaluated, figures, kept, world)
     return optimized(figures, "test/rms_m")
 
 
