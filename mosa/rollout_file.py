@@ -15,11 +15,11 @@ from mosa.types import Rollout
 
 
 def save_rollout(path: str | Path, parts: Mapping[str, Rollout], colliders: Sequence[Collider] = ()) -> None:
-    """npz of rollouts under `<name>/...`: x, v [T, N, 3] (m, m/s), F, F_tot [T, N, 3, 3], times [T] (s), counts [T - 1] (substeps).
+    """npz of rollouts under `<name>/...`: x, v [T, N, 3] (m, m/s), F, F_tot [T, N, 3, 3], times [T] (s), counts [T - 1].
 
-    Where there are K colliders also reactions [T - 1, substeps, K, 6]: force (N) and torque about each one's origin (N m) of every
-    substep (one mean where the substeps vary), and collider_position [T, K, 3] (m), collider_rotation [T, K, 3, 3] at the frames, in
-    the order of the configuration.
+    Where there are K colliders also reactions [T - 1, substeps, K, 6]: force (N) and torque about each one's origin (N m) of
+    every substep (one mean where the substeps vary), and collider_position [T, K, 3] (m), collider_rotation [T, K, 3, 3] at the
+    frames, in the order of the configuration.
     """
     arrays = {}
     for name, rollout in parts.items():
@@ -42,8 +42,8 @@ def poses(colliders: Sequence[Collider], times: Tensor) -> tuple[Tensor, Tensor]
 
 
 def pose(motion: Motion | Trajectory, frames: int, frame_dt: float) -> tuple[Tensor, Tensor]:
-    """(position (T, 3), rotation (T, 3, 3)) of one collider at its frames; of a trajectory, which ends before the last one, the last
-    pose it has."""
+    """(position (T, 3), rotation (T, 3, 3)) of one collider at its frames; of a trajectory, which ends before the last one, the
+    last pose it has."""
     if isinstance(motion, Trajectory):
         index = (torch.arange(frames) * (len(motion.position) // max(frames - 1, 1))).clamp(max=len(motion.position) - 1)
         return motion.position.detach().double().cpu()[index], rotation_matrices(motion.rotation, 1).detach().double().cpu()[index]

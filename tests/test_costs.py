@@ -69,7 +69,8 @@ def test_an_estimate_has_every_part_and_leaves_the_random_state_alone(tmp_path, 
     monkeypatch.setattr(costs, "speed_of_rollouts", lambda *_: 0.05)
     monkeypatch.setattr(costs, "speed_of_pictures", lambda *_: 0.01)
     found = costs.estimate(cfg, scene, 2, 1, "cpu")
-    twice = configuration(f"scene.cache={tmp_path}", "fit.joint.newton_iterations=40", "fit.joint.iterations=40", "reconstruction.dynamic.iterations=3000")
+    twice = configuration(f"scene.cache={tmp_path}", "fit.joint.newton_iterations=40", "fit.joint.iterations=40",
+                          "reconstruction.dynamic.iterations=3000")
     more = costs.estimate(twice, scene, 2, 1, "cpu")
     assert more.parts["fit"] > 2 * found.parts["fit"] - 2 * costs.KERNELS
     assert more.parts["reconstruction"] > 2 * found.parts["reconstruction"]

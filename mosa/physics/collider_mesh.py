@@ -15,8 +15,8 @@ from torch import Tensor
 from mosa.errors import ConfigError, DataError
 
 MAX_LATTICE = 2**24
-FARTHEST = 1e6
-"""[m]"""
+FARTHEST, SMALLEST = 1e6, 1e-6
+"""[m] of a vertex, of the longest extent."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +89,8 @@ def field_of_triangles(
     if (corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() < 0:
         raise ConfigError("mesh: its triangles face inwards (negative volume): turn their orientation around")
     extent = float((points.max(0) - points.min(0)).max())
+    if extent < SMALLEST:
+        raise ConfigError(f"mesh: expected an extent of at least {SMALLEST:g} m, found {extent:.3g} m: check scale")
     spacing = extent / 48 if spacing is None else spacing
     if not spacing > 0:
         raise ConfigError(f"mesh: spacing: expected a positive number [m], found {spacing}")
