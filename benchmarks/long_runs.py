@@ -1,12 +1,13 @@
 """Many runs: in a row, side by side, killed and resumed; and many rollouts in one process.
 
-    OMP_NUM_THREADS=1 python benchmarks/long_runs.py                                # small: about ten minutes on two cores
-    OMP_NUM_THREADS=1 python benchmarks/long_runs.py --runs 200 --kills 40 --rollouts 20000
+    OMP_NUM_THREADS=1 python benchmarks/long_runs.py                     # small: about ten minutes on two cores
+    OMP_NUM_THREADS=1 python benchmarks/long_runs.py --runs 60 --kills 40 --rollouts 20000
+    OMP_NUM_THREADS=1 python benchmarks/long_runs.py --launcher submitit_local
 
-Runs are drawn (law, criterion, adapter, numbers of the fit) on the tiny scene. The same ones are made one after the other, then as a
-sweep of the joblib launcher, which is killed with SIGKILL, with all of its processes, at drawn moments and started again with
-resume=auto until it is complete. Told: exit codes, which figures differ between the two (times apart), what is left behind
-(processes, half-written files, locks), and by how much a process's memory grows over rollouts.
+Runs are drawn (law, criterion, adapter, numbers of the fit) on the tiny scene. The same ones are made one after the other, then as
+a sweep of a launcher (the extra `sweep`), which is killed with SIGKILL, with all of its processes, at drawn moments and started
+again with resume=auto until it is complete. Told: exit codes, which figures differ between the two (times apart), what is left
+behind (processes, half-written files, locks), and by how much a process's memory grows over rollouts.
 """
 
 from __future__ import annotations
@@ -25,8 +26,9 @@ from pathlib import Path
 import torch
 
 ROOT = Path(__file__).parents[1]
-SMALL = ["debug=default", "evaluation.video=false", "logger=none", "simulation.particles=100", "reconstruction.static.iterations=60",
-         "reconstruction.appearance.iterations=60", "reconstruction.dynamic.iterations=30"]  # fmt: skip
+SMALL = ["debug=default", "evaluation.video=false", "logger=none", "simulation.particles=100",
+         "reconstruction.static.iterations=60", "reconstruction.appearance.iterations=60",
+         "reconstruction.dynamic.iterations=30"]  # fmt: skip
 CHOICES = {
     "prior": ["corotated", "neo_hookean", "linear", "stvk"], "criterion": ["corrected", "free"], "adapter": ["operator", "none"],
     "fit.joint.newton_iterations": [1, 2], "identification.count": [20.0, 30.0],
@@ -90,7 +92,7 @@ def in_a_row(sets: list[list[str]], folder: Path, common: list[str]) -> list[dic
     return made
 
 
-def killed_sweep(sets: list[list[str]], folder: Path, common: list[str], kills: int, span: tuple[float, float],
+def killed_sweep(sets: list[list[str]], folder: Path, common: list[str], launcher: str, kills: int, span: tuple[float, float],
                  generator: random.Random) -> tuple[list[dict], int]:  # fmt: skip
     """The same runs as a sweep, killed `kills` times, then left alone; (their figures, jobs that a kill met unfinished)."""
     # one experiment file per set: a sweep goes through them
@@ -106,10 +108,12 @@ def killed_sweep(sets: list[list[str]], folder: Path, common: list[str], kills: 
             for part in path:
                 at = at.setdefault(part, {})
             at[last] = json.loads(value)
-        (conf / f"drawn_{k}.yaml").write_text("\n".join([*lines, *(f"{key}: {json.dumps(value)}" for key, value in tree.items())]) + "\n")
+        lines += [f"{key}: {json.dumps(value)}" for key, value in tree.items()]
+        (conf / f"drawn_{k}.yaml").write_text("\n".join(lines) + "\n")
     names = ",".join(f"drawn_{k}" for k in range(len(sets)))
-    sweep = ["-m", "--config-dir", str(folder / "conf"), *common, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "resume=auto",
-             f"hydra.sweep.dir={folder}/sweep", "hydra.sweep.subdir=${hydra.job.num}", f"experiment={names}"]
+    sweep = ["-m", "--config-dir", str(folder / "conf"), *common, f"hydra/launcher={launcher}", "resume=auto",
+             *(["hydra.launcher.n_jobs=2"] if launcher == "joblib" else []), f"experiment={names}",
+             f"hydra.sweep.dir={folder}/sweep", "hydra.sweep.subdir=${hydra.job.num}"]
     met = 0
     for _ in range(kills):
         process, wait = started(sweep, folder / "sweep.log"), generator.uniform(*span)
@@ -143,8 +147,8 @@ def growth_of_rollouts(checkpoint: Path, count: int) -> tuple[float, float]:
         if k == count // 10:
             early = resident()
         speed, turn = torch.randn(3, generator=generator), torch.randn(4, generator=generator)
-        twin.simulate(rotation=turn[:3].tolist() + [90 * float(turn[3])], height=0.1 + 0.2 * float(torch.rand(1, generator=generator)),
-                      velocity=speed.tolist(), frames=8)  # fmt: skip
+        height = 0.1 + 0.2 * float(torch.rand(1, generator=generator))
+        twin.simulate(rotation=[*turn[:3].tolist(), 90 * float(turn[3])], height=height, velocity=speed.tolist(), frames=8)
     return resident() - early, count / (time.perf_counter() - began)
 
 
@@ -154,6 +158,7 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=3)
     parser.add_argument("--rollouts", type=int, default=400)
     parser.add_argument("--between", type=float, nargs=2, default=(15.0, 60.0), help="seconds until a kill")
+    parser.add_argument("--launcher", default="joblib", help="joblib | submitit_local")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     generator = random.Random(options.seed)
@@ -162,14 +167,15 @@ def main() -> None:
         folder = Path(place)
         common = [*SMALL, f"scene.cache={folder}/cache"]
         first = in_a_row(sets, folder, common)
-        second, met = killed_sweep(sets, folder, common, options.kills, tuple(options.between), generator)
+        second, met = killed_sweep(sets, folder, common, options.launcher, options.kills, tuple(options.between), generator)
         wrong = [k for k, (a, b) in enumerate(zip(first, second)) if a != b or "exit" in a]
         left = leftovers(folder)
         alive = processes_with(place)
         added, rate = growth_of_rollouts(folder / "0" / "checkpoints" / "last.ckpt", options.rollouts)
-        print(f"\n| {len(sets)} runs in a row and as a sweep | figures that differ | unfinished jobs that {options.kills} kills met | "
-              f"processes left | half-written files and locks left | memory added by {options.rollouts} rollouts [MB] | rollouts/s |\n"
-              f"|---|---|---|---|---|---|---|\n| | {len(wrong)} | {met} | {len(alive)} | {len(left)} | {added:.1f} | {rate:.1f} |")
+        print(f"\n{len(sets)} runs in a row and as a sweep ({options.launcher}): {len(wrong)} with figures that differ\n"
+              f"{options.kills} kills met {met} unfinished jobs\n"
+              f"left: {len(alive)} processes, {len(left)} half-written files or locks\n"
+              f"{options.rollouts} rollouts in one process: {added:.1f} MB added after the first tenth, {rate:.1f} a second")
         for k in wrong:
             told = {key for key in {*first[k], *second[k]} if first[k].get(key) != second[k].get(key)}
             print(f"run {k} differs: {' '.join(sets[k])}: {sorted(told)[:8]}")
