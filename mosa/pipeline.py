@@ -9,10 +9,10 @@ import time
 import warnings
 from collections.abc import Collection
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import lightning as L
-import torch
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.plugins.environments import LightningEnvironment
 from omegaconf import DictConfig, OmegaConf
@@ -23,6 +23,7 @@ from mosa.analysis.tables import determined_text, geometry_lines, parameter_tabl
 from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLast, Pace, StageNotes
 from mosa.checkpoints import check_same, read_checkpoint
 from mosa.config import build_body, build_fit, build_world, plain, run_config, world_config
+from mosa.costs import Costs, before_data, duration, estimate, seconds_of_fit, speed_of_rollouts
 from mosa.data.datamodule import MultiViewDataModule, training_observations
 from mosa.data.sequences import load_sequences, taught_names
 from mosa.data.splats import save_ply
@@ -43,7 +44,7 @@ from mosa.modules.body import Body, Start, World
 from mosa.modules.carried_splats import CarriedSplats
 from mosa.modules.gauss_newton import Posterior
 from mosa.modules.lit_mosa import LitMosa, Take
-from mosa.physics.memory import KEPT_ON_CPU
+from mosa.physics.colliders import colliders_from_config
 from mosa.plan import plan, plan_text
 from mosa.prediction import determined, predicted_spread
 from mosa.progress import tqdm
@@ -51,6 +52,7 @@ from mosa.reconstruction.resolution import ENOUGH, grid_spacing, resolution
 from mosa.reconstruction.starts import first_contact, sequence_start, splats_of
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import use_backend
+from mosa.rollout_file import save_rollout
 from mosa.run import (
     begins_from,
     cost,
@@ -61,7 +63,7 @@ from mosa.run import (
     shared_starts,
     write_figures,
 )  # fmt: skip
-from mosa.twin import Twin, save_observed, save_rollout, save_spread, save_truth
+from mosa.twin import Twin, save_observed, save_spread, save_truth
 from mosa.types import MotionCues, Reconstruction, Scene
 
 log = logging.getLogger(__name__)
@@ -72,17 +74,18 @@ MOST_PARTICLES = {"cpu": 6000, "cuda": 30000}
 
 
 class Clock:
-    """Wall time per stage, into `time/<stage>_s`."""
+    """Wall time per stage, into `time/<stage>_s`. costs: of what is still to come, once that can be said."""
 
     def __init__(self) -> None:
         self.figures: dict[str, float] = {}
+        self.costs = Costs({}, 0.0)
 
     @contextmanager
     def measure(self, stage: str):
         began = time.perf_counter()
         yield
         self.figures[f"time/{stage}_s"] = self.figures.get(f"time/{stage}_s", 0.0) + time.perf_counter() - began
-        log.info("%s took %.1f s", stage, time.perf_counter() - began)
+        log.info(self.costs.done(stage, time.perf_counter() - began))
 
 
 def run_folder() -> Path:
@@ -91,19 +94,40 @@ def run_folder() -> Path:
 
 def reconstruct_scene(cfg: DictConfig, scene: Scene, device: str) -> tuple[Reconstruction, float]:
     """Reconstruction of the training sequence and the grid spacing that goes with it [m]."""
-    from mosa.reconstruction.pipeline import reconstruct, spacing_for
+    from mosa.reconstruction.pipeline import reconstruct
     from mosa.reconstruction.settings import build_settings
 
     settings = build_settings(**plain(cfg.reconstruction))
-    dx, particles, per_cell = cfg.simulation.dx, cfg.simulation.particles, cfg.simulation.particles_per_cell
-    if dx is not None:
-        spacing = dx / grid_spacing(1.0, per_cell)
-    else:
-        spacing = spacing_for(scene, None if particles == "auto" else particles, settings, per_cell=per_cell,
-                              most=MOST_PARTICLES["cpu" if device == "cpu" else "cuda"], cache_dir=cache_folder(cfg), device=device)
+    spacing, per_cell = spacing_of(cfg, scene, device), cfg.simulation.particles_per_cell
     reconstruction = reconstruct(scene, settings=settings, spacing=spacing, cache_dir=cache_folder(cfg), seed=cfg.seed,
                                  device=device)
     return reconstruction, grid_spacing(spacing, per_cell)
+
+
+def most_particles(device: str) -> int:
+    """Of simulation.particles=auto."""
+    return MOST_PARTICLES["cpu" if device == "cpu" else "cuda"]
+
+
+def spacing_of(cfg: DictConfig, scene: Scene, device: str) -> float:
+    """Of the particles [m]."""
+    from mosa.reconstruction.pipeline import spacing_for
+    from mosa.reconstruction.settings import build_settings
+
+    dx, particles, per_cell = cfg.simulation.dx, cfg.simulation.particles, cfg.simulation.particles_per_cell
+    if dx is not None:
+        return dx / grid_spacing(1.0, per_cell)
+    return spacing_for(scene, None if particles == "auto" else particles, build_settings(**plain(cfg.reconstruction)),
+                       per_cell=per_cell, most=most_particles(device), cache_dir=cache_folder(cfg), device=device)
+
+
+def reconstructed(cfg: DictConfig, scene: Scene, device: str) -> bool:
+    """Whether the training sequence's reconstruction lies in the cache."""
+    from mosa.reconstruction.pipeline import stored
+    from mosa.reconstruction.settings import build_settings
+
+    return stored(scene, lambda: spacing_of(cfg, scene, device), build_settings(**plain(cfg.reconstruction)),
+                  cache_dir=cache_folder(cfg), seed=cfg.seed)
 
 
 def cache_folder(cfg: DictConfig) -> Path:
@@ -159,11 +183,16 @@ def train(cfg: DictConfig) -> float | None:
     check_begin(cfg)
     device = device_of(cfg)
     use_backend(cfg.rendering.backend)
+    log.info(before_data(plain(cfg), most_particles(device)))
     with clock.measure("data"):
         scene, held_out = scenes(cfg)
     taught = taught_names(plain(cfg.scene))
     parallel.check_share(len(device_names(cfg)), 1 + len(taught), min(cfg.fit.views, len(scene.training_cameras)))
     check_seen(cfg, scene)
+    clock.costs = estimate(plain(cfg), scene, len(held_out), 1 + len(taught), device, stored=reconstructed(cfg, scene, device),
+                           processes=len(device_names(cfg)), most=most_particles(device))
+    if parallel.launched_rank() == 0:
+        log.info("this run takes %s; %.1f GB", clock.costs.said(), clock.costs.memory / 1e9)
     if scene.synthetic:
         log.info("scene %s: synthetic, made by this program; not a capture", scene.name)
     with clock.measure("reconstruction"):
@@ -188,7 +217,7 @@ def train(cfg: DictConfig) -> float | None:
         more = [(s, found[f"train/{s.sequence}"]) for s in held_out if s.sequence in taught]
         module, data = assemble_fit(cfg, scene, reconstruction, body, found["train"], config, device, more)
         if parallel.launched_rank() == 0:
-            log.info(fit_estimate(module, len(device_names(cfg))))
+            log.info(fit_estimate(module, clock.costs, len(device_names(cfg))))
         fit(cfg, module, data, folder, device)
     if parallel.launched_rank() != 0:
         return None
@@ -197,16 +226,16 @@ def train(cfg: DictConfig) -> float | None:
     with clock.measure("evaluation"):
         evaluated = sequences(body, scene, held_out, found)
         figures, kept = evaluate(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
-    figures |= identification(body, scene) | law_figures(body) | start_figures(found["train"]) | reconstruction.geometry
-    figures |= hidden_figures(body, scene, figures) | posterior_figures(body, module.posterior, evaluated, world, folder)
-    figures |= {f"id_prior/compared/{law}_m": distance for law, distance in module.compared.items()}
-    if cfg.evaluation.floor:
-        figures |= floor_figures(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
-        figures |= true_geometry(body, scene)
+        figures |= identification(body, scene) | law_figures(body) | start_figures(found["train"]) | reconstruction.geometry
+        figures |= hidden_figures(body, scene, figures) | posterior_figures(body, module.posterior, evaluated, world, folder)
+        figures |= {f"id_prior/compared/{law}_m": distance for law, distance in module.compared.items()}
+        if cfg.evaluation.floor:
+            figures |= floor_figures(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
+            figures |= true_geometry(body, scene)
     figures |= clock.figures | cost(device) | {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
     figures["geometry/cells_across"] = resolved.cells
     log_outcome(plain(cfg.logger), folder, plain(cfg), figures)
-    write_outputs(folder, cfg, body, evaluated, figures, kept)
+    write_outputs(folder, cfg, body, evaluated, figures, kept, world)
     return optimized(figures, cfg.optimized_metric)
 
 
@@ -264,31 +293,17 @@ def take_of(cfg, scene: Scene, start: Start, reconstruction: Reconstruction, bod
                 first_contact(body, start, scene))
 
 
-BACKWARD = 2.5  # cost of a step with gradients over one without, measured on the rabbit
-ADAPTER_COST, ADAPTER_BYTES = 1.8, 4.8e3  # of a step with networks over one without; per particle and evaluation
-STATE_BYTES = 330  # per particle and substep kept for the backward pass, with its share of the grid; measured on the rabbit
-
-
-def fit_estimate(module: LitMosa, processes: int = 1) -> str:
-    """One line on how long the fit will take and what its networks will keep in memory, from one timed step without gradients."""
-    body, stages = module.body, module.stages
-    first = module.takes[0]
+def fit_estimate(module: LitMosa, costs: Costs, processes: int = 1) -> str:
+    """One line on how long the fit will take, from rollouts of the body that was found, which `costs` takes over."""
+    first, body = module.takes[0], module.body
     frames = len(first.cues.positions)
-    began = time.perf_counter()
-    with torch.no_grad():
-        module.terms(stages[0], [0, min(1, len(first.observations.cameras) - 1)], frames)
-        again = time.perf_counter()
-        body.simulate(first.start, module.world, frames, first.frame_dt, with_adapter=False)
-    rollout = time.perf_counter() - again
-    step = BACKWARD * (again - began) * -(-len(module.takes) // processes)
-    networks = body.adapter is not None and not body.adapter.steady
-    seconds = sum(s.iterations * step * (ADAPTER_COST if s.name == "joint" and networks else 1) for s in stages if not s.newton)
-    seconds += sum(module.rollouts(s) * rollout for s in stages if s.newton)
-    evaluations = (frames - 1) * body.last_substeps / body.settings.stride
-    memory = evaluations * len(body.rest) * ADAPTER_BYTES if networks else 0
-    kept = 0 if body.rest.is_cuda else min(KEPT_ON_CPU, (frames - 1) * body.last_substeps * len(body.rest) * STATE_BYTES)
+    frame = speed_of_rollouts(body, first.frame_dt, module.world.gravity, module.world.up)
+    speeds = replace(costs.speeds, frame=frame)
+    seconds = seconds_of_fit(module, speeds, frames, processes)
+    costs.known("fit", seconds)
     return (f"fit: {len(body.rest)} particles, {frames} frames of {body.last_substeps} substeps, at most "
-            f"{sum(s.iterations for s in stages)} steps, about {seconds / 60:.0f} minutes and {0.8 + (memory + kept) / 1e9:.1f} GB")
+            f"{sum(s.iterations for s in module.stages)} steps, about {duration(seconds)}; the run takes about "
+            f"{costs.memory / 1e9:.1f} GB")
 
 
 def fit(cfg, module: LitMosa, data: MultiViewDataModule, folder: Path, device: str) -> None:
@@ -335,11 +350,13 @@ def start_figures(start: Start) -> dict[str, float]:
         f"id/omega0_{n}": float(v) for n, v in zip(names, start.angular_velocity)}
 
 
-def write_outputs(folder: Path, cfg: DictConfig, body: Body, evaluated: list[Sequence], figures: dict, kept: dict) -> None:
+def write_outputs(
+    folder: Path, cfg: DictConfig, body: Body, evaluated: list[Sequence], figures: dict, kept: dict, world: World
+) -> None:
     """rollout.npz and prior.npz, truth.npz where it is known; splats.ply; video.mp4 of the last held-out sequence, strip.png of
     all; tables in results.md; metrics.json."""
     for variant, name in (("adapted", "rollout.npz"), ("prior", "prior.npz")):
-        save_rollout(folder / name, {prefix: variants[variant] for prefix, variants in kept.items()})
+        save_rollout(folder / name, {prefix: variants[variant] for prefix, variants in kept.items()}, world.colliders)
     if known := {s.prefix: true_motion(body, s.scene) for s in evaluated if s.scene.truth is not None}:
         save_truth(folder / "truth.npz", known)
     if body.splats is not None:
@@ -382,6 +399,9 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     if any(simulate[k] is not None for k in ("velocity", "rotation", "position", "height", "angular_velocity", "colliders")):
         rollout = twin.simulate(**simulate, progress=True)
         log.info("simulated %d frames into %s", len(rollout.x), twin.export(rollout, folder))
+        given = simulate["colliders"]
+        solids = twin.world.colliders if given is None else colliders_from_config(given, "simulate.colliders")
+        save_rollout(folder / "rollout.npz", {"simulation": rollout}, solids)  # with what colliders did and felt
         return None
     scene, held_out = scenes(evaluated_scene(cfg, twin))
     body, world = twin.body, twin.world
@@ -403,7 +423,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     if cfg.evaluation.floor:
         figures |= floor_figures(body, evaluated, world, samples=cfg.evaluation.samples, assignment=cfg.evaluation.assignment)
         figures |= true_geometry(body, scene)
-    write_outputs(folder, cfg, body, evaluated, figures, kept)
+    write_outputs(folder, cfg, body, evaluated, figures, kept, world)
     return optimized(figures, "test/rms_m")
 
 

@@ -3,7 +3,8 @@
 A node at y, r = y - position, in the collider's axes at q = R^T r, of distance phi(q) and outward normal n = R grad phi/|grad phi|,
 moves relative to the solid's velocity there, V = linear + angular x r:
     u' = u + w(phi) (V + collide(u - V, n) - u),    force on the collider f = -m (u' - u)/dt,    torque r x f
-with `collide` of `boundary` and w = 1 inside (tolerance 1e-6 m as for planes), falling to 0 over the collider's `thickness`.
+with `collide` of `boundary` and w = 1 inside (tolerance 1e-6 m as for planes), falling to 0 at the collider's `thickness`
+(`boundary.make_fade`).
 Colliders act in the order given, after the planes. The pose is the one at the start of the substep. Worlds have the same solids,
 each with poses of its own: solid k of world w has column w count + k of poses and reactions.
 """
@@ -13,7 +14,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from mosa.physics.boundary import make_normal_adjoint, make_plane_functions
+from mosa.physics.boundary import make_fade, make_normal_adjoint, make_plane_functions
 from mosa.physics.collider_shapes import shape_functions
 from mosa.physics.mpm_kernels import transfer_kernels
 from mosa.physics.vector_memory import vector_memory
@@ -27,25 +28,13 @@ def collider_kernels(scalar) -> SimpleNamespace:
     mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
     collide, adj_collide = make_plane_functions(scalar)
     adj_collide_normal = make_normal_adjoint(scalar)
+    weight = make_fade(scalar)
     shape = shape_functions(scalar)
     signed_distance, curvature = shape.signed_distance, shape.curvature
     transfers = transfer_kernels(scalar)
     node_position, nodes_of = transfers.node_position, transfers.nodes_of
     load3, store3 = vector_memory(scalar).load3, vector_memory(scalar).store3
     module = f"mosa.physics.colliders_{scalar.__name__}"
-
-    @wp.func
-    def weight(phi: scalar, thickness: scalar):
-        """(w, dw/dphi): 1 inside, a smooth step to 0 at `thickness` above the surface."""
-        w = scalar(0.0)
-        slope = scalar(0.0)
-        if phi <= scalar(1.0e-6):
-            w = scalar(1.0)
-        elif phi < thickness:
-            s = phi / thickness
-            w = (scalar(1.0) - s) * (scalar(1.0) - s) * (scalar(1.0) + scalar(2.0) * s)
-            slope = scalar(-6.0) * s * (scalar(1.0) - s) / thickness
-        return w, slope
 
     @wp.func
     def respond(

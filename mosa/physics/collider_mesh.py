@@ -15,8 +15,8 @@ from torch import Tensor
 from mosa.errors import ConfigError, DataError
 
 MAX_LATTICE = 2**24
-FARTHEST = 1e6
-"""[m]"""
+FARTHEST, SMALLEST = 1e6, 1e-6
+"""[m] of a vertex, of the longest extent."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,8 @@ def field_of_triangles(
 ) -> SignedDistanceField:
     """Signed distances to a closed, consistently oriented mesh. vertices: (P, 3) [m]; triangles: (T, 3) indices.
 
-    spacing [m] of the lattice (None: the longest extent over 48); margin [m] beyond the mesh, at least two spacings.
+    spacing [m] of the lattice (None: the longest extent over 48); margin [m] beyond the mesh, at least two
+    spacings (None: a sixth of the longest extent).
     Errors: ConfigError: shapes, indices, no area, not closed, lattice too large.
     """
     points, index = np.asarray(vertices, dtype=np.float64), np.asarray(triangles, dtype=np.int64)
@@ -88,10 +89,12 @@ def field_of_triangles(
     if (corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() < 0:
         raise ConfigError("mesh: its triangles face inwards (negative volume): turn their orientation around")
     extent = float((points.max(0) - points.min(0)).max())
+    if extent < SMALLEST:
+        raise ConfigError(f"mesh: expected an extent of at least {SMALLEST:g} m, found {extent:.3g} m: check scale")
     spacing = extent / 48 if spacing is None else spacing
     if not spacing > 0:
         raise ConfigError(f"mesh: spacing: expected a positive number [m], found {spacing}")
-    margin = max(2 * spacing, margin or 0.0)
+    margin = max(2 * spacing, extent / 6 if margin is None else margin)
     low = points.min(0) - margin
     dims = np.ceil((points.max(0) + margin - low) / spacing) + 1
     if not dims.prod() <= MAX_LATTICE:  # in floating point, which does not overflow

@@ -1,10 +1,14 @@
-"""Pure torch float64 twin of the colliders: slow and obvious, for tests; gradients by plain autograd."""
+"""Pure torch float64 twin of the colliders: slow and obvious, for tests; gradients by plain autograd.
+
+Their thickness has to be given.
+"""
 
 import torch
 from torch import Tensor
 
 from mosa.physics.collider_mesh import SignedDistanceField
 from mosa.physics.colliders import Box, Capsule, Collider, Cylinder, HalfSpace, Sphere
+from mosa.physics.reference import fade
 
 
 def signed_distance(shape, q: Tensor) -> Tensor:
@@ -50,7 +54,7 @@ def collide(
     """
     forces, torques = [], []
     for collider, x, Q, linear, angular in zip(colliders, *poses):
-        near = signed_distance(collider.shape, (y - x) @ Q).detach() < max(collider.thickness, 1e-6)
+        near = signed_distance(collider.shape, (y - x) @ Q).detach() <= max(collider.thickness, 1e-6)
         r = (y - x)[near]
         q = r @ Q
         if not q.requires_grad:
@@ -60,8 +64,7 @@ def collide(
         n = (gradient / gradient.norm(dim=1, keepdim=True)) @ Q.mT
         V = linear + torch.linalg.cross(angular.expand_as(r), r)
         hit = V + _collide_each(u[near] - V, n, collider)
-        s = (phi / collider.thickness).clamp(0, 1) if collider.thickness > 0 else torch.zeros_like(phi)
-        w = torch.where(phi <= 1e-6, torch.ones(()), (1 - s) ** 2 * (1 + 2 * s))
+        w = fade(phi, collider.thickness)
         change = w[:, None] * (hit - u[near])
         f = -(m[near] / dt)[:, None] * change
         forces.append(f.sum(0))

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mosa.errors import ConfigError
 from mosa.physics import collider_shapes as packing
-from mosa.physics.boundary import MODES, Plane
+from mosa.physics.boundary import MODES, THICKNESS, Plane
 from mosa.physics.collider_keys import check_keys
 from mosa.physics.collider_mesh import SignedDistanceField, field_of_mesh
 from mosa.physics.collider_motion import Motion, Trajectory, exponential
@@ -67,18 +67,21 @@ KINDS = {HalfSpace: packing.HALF_SPACE, Sphere: packing.SPHERE, Capsule: packing
 class Collider:
     """A moving rigid solid. mode, friction: as for a plane, relative to the solid's velocity at the node.
 
-    thickness [m]: over this distance above the surface the contact fades in (0: a node is in contact or not, as for planes). The
-    result is then differentiable in the collider's position also where its surface is flat; with 0 a node that changes sides is a
-    jump that no gradient sees, and positions act through curvature, lever arms and velocities only. The fade is per substep: a node
-    of small weight still comes to a stop within as many substeps as its weight is small.
-    A grid contact is felt, and lets go, up to about half a cell off the surface: strokes should be many cells long.
+    thickness [m]: over this distance above the surface the contact fades in: whole in the share `boundary.WHOLE` of it next to
+    the surface, then falling to nothing. None: `boundary.THICKNESS` cells of the grid (of a mesh at most its margin). Plates then
+    squeeze a body with the force of its own law, whatever dx, and a shaken block stays where friction holds it; but an impact is
+    felt up to a cell and a half early, and rolling is braked. 0: a node is in contact or not, as for planes without friction; a
+    ball rolls as it should, and each plate squeezes a body by about a quarter of a cell less than its stroke. With a thickness the
+    result is differentiable in the collider's position also where its surface is flat; with 0 a node that changes sides is a jump
+    that no gradient sees, and positions act through curvature, lever arms and velocities only. The fade is per substep: a node of
+    small weight still comes to a stop within as many substeps as its weight is small.
     """
 
     shape: Shape
     mode: str = "sticky"
     friction: float = 0.0
     motion: Motion | Trajectory = field(default_factory=Motion)
-    thickness: float = 0.0
+    thickness: float | None = None
     name: str = ""
 
 
@@ -94,8 +97,8 @@ class PackedColliders(NamedTuple):
         return len(self.codes)
 
 
-def pack_colliders(colliders: Sequence[Collider], dtype: torch.dtype, device: torch.device) -> PackedColliders:
-    """Errors: ConfigError naming the collider and the field."""
+def pack_colliders(colliders: Sequence[Collider], dtype: torch.dtype, device: torch.device, dx: float) -> PackedColliders:
+    """dx [m]: of the grid. Errors: ConfigError naming the collider and the field."""
     shapes = torch.zeros(len(colliders), packing.SHAPE_COLUMNS, dtype=torch.float64)
     codes = torch.zeros(len(colliders), packing.CODE_COLUMNS, dtype=torch.int32)
     fields, offset = [torch.zeros(1, dtype=torch.float64)], 1
@@ -105,8 +108,9 @@ def pack_colliders(colliders: Sequence[Collider], dtype: torch.dtype, device: to
             raise ConfigError(f"{where}: shape: expected one of {', '.join(k.__name__ for k in KINDS)}, found {shape!r}")
         if collider.mode not in MODES:
             raise ConfigError(f"{where}: mode: expected one of {', '.join(MODES)}, found {collider.mode!r}")
-        for name in ("friction", "thickness"):
-            value = getattr(collider, name)
+        given = collider.thickness
+        thickness = THICKNESS * dx if given is None else given
+        for name, value in (("friction", collider.friction), ("thickness", thickness)):
             if isinstance(value, bool) or not 0 <= value < math.inf:
                 raise ConfigError(f"{where}: {name}: expected a finite number >= 0, found {value}")
         if collider.friction > 0 and collider.mode != "separate":
@@ -115,13 +119,15 @@ def pack_colliders(colliders: Sequence[Collider], dtype: torch.dtype, device: to
             if not 0 < value < math.inf:
                 raise ConfigError(f"{where}: {type(shape).__name__}: expected positive lengths [m], found {shape}")
             shapes[i, packing.SIZE + j] = value
-        shapes[i, packing.THICKNESS], shapes[i, packing.FRICTION] = collider.thickness, collider.friction
+        shapes[i, packing.THICKNESS], shapes[i, packing.FRICTION] = thickness, collider.friction
         codes[i, packing.KIND], codes[i, packing.MODE] = KINDS[type(shape)], MODES[collider.mode]
         if isinstance(shape, SignedDistanceField):
-            if shape.margin < collider.thickness:
+            if given is None:
+                shapes[i, packing.THICKNESS] = min(thickness, shape.margin)
+            elif shape.margin < thickness:
                 raise ConfigError(
-                    f"{where}: thickness: the field of the mesh reaches {shape.margin:.3g} m beyond it, less than "
-                    f"{collider.thickness}: make it with a larger margin"
+                    f"{where}: thickness: the field of the mesh reaches {shape.margin:.3g} m beyond it, less than {thickness}: "
+                    "make it with a larger margin"
                 )
             shapes[i, packing.ORIGIN : packing.ORIGIN + 3] = torch.as_tensor(shape.origin, dtype=torch.float64)
             shapes[i, packing.SPACING] = shape.spacing
@@ -210,12 +216,14 @@ def _collider(item: Mapping, where: str) -> Collider:
     try:
         if kind == "mesh":
             options = {key: float(item[key]) for key in extra if item.get(key) is not None}
-            options.setdefault("margin", 2.0 * float(item.get("thickness", 0.0)) or None)
+            if "thickness" in item:
+                options.setdefault("margin", 2.0 * float(item["thickness"]))
             shape = field_of_mesh(Path(item["path"]), **options)
         else:
             shape = make(*(tuple(map(float, item[k])) if k == "size" else float(item[k]) for k in needed))
         motion = _motion(item)
-        friction, thickness = float(item.get("friction", 0.0)), float(item.get("thickness", 0.0))
+        friction = float(item.get("friction", 0.0))
+        thickness = float(item["thickness"]) if "thickness" in item else None
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from error
     return Collider(shape, item.get("mode", "sticky"), friction, motion, thickness, str(item.get("name", "")))

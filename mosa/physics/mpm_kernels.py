@@ -16,7 +16,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from mosa.physics.boundary import make_plane_functions
+from mosa.physics.boundary import make_fade, make_plane_functions
 from mosa.physics.vector_memory import vector_memory
 
 # slots of the flag array: the first substep * N + particle at which the event happened
@@ -38,6 +38,7 @@ def transfer_kernels(scalar) -> SimpleNamespace:
     vec4 = wp.types.vector(length=4, dtype=scalar)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
     collide, adj_collide = make_plane_functions(scalar)
+    fade = make_fade(scalar)
     memory = vector_memory(scalar)
     load3, load4, store3, store4, add3, add4 = (
         memory.load3, memory.load4, memory.store3, memory.store4, memory.add3, memory.add4
@@ -135,9 +136,11 @@ def transfer_kernels(scalar) -> SimpleNamespace:
         return dx * vec3(scalar(origin[0] + i), scalar(origin[1] + j), scalar(origin[2] + k))
 
     @wp.func
-    def inside(y: vec3, planes: wp.array2d(dtype=scalar), i: int):
+    def touch(y: vec3, planes: wp.array2d(dtype=scalar), i: int):
+        """Weight of plane i's contact of a node at y."""
         normal = vec3(planes[i, 0], planes[i, 1], planes[i, 2])
-        return wp.dot(y, normal) - planes[i, 3] <= scalar(1.0e-6)
+        w, _slope = fade(wp.dot(y, normal) - planes[i, 3], planes[i, 5])
+        return w
 
     @wp.func
     def contact(
@@ -146,8 +149,13 @@ def transfer_kernels(scalar) -> SimpleNamespace:
         """Velocity after the first `count` planes."""
         r = u
         for i in range(count):
-            if inside(y, planes, i):
-                r = collide(r, vec3(planes[i, 0], planes[i, 1], planes[i, 2]), modes[i], planes[i, 4])
+            w = touch(y, planes, i)
+            if w > scalar(0.0):
+                hit = collide(r, vec3(planes[i, 0], planes[i, 1], planes[i, 2]), modes[i], planes[i, 4])
+                if w < scalar(1.0):
+                    r = r + w * (hit - r)
+                else:
+                    r = hit
         return r
 
     @wp.func
@@ -157,10 +165,11 @@ def transfer_kernels(scalar) -> SimpleNamespace:
         a = seed
         for reverse in range(count):
             i = count - 1 - reverse
-            if inside(y, planes, i):
+            w = touch(y, planes, i)
+            if w > scalar(0.0):
                 before = contact(u, y, planes, modes, i)
                 normal = vec3(planes[i, 0], planes[i, 1], planes[i, 2])
-                a = adj_collide(before, normal, modes[i], planes[i, 4], a)
+                a = (scalar(1.0) - w) * a + adj_collide(before, normal, modes[i], planes[i, 4], w * a)
         return a
 
     @wp.func

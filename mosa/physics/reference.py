@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.physics.boundary import Plane
+from mosa.physics.boundary import THICKNESS, WHOLE, Plane
 from mosa.types import ParticleState
 
 EYE = torch.eye(3, dtype=torch.float64)
@@ -183,12 +183,21 @@ def stiffened_stress(law: str, measure: str, F: Tensor, p: dict[str, Tensor], S:
     return stress(law, F, p) + slope @ F.mT
 
 
-def collide(v: Tensor, y: Tensor, planes: Sequence[Plane]) -> Tensor:
+def fade(phi: Tensor, thickness: float) -> Tensor:
+    """Weight of the contact of nodes at distances phi (M,) [m]: 1 up to `WHOLE` of the thickness, then a smooth step to 0."""
+    if thickness == 0:
+        return (phi <= 1e-6).to(phi)
+    s = ((phi / thickness - WHOLE) / (1 - WHOLE)).clamp(0, 1)
+    return torch.where(phi <= 1e-6, torch.ones_like(phi), (1 - s) ** 2 * (1 + 2 * s))
+
+
+def collide(v: Tensor, y: Tensor, planes: Sequence[Plane], dx: float) -> Tensor:
     """Node velocities (M, 3) after contact; y: (M, 3) node positions [m]."""
     for plane in planes:
         n = torch.tensor(plane.normal, dtype=torch.float64)
         n = n / n.norm()
-        inside = (y - torch.tensor(plane.point, dtype=torch.float64)) @ n <= 1e-6
+        thickness = plane.thickness if plane.thickness is not None else THICKNESS * dx * (plane.friction > 0)
+        w = fade((y - torch.tensor(plane.point, dtype=torch.float64)) @ n, thickness)
         un = v @ n
         tangential = v - un[:, None] * n
         if plane.mode == "sticky":
@@ -200,7 +209,7 @@ def collide(v: Tensor, y: Tensor, planes: Sequence[Plane]) -> Tensor:
             keep = (length + plane.friction * un).clamp_min(0) / torch.where(length > 0, length, torch.ones_like(length))
             sliding = keep[:, None] * tangential if plane.friction > 0 else tangential
             after = torch.where((un < 0)[:, None], sliding, v)
-        v = torch.where(inside[:, None], after, v)
+        v = v + w[:, None] * (after - v)
     return v
 
 
@@ -236,7 +245,7 @@ def substep(law: str, state: ParticleState, p: dict[str, Tensor], volume: Tensor
     grid_v = grid_v + dt * torch.as_tensor(gravity, dtype=torch.float64)
     axes = torch.meshgrid(*(torch.arange(s) for s in size), indexing="ij")
     y = dx * (torch.stack(axes, -1).reshape(-1, 3) + low).double()
-    grid_v = torch.where(occupied[:, None], collide(grid_v, y, planes), torch.zeros_like(grid_v))
+    grid_v = torch.where(occupied[:, None], collide(grid_v, y, planes, dx), torch.zeros_like(grid_v))
     new_v, new_C = torch.zeros_like(v), torch.zeros_like(C)
     for index, w, arm in stencil:
         u = w[:, None] * grid_v[index]

@@ -99,9 +99,9 @@ class Simulator:
         if up is None:
             up = -gravity / gravity.norm() if gravity.norm() > 0 else torch.tensor([0.0, 1.0, 0.0])
         all_planes = ([ground_plane(ground, up)] if ground is not None else []) + list(planes)
-        values, modes = pack_planes(all_planes, dtype, self.device)
+        values, modes = pack_planes(all_planes, dtype, self.device, float(dx))
         self.colliders = tuple(colliders)
-        packed_colliders = pack_colliders(self.colliders, dtype, self.device) if self.colliders else None
+        packed_colliders = pack_colliders(self.colliders, dtype, self.device, float(dx)) if self.colliders else None
         if box is None:
             low, high = (-_UNBOUNDED,) * 3, (_UNBOUNDED,) * 3
         else:

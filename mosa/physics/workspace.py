@@ -31,7 +31,7 @@ SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
 @dataclass(frozen=True)
 class Numerics:
     """What is constant over a rollout and the same in all worlds, but for gravity where each has its own. dx [m], dt [s] where the
-    step is fixed, gravity (3,) [m/s^2], planes (P, 5) and modes (P,) from `pack_planes`, low and high (3,) [m] corners of the
+    step is fixed, gravity (3,) [m/s^2], planes (P, 6) and modes (P,) from `pack_planes`, low and high (3,) [m] corners of the
     admissible domain, norm_eps under the root of yield norms, colliders None where there are none, strain: measure of an operator
     that is a stiffness (`stress_kernel`), None for one that acts on the stress."""
 

@@ -64,8 +64,7 @@ def object_geometry(
 
     Errors: DataError (empty mattes, empty hull).
     """
-    parts = {"resolution": settings.resolution, "ridge_passes": settings.ridge_passes, "margin": settings.margin}
-    cache = _open_cache(cache_dir, scene, parts | {"geometry": asdict(settings.geometry)}, 0, free=scene.last_free_frame)
+    cache = _geometry_cache(scene, settings, cache_dir)
 
     def stage() -> dict[str, Any]:
         found = find_geometry(
@@ -108,6 +107,23 @@ def filling_spacing(body: Volume, particles: int | None, *, per_cell: float = PE
         particles = particles_for(lambda spacing: fill(body, spacing=spacing).positions, volume, per_cell=per_cell, least=FEW,
                                   most=max(most, FEW))
     return (volume / particles) ** (1 / 3)
+
+
+def stored(
+    scene: Scene, spacing: Callable[[], float], settings: ReconstructionSettings, *, cache_dir: str | Path, seed: int = 0
+) -> bool:
+    """Whether the cache has the motion of `scene`, the last stage of its reconstruction. spacing: gives that of the particles [m],
+    and is asked where the body it follows from is in the cache."""
+    folder = _geometry_cache(scene, settings, cache_dir).folder
+    if folder is None or settings.splats is not None or not (folder / "geometry.pt").is_file():
+        return False
+    folder = _open_cache(cache_dir, scene, asdict(settings), seed, spacing=spacing()).folder
+    return folder is not None and (folder / "motion.pt").is_file()
+
+
+def _geometry_cache(scene: Scene, settings: ReconstructionSettings, cache_dir: str | Path | None) -> StageCache:
+    parts = {"resolution": settings.resolution, "ridge_passes": settings.ridge_passes, "margin": settings.margin}
+    return _open_cache(cache_dir, scene, parts | {"geometry": asdict(settings.geometry)}, 0, free=scene.last_free_frame)
 
 
 def _open_cache(cache_dir: str | Path | None, scene: Scene, settings: Mapping[str, Any], seed: int, **more: Any) -> StageCache:

@@ -5,7 +5,7 @@ import torch
 import warp as wp
 
 from mosa.errors import ConfigError
-from mosa.physics.boundary import MODES, Plane, ground_plane, make_plane_functions, pack_planes
+from mosa.physics.boundary import MODES, THICKNESS, Plane, ground_plane, make_plane_functions, pack_planes
 from mosa.types import Ground
 
 collide, adj_collide = make_plane_functions(wp.float64)
@@ -68,8 +68,8 @@ def test_adjoint(mode, friction):
 def test_ground_is_below_its_height_along_up():
     plane = ground_plane(Ground(0.3, "separate", 0.2), torch.tensor([0.0, 0.0, 2.0]))
     assert plane.point == pytest.approx((0, 0, 0.3)) and plane.normal == pytest.approx((0, 0, 1))
-    values, modes = pack_planes([plane], torch.float64, torch.device("cpu"))
-    torch.testing.assert_close(values, torch.tensor([[0, 0, 1, 0.3, 0.2]]).double())
+    values, modes = pack_planes([plane], torch.float64, torch.device("cpu"), 0.1)
+    torch.testing.assert_close(values, torch.tensor([[0, 0, 1, 0.3, 0.2, THICKNESS * 0.1]]).double())
     assert modes.tolist() == [2]
 
 
@@ -80,8 +80,9 @@ def test_ground_is_below_its_height_along_up():
         (Plane((0, 0, 0), UP, "separate", -1.0), "friction"),
         (Plane((0, 0, 0), UP, "slip", 0.5), "separate only"),
         (Plane((0, 0, 0), (0, 0, 0)), "normal"),
+        (Plane((0, 0, 0), UP, "separate", 0.1, -1.0), "thickness"),
     ],
 )
 def test_errors(plane, match):
     with pytest.raises(ConfigError, match=match):
-        pack_planes([plane], torch.float64, torch.device("cpu"))
+        pack_planes([plane], torch.float64, torch.device("cpu"), 0.1)

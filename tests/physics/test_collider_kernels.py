@@ -43,7 +43,7 @@ def nodes():
 
 
 def arguments(threads, colliders, mass, poses):
-    packed = pack_colliders(colliders, torch.float64, torch.device("cpu"))
+    packed = pack_colliders(colliders, torch.float64, torch.device("cpu"), 0.1)
     grid = torch.cat([torch.zeros(COUNT, 3).double(), mass[:, None]], 1)
     kinds = (VEC3, MAT33, VEC3, VEC3)
     # poses are those of substep 2 of 3

@@ -47,13 +47,15 @@ def acceleration(times, position):
     return float(torch.linalg.lstsq(A, position).solution[2])
 
 
-@pytest.mark.parametrize("mode, friction", [("sticky", 0.0), ("slip", 0.0), ("separate", 0.0), ("separate", 0.4)])
-def test_a_resting_half_space_or_box_is_the_plane(mode, friction, make_block):
+@pytest.mark.parametrize("mode, friction, thickness", [("sticky", 0.0, 0.0), ("slip", 0.0, 0.0), ("separate", 0.0, 0.0),
+                                                       ("separate", 0.4, 0.0), ("separate", 0.4, None), ("slip", 0.0, 0.05)])
+def test_a_resting_half_space_or_box_is_the_plane(mode, friction, thickness, make_block):
     state = make_block()
-    plane = rollout(state, planes=[Plane((0, 0, 0), (0, 1, 0), mode, friction)], gravity=(0.0, -9.8, 0.0))
+    plane = rollout(state, planes=[Plane((0, 0, 0), (0, 1, 0), mode, friction, thickness)], gravity=(0.0, -9.8, 0.0))
     turned = Motion(rotation=(-math.pi / 2, 0.0, 0.0))
     slab = Motion(position=(0.0, -1.0, 0.0))
-    for collider in (Collider(HalfSpace(), mode, friction, turned), Collider(Box((9.0, 2.0, 9.0)), mode, friction, slab)):
+    for collider in (Collider(HalfSpace(), mode, friction, turned, thickness),
+                     Collider(Box((9.0, 2.0, 9.0)), mode, friction, slab, thickness)):  # fmt: skip
         found = rollout(state, [collider], gravity=(0.0, -9.8, 0.0))
         torch.testing.assert_close(found.x, plane.x, rtol=0, atol=1e-14)
     free = rollout(state, gravity=(0.0, -9.8, 0.0))
@@ -141,7 +143,7 @@ def test_body_flows_around_and_does_not_enter():
     it passes through."""
     x = lattice((0.24, 0.24, 0.24)) + torch.tensor([0.0, 0.0, 0.28]).double()
     shapes = [(Sphere(0.12), Motion((0.02, 0.0, 0.0))), (Capsule(0.08, 0.3), Motion((-0.12, 0.0, 0.02), (math.pi / 2, 0.0, 0.0)))]
-    colliders = [Collider(shape, "separate", 0.1, motion) for shape, motion in shapes]
+    colliders = [Collider(shape, "separate", 0.1, motion, thickness=0.0) for shape, motion in shapes]
     mu, lam = lame(torch.tensor(2e4).double(), torch.tensor(0.3).double())
     soft = {"frames": 26, "law": "von_mises", "parameters": {"mu": mu, "lam": lam, "yield_stress": 500.0}}
     result, passed = (rollout(at_rest(x, (0.0, 0.0, -1.5)), solid, **soft) for solid in (colliders, []))
@@ -178,7 +180,7 @@ def test_block_slips_at_the_friction_angle(turn):
 
 def test_sphere_rolls_down_an_incline():
     """5/7 g sin(angle) without slipping. The grid holds the sphere up half a cell early, so it rolls on a radius larger by that:
-    1/(1 + 2/5 (R/h)^2) with h the height of its centre, which is matched to 3 %."""
+    1/(1 + 2/5 (R/h)^2) with h the height of its centre, which is matched to 3 %. A contact that fades in would brake it."""
     cells, radius, angle = 7, 0.1, math.radians(20)
     dx = radius / cells
     x = lattice((2.4 * radius,) * 3, dx / 2)
@@ -187,7 +189,7 @@ def test_sphere_rolls_down_an_incline():
     substeps = required_substeps(float(lam + 2 * mu), DENSITY, 0.02, dx, 3.0)
     simulator = Simulator("neo_hookean", dx=dx, substeps=substeps, frame_dt=0.02, dtype=torch.float32,
                           gravity=(9.8 * math.sin(angle), 0.0, -9.8 * math.cos(angle)),
-                          colliders=[Collider(HalfSpace(), "separate", 0.6)])  # fmt: skip
+                          colliders=[Collider(HalfSpace(), "separate", 0.6, thickness=0.0)])  # fmt: skip
     start = at_rest(x)
     start = ParticleState(*(getattr(start, k).float() for k in ("x", "v", "C_affine", "F", "F_tot")))
     result = simulator.rollout(start, {"mu": mu, "lam": lam}, torch.full((len(x),), (dx / 2) ** 3), DENSITY, 26)
@@ -294,7 +296,7 @@ def test_thickness_makes_a_flat_face_differentiable_in_position():
     x = lattice((0.12, 0.12, 0.12)) + torch.tensor([0.0, 0.0, 0.07]).double()
     gradients = []
     for thickness in (0.0, DX):
-        height = torch.tensor([0.0, 0.0, -0.01], dtype=torch.float64, requires_grad=True)
+        height = torch.tensor([0.0, 0.0, -0.025], dtype=torch.float64, requires_grad=True)
         collider = Collider(HalfSpace(), "separate", 0.0, Motion(height), thickness)
         result = rollout(at_rest(x, (0.0, 0.0, -1.0)), [collider])
         gradients.append(float(torch.autograd.grad(result.x[-1][:, 2].mean(), height)[0][2]))
@@ -318,7 +320,7 @@ def test_continued_rollout_takes_the_motion_up(make_block):
 
 
 def test_domain_walls_keep_a_body_in():
-    walls = domain_walls(torch.tensor([[-0.2, -0.2, -0.2], [0.2, 0.2, 0.2]]), "separate", 0.1)
+    walls = domain_walls(torch.tensor([[-0.2, -0.2, -0.2], [0.2, 0.2, 0.2]]), "separate")
     result = rollout(at_rest(lattice((0.12, 0.12, 0.12)), (3.0, -2.0, -1.0)), planes=walls, frames=16)
     assert result.x.abs().max() < 0.2 + 0.5 * DX
     assert result.x[:, :, 0].max() > 0.15 and result.v[-1][:, 0].mean() < 2.0

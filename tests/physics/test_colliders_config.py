@@ -26,7 +26,7 @@ def test_every_type(tmp_path):
             {"time": 0.0, "position": [0, 0, 0]}, {"time": 1.0, "position": [0, 0, 1], "rotation": [1, 0, 0, 90]}]}},
         {"type": "mesh", "path": str(tmp_path / "cube.obj"), "spacing": 0.1, "scale": 2.0, "thickness": 0.3},
     ])  # fmt: skip
-    pack_colliders(made, torch.float32, torch.device("cpu"))
+    pack_colliders(made, torch.float32, torch.device("cpu"), 0.1)
     plane, sphere, capsule, roll, box, mesh = made
     assert plane.mode == "separate" and plane.friction == 0.3
     up = plane.motion.sample(1, 1, 0.1)[1][0] @ torch.tensor([0.0, 0.0, 1.0]).double()
@@ -98,7 +98,7 @@ def test_errors_of_a_configuration(item, match):
 )
 def test_packing_errors(collider, match):
     with pytest.raises(ConfigError, match=match):
-        pack_colliders([collider], torch.float64, torch.device("cpu"))
+        pack_colliders([collider], torch.float64, torch.device("cpu"), 0.1)
 
 
 def test_motions_of_another_number(make_block):

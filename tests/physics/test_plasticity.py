@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError
+from mosa.physics import reference
 from mosa.physics.particle_operations import first_advance
 from mosa.physics.plasticity import friction_alpha
 from mosa.physics.rollout import Simulator
@@ -158,3 +159,18 @@ def test_gradient_is_finite_at_rest(law):
 def test_friction_alpha():
     s = math.sin(math.radians(40.0))
     assert float(friction_alpha(torch.tensor(40.0).double())) == pytest.approx(math.sqrt(2 / 3) * 2 * s / (3 - s))
+
+
+@pytest.mark.parametrize("angle", [20.0, 30.0])
+def test_drucker_prager_is_steeper_in_plane_strain(angle):
+    """A friction angle is that of triaxial compression: sheared in plane strain until it flows, the law's stresses reach
+    sin = 2 sqrt(3) sin(angle)/(3 - sin(angle)), 43.9 degrees for 30, which is what a sand column in a channel feels."""
+    s = math.sin(math.radians(angle))
+    numbers = {"mu": 2e5, "lam": 3e5, "friction_alpha": math.sqrt(2 / 3) * 2 * s / (3 - s), "cohesion": 0.0}
+    p = {name: torch.tensor(value, dtype=torch.float64) for name, value in numbers.items()}
+    F = math.exp(-0.01) * torch.eye(3, dtype=torch.float64)[None]
+    shear = torch.diag(torch.tensor([math.exp(-1e-4), math.exp(1e-4), 1.0], dtype=torch.float64))
+    for _ in range(1000):
+        F = reference.return_map("drucker_prager", shear @ F, p)
+    first, second, _ = reference.stress("drucker_prager", F, p)[0].diagonal().tolist()
+    assert (second - first) / -(first + second) == pytest.approx(2 * math.sqrt(3) * s / (3 - s), rel=2e-3)

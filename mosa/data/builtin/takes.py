@@ -60,6 +60,14 @@ def cameras_of(body: BuiltinObject, seed: int) -> Cameras:
     )  # fmt: skip
 
 
+def take_file(name: str, sequence: str, material: str, seed: int, cache: str | Path | None = None) -> Path:
+    """Where a take lies once it has been made."""
+    hidden = object_named(name).material.variant(material)
+    key = hashlib.sha256(repr((VERSION, object_named(name), hidden, drop_named(name, sequence), seed)).encode()).hexdigest()[:12]
+    folder = Path(cache) if cache is not None else default_cache()
+    return folder / "builtin" / f"{name}-{sequence}-{material}-{seed}-{key}.npz"
+
+
 def make(
     name: str,
     sequence: str,
@@ -73,11 +81,7 @@ def make(
 
     Errors: ConfigError for an unknown name, sequence or material, or a cache folder that cannot be written.
     """
-    body, drop = object_named(name), drop_named(name, sequence)
-    hidden = body.material.variant(material)
-    key = hashlib.sha256(repr((VERSION, body, hidden, drop, seed)).encode()).hexdigest()[:12]
-    folder = Path(cache) if cache is not None else default_cache()
-    file = folder / "builtin" / f"{name}-{sequence}-{material}-{seed}-{key}.npz"
+    file = take_file(name, sequence, material, seed, cache)
     kept = read_take(file)
     if kept is not None:
         return kept
