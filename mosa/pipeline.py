@@ -398,10 +398,9 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     simulate = plain(cfg.simulate)
     if any(simulate[k] is not None for k in ("velocity", "rotation", "position", "height", "angular_velocity", "colliders")):
         rollout = twin.simulate(**simulate, progress=True)
-        log.info("simulated %d frames into %s", len(rollout.x), twin.export(rollout, folder))
         given = simulate["colliders"]
         solids = twin.world.colliders if given is None else colliders_from_config(given, "simulate.colliders")
-        save_rollout(folder / "rollout.npz", {"simulation": rollout}, solids)  # with what colliders did and felt
+        log.info("simulated %d frames into %s", len(rollout.x), twin.export(rollout, folder, colliders=solids))
         return None
     scene, held_out = scenes(evaluated_scene(cfg, twin))
     body, world = twin.body, twin.world

@@ -36,6 +36,7 @@ from mosa.physics.colliders import Collider, colliders_from_config
 from mosa.prediction import total_spread
 from mosa.progress import tqdm
 from mosa.rendering.cameras import look_at
+from mosa.rollout_file import save_rollout
 from mosa.schema import is_number
 from mosa.types import Cameras, MotionCues, Rollout
 
@@ -227,13 +228,14 @@ class Twin:
 
     def export(
         self, rollout: Rollout, folder: str | Path, *, video: bool = True, title: str = "learned twin",
-        formats: Sequence[str] = ("ply",),
+        formats: Sequence[str] = ("ply",), colliders: Sequence[Collider] = (),
     ) -> Path:  # fmt: skip
-        """Write `rollout.npz`, one PLY a frame (x y z red green blue), `simulation.mp4` and the Gaussians that its images show in
-        `formats` (`data.splat_files.FORMATS`: 3DGS PLY, splat, spz, usd) below `splats/` into `folder`."""
+        """Write `rollout.npz` (with the poses of `colliders`, those of the rollout, where they are given), one PLY a frame (x y z red
+        green blue), `simulation.mp4` and the Gaussians that its images show in `formats` (`data.splat_files.FORMATS`: 3DGS PLY,
+        splat, spz, usd) below `splats/` into `folder`."""
         folder = Path(folder)
         (folder / "ply").mkdir(parents=True, exist_ok=True)
-        save_rollout(folder / "rollout.npz", {"simulation": rollout})
+        save_rollout(folder / "rollout.npz", {"simulation": rollout}, colliders)
         for t, x in enumerate(rollout.x.cpu().numpy()):
             write_ply(folder / "ply" / f"{t:03d}.ply", x, self.body.colors.cpu().numpy())
         save_frames(seen(self.body, rollout.x, rollout.F_tot), folder / "splats", formats, rate=1 / self.frame_dt, up=self.world.up)
@@ -405,14 +407,6 @@ def vector(name: str, value: Sequence[float]) -> Tensor:
     if result.shape != (3,) or float(result.detach().abs().max()) > FASTEST:
         raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}")
     return result
-
-
-def save_rollout(path: str | Path, parts: dict[str, Rollout]) -> None:
-    """npz with x [T, N, 3], F and F_tot [T, N, 3, 3], times [T] and counts [T - 1] (substeps) under `<name>/...`."""
-    save_parts(path, {
-        name: {"x": r.x, "F": r.F, "F_tot": r.F_tot, "times": r.times, "counts": torch.tensor(r.counts, dtype=torch.int64)}
-        for name, r in parts.items()
-    })  # fmt: skip
 
 
 def save_observed(path: str | Path, parts: dict[str, MotionCues]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -63,6 +63,11 @@ class Adapter(nn.Module):
         self.register_buffer("poisson", torch.tensor(float("nan")))
         self._last: tuple[Tensor, Tensor, Tensor] | None = None
 
+    replaces_law = False
+    """Whether nothing of the prior is left in the answer: its stage then holds the prior's parameters, which would only drift."""
+    chained = True
+    """Whether evaluations may be captured into a CUDA graph together with the substeps between them."""
+
     @property
     def steady(self) -> bool:
         """Whether the operator is the same in every state, so that one evaluation serves a whole rollout."""
@@ -71,6 +76,12 @@ class Adapter(nn.Module):
     def stiffening(self, poisson: Tensor | float) -> float:
         """Modulus over the prior's that the time step allows for; poisson: the prior's."""
         return ADAPTER_MARGIN
+
+    def prepare(self, law: str, states: Callable[[Tensor], MaterialState]) -> None:
+        """Called once, after `switch_on`, when the adapter's stage begins: networks that stand in for the prior start from it.
+
+        law: the prior's name; states: of `mosa.modules.material.material_states`, at its calibrated parameters.
+        Errors: ConfigError where the adapter cannot be used with this law."""
 
     def follow(self, poisson: Tensor) -> None:
         """Told before every rollout: the prior's Poisson number at that moment, (), with its graph."""
@@ -114,7 +125,7 @@ class Adapter(nn.Module):
 class StressAdapter(Adapter):
     """The paper's adapter. `forward` answers the simulator with an operator that is exact at the state it was asked at.
 
-    alpha, l_max (dimensionless): bounds, see `ProgressiveOperator`; input_scale: factor of what the networks read;
+    alpha, alpha_normal, l_max (dimensionless): bounds, see `ProgressiveOperator`; input_scale: factor of what the networks read;
     rest_free: an undeformed body stays stress-free, exactly (the paper's literal form: false);
     plastic: a second set of networks corrects the strain in the yield function;
     major_symmetry: a projection after which a constant operator has an energy; state_dependence: full | constant;
@@ -126,14 +137,16 @@ class StressAdapter(Adapter):
     """
 
     def __init__(
-        self, *, alpha: float = 0.1, l_max: float | None = 0.1, input_scale: float = 10.0, hidden: int = 64,
-        rest_free: bool = True, plastic: bool = False, major_symmetry: bool = False, state_dependence: str = "full",
-        recompute: bool = False, fused: bool | str = "auto", precision: str = "accurate",
+        self, *, alpha: float = 0.1, alpha_normal: float | None = None, l_max: float | None = 0.1, input_scale: float = 10.0,
+        hidden: int = 64, rest_free: bool = True, plastic: bool = False, major_symmetry: bool = False,
+        state_dependence: str = "full", recompute: bool = False, fused: bool | str = "auto", precision: str = "accurate",
         no_C: bool = False, no_pre: bool = False, no_post: bool = False, no_prior_stress: bool = False,
     ) -> None:  # fmt: skip
         super().__init__()
         if not 0 < alpha < 1:
             raise ConfigError(f"adapter.alpha: expected a number between 0 and 1, found {alpha}")
+        if alpha_normal is not None and not 0 < alpha_normal < 1:
+            raise ConfigError(f"adapter.alpha_normal: expected a number between 0 and 1 or null, found {alpha_normal}")
         check_network(l_max, input_scale, hidden)
         if state_dependence not in ("full", "constant"):
             raise ConfigError(f"adapter.state_dependence: expected full or constant, found {state_dependence!r}")
@@ -141,8 +154,8 @@ class StressAdapter(Adapter):
             raise ConfigError("adapter: no_prior_stress needs L_pre (no_pre=false): the stress comes from it alone")
         check_options(fused, precision)
         self.rest_free, self.recompute, self.fused, self.precision = rest_free, recompute, fused, precision
-        shape = {"alpha": alpha, "input_scale": input_scale, "hidden": hidden, "state_dependence": state_dependence}
-        shape |= {"no_C": no_C, "no_pre": no_pre, "no_post": no_post}
+        shape = {"alpha": alpha, "alpha_normal": alpha_normal, "input_scale": input_scale, "hidden": hidden}
+        shape |= {"state_dependence": state_dependence, "no_C": no_C, "no_pre": no_pre, "no_post": no_post}
         bound = None if no_prior_stress else l_max  # without the prior the residuals have to carry the whole stress
         self.operator = ProgressiveOperator(l_max=bound, major_symmetry=major_symmetry, no_prior_stress=no_prior_stress, **shape)
         # C0 is a stiffness: it has no meaning for the strain in the yield function
@@ -161,8 +174,15 @@ class StressAdapter(Adapter):
         if self.operator.no_C or self.operator.no_prior_stress:
             return ADAPTER_MARGIN
         if not self.operator.constant:
-            return worst_stiffening(self.operator.alpha)
+            return worst_stiffening(max(self.operator.alpha, self.operator.alpha_normal))
         return max(ADAPTER_MARGIN, acoustic_stiffening(self.operator.constant_operator(), poisson))
+
+    def prepare(self, law: str, states: Callable[[Tensor], MaterialState]) -> None:
+        """Without the prior stress, L_pre starts as the prior (`warm_start`)."""
+        if self.operator.no_prior_stress:
+            from mosa.modules.warm_start import warm_start
+
+            warm_start(self, states)
 
     def affine(self, operator: ProgressiveOperator, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Correction]:
         """(A - I (N, 6, 6), b (N, 6), parts) of d(w, s) = (A - I) s + b, the rest term included."""
