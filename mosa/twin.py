@@ -230,9 +230,9 @@ class Twin:
         self, rollout: Rollout, folder: str | Path, *, video: bool = True, title: str = "learned twin",
         formats: Sequence[str] = ("ply",), colliders: Sequence[Collider] = (),
     ) -> Path:  # fmt: skip
-        """Write `rollout.npz` (with the poses of `colliders`, those of the rollout, where they are given), one PLY a frame (x y z red
-        green blue), `simulation.mp4` and the Gaussians that its images show in `formats` (`data.splat_files.FORMATS`: 3DGS PLY,
-        splat, spz, usd) below `splats/` into `folder`."""
+        """Write `rollout.npz` (with the poses of `colliders`, those of the rollout, where they are given), one PLY a frame (x y z
+        red green blue), `simulation.mp4` and the Gaussians that its images show in `formats` (`data.splat_files.FORMATS`: 3DGS
+        PLY, splat, spz, usd) below `splats/` into `folder`."""
         folder = Path(folder)
         (folder / "ply").mkdir(parents=True, exist_ok=True)
         save_rollout(folder / "rollout.npz", {"simulation": rollout}, colliders)
