@@ -246,7 +246,7 @@ def hidden_figures(body: Body, scene: Scene, figures: Mapping[str, float]) -> di
 def law_figures(body: Body) -> dict[str, float]:
     """What the learned law is like by itself: its stiffest direction, and whether it makes energy (with a warning)."""
     adapter, material = body.adapter, body.material
-    if adapter is None or not adapter.is_on:
+    if adapter is None or not adapter.is_on or hasattr(adapter, "simulator"):  # which brings no law
         return {}
     figures = {}
     adapter.follow(material.poisson())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -63,6 +63,11 @@ class Adapter(nn.Module):
         self.register_buffer("poisson", torch.tensor(float("nan")))
         self._last: tuple[Tensor, Tensor, Tensor] | None = None
 
+    replaces_law = False
+    """Whether nothing of the prior is left in the answer: its stage then holds the prior's parameters, which would only drift."""
+    chained = True
+    """Whether evaluations may be captured into a CUDA graph together with the substeps between them."""
+
     @property
     def steady(self) -> bool:
         """Whether the operator is the same in every state, so that one evaluation serves a whole rollout."""
@@ -71,6 +76,12 @@ class Adapter(nn.Module):
     def stiffening(self, poisson: Tensor | float) -> float:
         """Modulus over the prior's that the time step allows for; poisson: the prior's."""
         return ADAPTER_MARGIN
+
+    def prepare(self, law: str, states: Callable[[Tensor], MaterialState]) -> None:
+        """Called once, after `switch_on`, when the adapter's stage begins: networks that stand in for the prior start from it.
+
+        law: the prior's name; states: of `mosa.modules.material.material_states`, at its calibrated parameters.
+        Errors: ConfigError where the adapter cannot be used with this law."""
 
     def follow(self, poisson: Tensor) -> None:
         """Told before every rollout: the prior's Poisson number at that moment, (), with its graph."""
@@ -163,6 +174,13 @@ class StressAdapter(Adapter):
         if not self.operator.constant:
             return worst_stiffening(self.operator.alpha)
         return max(ADAPTER_MARGIN, acoustic_stiffening(self.operator.constant_operator(), poisson))
+
+    def prepare(self, law: str, states: Callable[[Tensor], MaterialState]) -> None:
+        """Without the prior stress, L_pre starts as the prior (`warm_start`)."""
+        if self.operator.no_prior_stress:
+            from mosa.modules.warm_start import warm_start
+
+            warm_start(self, states)
 
     def affine(self, operator: ProgressiveOperator, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Correction]:
         """(A - I (N, 6, 6), b (N, 6), parts) of d(w, s) = (A - I) s + b, the rest term included."""

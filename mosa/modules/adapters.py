@@ -14,6 +14,9 @@ ADAPTERS = {
     "hyperelastic": "mosa.modules.hyperelastic:HyperelasticAdapter",
     "stress": "mosa.modules.adapter:StressAdapter",
     "direct": "mosa.modules.direct:DirectAdapter",
+    "nclaw": "mosa.modules.nclaw:NeuralLaw",
+    "neuma": "mosa.modules.neuma:LowRankLaw",
+    "interaction": "mosa.modules.interaction:InteractionNetwork",
 }
 """adapter.name -> module:class. A new adapter is one class whose keyword arguments are the keys of its YAML, and one line here."""
 

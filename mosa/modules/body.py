@@ -228,6 +228,8 @@ class Body(nn.Module):
         self.material, self.heterogeneity, self.adapter = material, heterogeneity, adapter
         if isinstance(heterogeneity, StiffnessModes):
             heterogeneity.settle(self.rest)
+        if (settle := getattr(adapter, "settle", None)) is not None:
+            settle(self.rest, self.volume)
         # the calibrated backbones that every later figure is compared with; filled when their stage ends
         self.contact = ContactOffset(settings.dx, settings.contact_offset)
         backbone = nn.ModuleDict({"material": material, "contact": self.contact})
@@ -383,6 +385,11 @@ class Body(nn.Module):
             )  # fmt: skip
             state = self.initial_state(start, frame_dt / substeps, gravity)
         lift = contact() * up
+        if (own := getattr(adapter, "simulator", None)) is not None:  # no law on a grid: the adapter brings its dynamics
+            simulator, lift, timing = own(self.density, world, frame_dt), torch.zeros_like(lift), {}
+            state = self.initial_state(start, frame_dt / simulator.substeps, gravity)
+        else:
+            simulator = self.simulator(material.law, substeps, frame_dt, world, getattr(adapter, "strain", None))
         state = replace(state, x=state.x + lift)
         state = ParticleState(*(getattr(state, name).to(dtype) for name in ("x", "v", "C_affine", "F", "F_tot")))
         arguments = {
@@ -390,7 +397,6 @@ class Body(nn.Module):
             "density": self.density, "adapter": adapter,
             "stride": None if adapter is not None and adapter.steady else self.settings.stride,
         }  # fmt: skip
-        simulator = self.simulator(material.law, substeps, frame_dt, world, getattr(adapter, "strain", None))
         return Ready(simulator, state, lift, arguments, timing)
 
     def simulator(self, law: str, substeps: int, frame_dt: float, world: World, strain: str | None = None) -> Simulator:

@@ -21,7 +21,6 @@ from mosa.modules.material import material_states
 from mosa.modules.observer import deformed_covariances, observe
 from mosa.modules.restorable import Restorable
 from mosa.modules.stages import Stage
-from mosa.modules.warm_start import warm_start
 from mosa.types import MotionCues, Rollout
 
 MISFIT = 0.01
@@ -116,7 +115,9 @@ class LitMosa(Restorable, L.LightningModule):
     def groups(self, stage: Stage) -> list[dict]:
         """Parameter groups of a stage; `rate` keeps the learning rate before decay."""
         body = self.body
-        groups = [{"params": [p for p in body.material.parameters() if p.requires_grad], "rate": stage.lr, "name": "material"}]
+        replaced = stage.name == "joint" and body.adapter is not None and body.adapter.replaces_law
+        learned = [] if replaced else [p for p in body.material.parameters() if p.requires_grad]
+        groups = [{"params": learned, "rate": stage.lr, "name": "material"}]
         if body.contact.enabled:
             groups.append({"params": list(body.contact.parameters()), "rate": stage.lr_contact, "name": "contact"})
         if stage.name != "prior" and body.heterogeneity is not None:
@@ -315,9 +316,8 @@ class LitMosa(Restorable, L.LightningModule):
         adapter, material = self.body.adapter, self.body.material
         if stage.name == "joint" and adapter is not None:
             adapter.switch_on(material.reference_modulus(), material.poisson())
-            if getattr(getattr(adapter, "operator", None), "no_prior_stress", False):
-                parameters = {k: v.detach() for k, v in material.per_particle(1.0).items()}
-                warm_start(adapter, material_states(material.law, parameters))
+            parameters = {k: v.detach() for k, v in material.per_particle(1.0).items()}
+            adapter.prepare(material.law, material_states(material.law, parameters, **self.body.law_options))
             if self.weights.get("operator", 0.0) != 0:
                 self.misfit = max(parallel.mean(self.measure_misfit()), 0.1 * MISFIT)
         parallel.synchronise(self.body)  # on a GPU ranks may come to slightly different numbers

@@ -185,7 +185,8 @@ class Simulator:
         [kg/m^3]: number or (N,).
         adapter: asked every `stride` substeps from the start of each frame; None: once, at the start of the rollout (an operator
         that does not depend on the state). collect: called with `adapter.statistics()`, a named tuple of tensors, of every
-        evaluation. progress: called with the number of each frame.
+        evaluation. progress: called with the number of each frame. An adapter that has `flow` is no part of a chain; before it is
+        asked, F becomes flow(F (N, 3, 3), time until it is asked again [s]): plastic flow that a network has learned.
         motions: of the colliders, instead of their own; start_time [s]: time of frame 0 in these motions.
         control: choose the substeps of each frame from the state at its start (see `adaptive`) instead of taking `substeps`;
         counts: of the frames - 1 intervals, instead of choosing: a replay, in which differences hold the substeps fixed.
@@ -211,6 +212,7 @@ class Simulator:
             current = prepared.first_advance(current, self.frame_dt / taken[0] if taken else self.dt)
         prepared.settle(current)
         chained = self.chained and isinstance(prepared.adapter, nn.Module) and not variable and not self.colliders
+        chained = chained and getattr(prepared.adapter, "chained", True)
         if chained:
             solver, lengths = prepared.lanes.solvers[0], segments(self.substeps, stride)
             states = self._chains.frames(solver, adapter, current, prepared.packed, frames - 1, lengths, collect)

@@ -90,7 +90,11 @@ class Prepared:
         """(state after the segments of a frame, reactions (substeps, W K, 6) or None). first: number of its first substep; poses:
         of W worlds with K colliders at its substeps, () where there are none; steps: None for the numerics' dt."""
         forces, done = [], 0
+        flow = getattr(self.adapter, "flow", None)
         for length in lengths:
+            if flow is not None:
+                x, v, C, F, F_tot = state
+                state = (x, v, C, flow(F, length * (self.numerics.dt if steps is None else steps.dt)), F_tot)
             if self.adapter is not None:
                 self.held.update(self.ask(self.adapter, state[3], state[2], self.packed, self.collect))
             along = tuple(part[done : done + length] for part in poses)

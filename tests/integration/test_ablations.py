@@ -70,6 +70,16 @@ def test_no_prior_stress_starts_near_the_prior(first_step):
     assert terms["position"] == pytest.approx(full["position"], rel=0.05)  # which was fitted to the prior's
 
 
+@pytest.mark.parametrize("name", ["nclaw", "neuma"])
+def test_networks_in_place_of_the_law_start_near_the_prior_and_hold_its_parameters(first_step, name):
+    untouched, _ = first_step("paper")  # with the same time step, and networks that have not moved
+    terms, _ = first_step("full", f"adapter={name}")
+    assert terms["position"] == pytest.approx(untouched["position"], abs=0.005)  # of the body's size
+    module = first_step.modules["full", f"adapter={name}"]
+    assert [g["name"] for g in module.groups(module.stages[0])] == ["material", "contact"]
+    assert [g["name"] for g in module.groups(module.stages[-1])] == ["contact", "adapter"]
+
+
 LINEAR = "adapter=linear"
 """It has a penalty of its size; that of the default adapter is the prior of its numbers."""
 

@@ -1,0 +1,219 @@
+"""Baseline: learned pair forces between particles in place of law and grid, after DEL (Wang et al., NeurIPS 2024).
+
+DEL keeps the form of the discrete element method, forces between particles that depend on what two of them see of each other,
+and learns their sizes. Here M nodes, drawn evenly from the body's particles, are joined to their neighbours in the rest shape; a
+bond of rest length L between i and j pulls with
+
+    f = E_ref a (g e + d rate) n,    e = |x_j - x_i|/L - 1,    rate = (v_j - v_i).n/c,    c = sqrt(E_ref/density)
+
+along n = (x_j - x_i)/|x_j - x_i|, where the network gives g > 0 and d > 0 from e, rate and the mean e of both nodes' bonds. Forces
+act along the line of centres and in pairs, and what the network reads does not change with the frame: momentum and angular momentum
+are kept and the dynamics is objective, whatever the weights are. a is such that the bonds have the bulk modulus of E_ref at
+nu = 1/4, the only Poisson number of central forces; the learned dynamics starts there.
+Differences to the source: bonds are those of the rest shape (solids only), no tangential forces, the ground is a rigid plane and no
+learned one, and images are rendered by the project's splats. The other particles follow the deformation of the nodes around them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from mosa.errors import ConfigError, SimulationDiverged
+from mosa.modules.adapter import Adapter
+from mosa.modules.networks import TwoHiddenLayers, zero_outputs
+from mosa.physics.asking import AdapterOperator, MaterialState
+from mosa.types import ParticleState, Rollout
+
+DAMPING = 0.1
+"""Of d where the network answers zero: about a twentieth of critical for a bond."""
+FOLLOWED = 12
+"""Nodes whose deformation a particle follows."""
+SCALE = 10.0
+"""Of what the network reads: strains of a tenth become numbers of order one."""
+
+
+class InteractionNetwork(Adapter):
+    """Pair forces between nodes of the rest shape. It brings its own dynamics (`simulator`), and answers no law.
+
+    hidden: width of the network; nodes: at most; neighbours: bonds of a node, at least; stiffer: bound of |log g|.
+    Errors: ConfigError naming the key.
+    """
+
+    replaces_law = True
+    chained = False
+
+    def __init__(self, *, hidden: int = 32, nodes: int = 400, neighbours: int = 12, stiffer: float = 2.0) -> None:
+        super().__init__()
+        for name, value, low in (("nodes", nodes, 8), ("neighbours", neighbours, 4)):
+            if isinstance(value, bool) or not isinstance(value, int) or value < low:
+                raise ConfigError(f"adapter.{name}: expected a whole number of at least {low}, found {value!r}")
+        if not 0 < stiffer <= 5:
+            raise ConfigError(f"adapter.stiffer: expected a number above 0 and at most 5, found {stiffer}")
+        self.most, self.neighbours, self.stiffer = nodes, neighbours, stiffer
+        self.net = TwoHiddenLayers(3, 2, hidden)
+        zero_outputs(self.net[-1])
+        self.register_buffer("scale", torch.tensor(SCALE), persistent=False)
+
+    def settle(self, rest: Tensor, volume: Tensor) -> None:
+        """Choose nodes and bonds of a body: rest (N, 3) [m], volume (N,) [m^3]. Errors: ConfigError for too few particles."""
+        X, V = rest.detach().cpu().double().numpy(), volume.detach().cpu().double().numpy()
+        count = min(self.most, len(X))
+        if count <= self.neighbours:
+            raise ConfigError(f"adapter.neighbours: expected fewer than the body's {count} nodes, found {self.neighbours}")
+        nodes = spread(X, count)
+        tree = cKDTree(X[nodes])
+        V_nodes = np.bincount(tree.query(X)[1], weights=V, minlength=count)
+        near = tree.query(X[nodes], k=self.neighbours + 1)[1][:, 1:]
+        pairs = np.sort(np.stack([np.repeat(np.arange(count), self.neighbours), near.ravel()], 1), axis=1)
+        i, j = np.unique(pairs, axis=0).T
+        L = np.linalg.norm(X[nodes][j] - X[nodes][i], axis=1)
+        total = np.bincount(i, weights=L, minlength=count) + np.bincount(j, weights=L, minlength=count)
+        share = 6 * V_nodes / total  # the bonds' sum of a L is then six volumes: K = 2/3 E_ref, that of nu = 1/4
+        area = share[i] + share[j]
+        bond = area / L
+        rate = (np.bincount(i, weights=bond, minlength=count) + np.bincount(j, weights=bond, minlength=count)) / V_nodes
+        degree = np.bincount(i, minlength=count) + np.bincount(j, minlength=count)
+        followed, weight, center, inverse = following(X, X[nodes], tree)
+        found = {"nodes": nodes, "i": i, "j": j, "length": L, "area": area, "node_volume": V_nodes, "degree": degree.astype(float),
+                 "followed": followed, "weight": weight, "center": center, "inverse": inverse, "node_rest": X[nodes], "rest": X}
+        for name, value in found.items():
+            self.register_buffer(name, torch.as_tensor(value).to(rest.device), persistent=False)
+        for name, value in self.named_buffers():
+            if value.is_floating_point() and name not in ("E_ref", "poisson"):
+                setattr(self, name, value.to(rest.dtype))
+        self.fastest = float(np.sqrt(2 * rate.max()))  # bound of the nodes' frequencies, times sqrt(E_ref/density)
+        self.radius = 0.5 * float(V.mean()) ** (1 / 3)
+
+    def tension(self, e: Tensor, rate: Tensor, mean: Tensor) -> Tensor:
+        """(B,) f/(E_ref a) of bonds; e, rate, mean: (B,) strain, its rate over c and the mean strain around."""
+        raw = self.net(self.scale * torch.stack([e, rate, mean], -1))
+        bounded = torch.tanh(raw)
+        return e * torch.exp(self.stiffer * bounded[:, 0]) + DAMPING * torch.exp(bounded[:, 1]) * rate
+
+    def forces(self, x: Tensor, v: Tensor, density: float) -> Tensor:
+        """(M, 3) [N] on the nodes at x (M, 3) [m] with velocities v (M, 3) [m/s]; density [kg/m^3]."""
+        d = x[self.j] - x[self.i]
+        r = d.norm(dim=-1)
+        n = d / r[:, None]
+        e = r / self.length - 1
+        rate = ((v[self.j] - v[self.i]) * n).sum(-1) * torch.sqrt(density / self.E_ref)
+        zero = torch.zeros(len(x), dtype=x.dtype, device=x.device)
+        around = (zero.index_add(0, self.i, e).index_add(0, self.j, e)) / self.degree
+        f = (self.E_ref * self.area * self.tension(e, rate, 0.5 * (around[self.i] + around[self.j])))[:, None] * n
+        return torch.zeros_like(x).index_add(0, self.i, f).index_add(0, self.j, -f)
+
+    def follow_nodes(self, x: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(x (N, 3), v (N, 3), F (N, 3, 3)) of all particles: nodes as they are, the others by the affine motion that fits the
+        nodes around each best."""
+        near, w = x[self.followed], self.weight[..., None]  # (N, K, 3), (N, K, 1)
+        arms = self.node_rest[self.followed] - self.center[:, None]
+        middle = (w * near).sum(1)
+        F = torch.einsum("nka,nkb,nbc->nac", w * (near - middle[:, None]), arms, self.inverse)
+        moved = middle + (F @ (self.rest - self.center)[..., None])[..., 0]
+        return moved.index_copy(0, self.nodes, x), (w * v[self.followed]).sum(1).index_copy(0, self.nodes, v), F
+
+    def simulator(self, density: float, world, frame_dt: float) -> Interactions:
+        """What rolls the nodes out in a world, in place of the body's `Simulator`. Errors: ConfigError."""
+        self.check_on()
+        return Interactions(self, density, world, frame_dt)
+
+    def forward(self, state: MaterialState) -> AdapterOperator:
+        raise ConfigError("adapter=interaction: pair forces have no stress; expected a rollout by `Body.simulate`")
+
+
+class Interactions:
+    """Nodes under their pair forces, gravity and a ground; symplectic Euler. `substeps` of each frame of frame_dt [s]."""
+
+    def __init__(self, network: InteractionNetwork, density: float, world, frame_dt: float) -> None:
+        if world.planes or world.colliders:
+            raise ConfigError("adapter=interaction: expected a world with a ground alone, found world.walls or world.colliders")
+        fastest = network.fastest * math.sqrt(float(network.E_ref) / density) * math.exp(0.5 * network.stiffer)
+        self.substeps = math.ceil(frame_dt * fastest)  # half of the limit of stability, 2/fastest, for bonds at their stiffest
+        self.network, self.density, self.world, self.frame_dt = network, density, world, frame_dt
+
+    def rollout(
+        self, state: ParticleState, *, frames: int, parameters=None, volume=None, density=None, adapter=None, stride=None,
+        collect: Callable | None = None, motions=(), progress: Callable[[int], None] | None = None, started: bool = False,
+        start_time: float = 0.0,
+    ) -> Rollout:  # fmt: skip
+        """As `Simulator.rollout`; what concerns a law or a grid is not read. Errors: SimulationDiverged naming the frame."""
+        network = self.network
+        x, v = state.x[network.nodes], state.v[network.nodes]
+        C = state.C_affine
+        recorded = [(state.x, state.v, state.F)]
+        for frame in range(1, frames):
+            if torch.is_grad_enabled():
+                x, v = checkpoint(self.frame, x, v, use_reentrant=False)
+            else:
+                x, v = self.frame(x, v)
+            if not bool(torch.isfinite(x).all()):
+                raise SimulationDiverged(f"adapter=interaction: a position is not finite in frame {frame}; lower "
+                                         "fit.joint.lr_adapter")
+            recorded.append(network.follow_nodes(x, v))
+            if progress is not None:
+                progress(frame)
+        if collect is not None:
+            zero = x.new_zeros(1, 6)
+            network._last = (x.new_zeros(1, 4, 3, 3), zero, zero)
+            collect(network.statistics())
+        xs, vs, Fs = (torch.stack(values) for values in zip(*recorded))
+        times = self.frame_dt * torch.arange(frames, dtype=xs.dtype, device=xs.device)
+        a, b, c = Fs.detach().unbind(-2)
+        inverted = int(((a * torch.linalg.cross(b, c)).sum(-1) <= 0).sum())
+        final = ParticleState(xs[-1], vs[-1], C, Fs[-1], Fs[-1])
+        return Rollout(x=xs, v=vs, F=Fs, F_tot=Fs, times=times, final=final, inverted=inverted, reactions=None,
+                       counts=(self.substeps,) * (frames - 1))
+
+    def frame(self, x: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        """(x, v) (M, 3) of the nodes one frame later."""
+        network, dt = self.network, self.frame_dt / self.substeps
+        gravity = self.world.gravity.to(x)
+        mass = self.density * network.node_volume[:, None]
+        for _ in range(self.substeps):
+            v = v + dt * (network.forces(x, v, self.density) / mass + gravity)
+            if self.world.ground is not None:
+                v = self.contact(x, v)
+            x = x + dt * v
+        return x, v
+
+    def contact(self, x: Tensor, v: Tensor) -> Tensor:
+        """Velocities after the ground, as a grid node's (`mosa.physics.boundary`)."""
+        ground, up = self.world.ground, self.world.up.to(x)
+        touching = ((x @ up) - ground.height <= self.network.radius)[:, None]
+        normal = (v @ up)[:, None]
+        tangent = v - normal * up
+        if ground.mode == "sticky":
+            return torch.where(touching, torch.zeros_like(v), v)
+        if ground.mode == "slip":
+            return torch.where(touching, tangent, v)
+        size = (tangent.square().sum(-1, keepdim=True) + 1e-12).sqrt()
+        kept = (1 + ground.friction * normal / size).clamp(min=0)
+        return torch.where(touching & (normal < 0), kept * tangent, v)
+
+
+def spread(X: np.ndarray, count: int) -> np.ndarray:
+    """(count,) indices of points (N, 3) far from each other: the one farthest from the centre, then always the farthest left."""
+    chosen = [int(np.linalg.norm(X - X.mean(0), axis=1).argmax())]
+    distance = np.linalg.norm(X - X[chosen[0]], axis=1)
+    while len(chosen) < count:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(X - X[chosen[-1]], axis=1))
+    return np.array(chosen)
+
+
+def following(X: np.ndarray, nodes: np.ndarray, tree: cKDTree) -> tuple[np.ndarray, ...]:
+    """(nearest nodes (N, K), weights (N, K), their centres (N, 3), inverse moments (N, 3, 3)) of particles (N, 3)."""
+    K = min(FOLLOWED, len(nodes))
+    distance, near = tree.query(X, k=K)
+    weight = np.maximum(1 - (distance / (1.1 * distance[:, -1:])) ** 2, 0) ** 2
+    weight /= weight.sum(1, keepdims=True)
+    center = np.einsum("nk,nka->na", weight, nodes[near])
+    arms = nodes[near] - center[:, None]
+    return near, weight, center, np.linalg.pinv(np.einsum("nk,nka,nkb->nab", weight, arms, arms), rcond=1e-4, hermitian=True)
