@@ -117,6 +117,7 @@ TRAINING: dict[str, Kind] = {
     "adapter.name": or_null(TEXT),
     "adapter._target_": or_null(TEXT),
     "adapter.alpha": POSITIVE,
+    "adapter.alpha_normal": or_null(POSITIVE),
     "adapter.l_max": or_null(POSITIVE),
     "adapter.input_scale": POSITIVE,
     "adapter.hidden": whole(1, WIDEST),

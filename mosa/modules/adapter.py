@@ -125,7 +125,7 @@ class Adapter(nn.Module):
 class StressAdapter(Adapter):
     """The paper's adapter. `forward` answers the simulator with an operator that is exact at the state it was asked at.
 
-    alpha, l_max (dimensionless): bounds, see `ProgressiveOperator`; input_scale: factor of what the networks read;
+    alpha, alpha_normal, l_max (dimensionless): bounds, see `ProgressiveOperator`; input_scale: factor of what the networks read;
     rest_free: an undeformed body stays stress-free, exactly (the paper's literal form: false);
     plastic: a second set of networks corrects the strain in the yield function;
     major_symmetry: a projection after which a constant operator has an energy; state_dependence: full | constant;
@@ -137,14 +137,16 @@ class StressAdapter(Adapter):
     """
 
     def __init__(
-        self, *, alpha: float = 0.1, l_max: float | None = 0.1, input_scale: float = 10.0, hidden: int = 64,
-        rest_free: bool = True, plastic: bool = False, major_symmetry: bool = False, state_dependence: str = "full",
-        recompute: bool = False, fused: bool | str = "auto", precision: str = "accurate",
+        self, *, alpha: float = 0.1, alpha_normal: float | None = None, l_max: float | None = 0.1, input_scale: float = 10.0,
+        hidden: int = 64, rest_free: bool = True, plastic: bool = False, major_symmetry: bool = False,
+        state_dependence: str = "full", recompute: bool = False, fused: bool | str = "auto", precision: str = "accurate",
         no_C: bool = False, no_pre: bool = False, no_post: bool = False, no_prior_stress: bool = False,
     ) -> None:  # fmt: skip
         super().__init__()
         if not 0 < alpha < 1:
             raise ConfigError(f"adapter.alpha: expected a number between 0 and 1, found {alpha}")
+        if alpha_normal is not None and not 0 < alpha_normal < 1:
+            raise ConfigError(f"adapter.alpha_normal: expected a number between 0 and 1 or null, found {alpha_normal}")
         check_network(l_max, input_scale, hidden)
         if state_dependence not in ("full", "constant"):
             raise ConfigError(f"adapter.state_dependence: expected full or constant, found {state_dependence!r}")
@@ -152,8 +154,8 @@ class StressAdapter(Adapter):
             raise ConfigError("adapter: no_prior_stress needs L_pre (no_pre=false): the stress comes from it alone")
         check_options(fused, precision)
         self.rest_free, self.recompute, self.fused, self.precision = rest_free, recompute, fused, precision
-        shape = {"alpha": alpha, "input_scale": input_scale, "hidden": hidden, "state_dependence": state_dependence}
-        shape |= {"no_C": no_C, "no_pre": no_pre, "no_post": no_post}
+        shape = {"alpha": alpha, "alpha_normal": alpha_normal, "input_scale": input_scale, "hidden": hidden}
+        shape |= {"state_dependence": state_dependence, "no_C": no_C, "no_pre": no_pre, "no_post": no_post}
         bound = None if no_prior_stress else l_max  # without the prior the residuals have to carry the whole stress
         self.operator = ProgressiveOperator(l_max=bound, major_symmetry=major_symmetry, no_prior_stress=no_prior_stress, **shape)
         # C0 is a stiffness: it has no meaning for the strain in the yield function
@@ -172,7 +174,7 @@ class StressAdapter(Adapter):
         if self.operator.no_C or self.operator.no_prior_stress:
             return ADAPTER_MARGIN
         if not self.operator.constant:
-            return worst_stiffening(self.operator.alpha)
+            return worst_stiffening(max(self.operator.alpha, self.operator.alpha_normal))
         return max(ADAPTER_MARGIN, acoustic_stiffening(self.operator.constant_operator(), poisson))
 
     def prepare(self, law: str, states: Callable[[Tensor], MaterialState]) -> None:

@@ -28,7 +28,8 @@ class Correction(NamedTuple):
 class ProgressiveOperator(nn.Module):
     """Four networks on a dimensionless symmetric tensor s (N, 6) and the stretch w = vech(W - I) (N, 6).
 
-    alpha: bound of the entries of the LU factors; l_max: of L_pre and L_post, None leaves them linear (the paper's form);
+    alpha: bound of the entries of the LU factors; alpha_normal: of those of C_xyz and of l2, None: alpha;
+    l_max: of L_pre and L_post, None leaves them linear (the paper's form);
     state_dependence: full | constant (the four matrices are learned numbers, not functions of the state);
     major_symmetry: (A + C0 A^T C0^-1)/2 in place of A, needs `poisson` of C0;
     no_prior_stress: s1 = L_pre instead of s + L_pre. The output is exactly 0 at initialisation.
@@ -37,9 +38,11 @@ class ProgressiveOperator(nn.Module):
     def __init__(
         self, *, alpha: float, l_max: float | None, input_scale: float, hidden: int, no_C: bool, no_pre: bool, no_post: bool,
         state_dependence: str = "full", major_symmetry: bool = False, no_prior_stress: bool = False,
+        alpha_normal: float | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
         self.alpha, self.l_max, self.scale = alpha, l_max, input_scale
+        self.alpha_normal = alpha if alpha_normal is None else alpha_normal
         self.no_C, self.no_pre, self.no_post, self.no_prior_stress = no_C, no_pre, no_post, no_prior_stress
         self.constant, self.major_symmetry = state_dependence == "constant", major_symmetry
         self.phi = TwoHiddenLayers(12, 6, hidden)
@@ -82,7 +85,8 @@ class ProgressiveOperator(nn.Module):
 
     def constant_corrections(self, like: Tensor) -> Tensor:
         """(4, 3, 3). The numbers are learned in units of 1/input_scale: the networks' learning rate then fits them too."""
-        return microplane.correction(self.alpha * torch.tanh(self.scale * self.free).to(like))
+        bound = torch.tensor([self.alpha] * 3 + [self.alpha_normal]).to(like)[:, None]
+        return microplane.correction(bound * torch.tanh(self.scale * self.free).to(like))
 
     def constant_operator(self) -> Tensor:
         """(6, 6) A - I of the constant matrices, before the projection to major symmetry."""
@@ -93,7 +97,7 @@ class ProgressiveOperator(nn.Module):
         """Step 4: (C_xyz (N, 3, 3), l2 (N, hidden) or None where nothing reads it); n: (N, 3) normals after the planes."""
         numbers = l2 = None
         if l1 is not None:
-            bounded = self.alpha * torch.tanh(self.psi2(torch.cat([l1, self.scale * n], -1)))
+            bounded = self.alpha_normal * torch.tanh(self.psi2(torch.cat([l1, self.scale * n], -1)))
             numbers, l2 = bounded[:, :12], bounded[:, 12:]
         if self.no_C:
             return n.new_zeros(len(n), 3, 3), l2

@@ -1,0 +1,107 @@
+"""Run the jobs of a table or figure of the paper and write its results:  mosa-experiment table_generalisation --quick"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+import sys
+from pathlib import Path
+
+from mosa.commands import configuration
+from mosa.errors import ConfigError, MosaError
+
+
+def arguments(words: list[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="mosa-experiment", description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME", help="experiments, or all; none: list them")
+    parser.add_argument("--quick", action="store_true", help="the small variant, minutes on two cores")
+    parser.add_argument("--dry-run", action="store_true", help="list the jobs with the estimated time, run nothing")
+    parser.add_argument("--collect", action="store_true", help="run nothing, write the results of the jobs that are complete")
+    parser.add_argument("--runs", type=Path, default=Path("experiments"), help="folder of the jobs' run folders")
+    parser.add_argument(
+        "--results", type=Path, default=None, help="folder of the tables; default: docs/results, quick: RUNS/results"
+    )
+    parser.add_argument("--jobs", type=int, default=1, help="jobs side by side, on each device where there are devices")
+    parser.add_argument("--devices", default=None, help="GPUs by number, as 0,1; default: the CPU")
+    parser.add_argument("--seeds", default=None, help="instead of the experiment's, as 0,1,2")
+    parser.add_argument("--only", action="append", default=[], metavar="AXIS=NAME,NAME", help="these of an axis")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        dest="overrides",
+        help="override for every job, as train.py takes it",
+    )
+    return parser.parse_args(words)
+
+
+def main(words: list[str] | None = None) -> None:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    try:
+        code = run(arguments(sys.argv[1:] if words is None else words))
+    except MosaError as error:
+        print(f"\n{type(error).__name__}: {error}", file=sys.stderr)
+        code = 2
+    except KeyboardInterrupt:
+        print("\nstopped; the same command goes on from here", file=sys.stderr)
+        code = 130
+    sys.exit(code)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Exit code: 1 where jobs failed. Errors: ConfigError naming argument or file."""
+    from mosa.experiments.running import run_jobs
+    from mosa.experiments.specification import estimate, experiment_names, jobs_of, load_experiment, narrowed, pairs, total_minutes
+
+    folder = Path(configuration()) / "experiment" / "paper"
+    if not options.names:
+        for name in experiment_names(folder):
+            print(f"{name:28s} {load_experiment(folder, name).title}")
+        return 0
+    devices = [None] if options.devices is None else whole_numbers("--devices", options.devices)
+    if options.jobs < 1:
+        raise ConfigError(f"--jobs: expected at least 1, found {options.jobs}")
+    names = experiment_names(folder) if options.names == ["all"] else options.names
+    experiments = [load_experiment(folder, name, quick=options.quick) for name in names]
+    seeds = None if options.seeds is None else tuple(whole_numbers("--seeds", options.seeds))
+    experiments = [
+        narrowed(e, pairs(options.only, [axis for each in experiments for axis in each.axes]), seeds) for e in experiments
+    ]
+    more = [*options.overrides, *(["trainer=gpu"] if devices != [None] else [])]
+    planned = {e.name: jobs_of(e, options.runs, more) for e in experiments}
+    jobs = list({job.folder: job for found in planned.values() for job in found}.values())
+    slots = len(devices) * options.jobs
+    for line in estimate(jobs, gpu=devices != [None], slots=slots):
+        print(line, flush=True)
+    if options.dry_run:
+        return 0
+    failed = {} if options.collect else run_jobs(jobs, devices, options.jobs)
+    from mosa.experiments.writing import write_results
+
+    results = options.results or (options.runs / "results" if options.quick else Path("docs/results"))
+    command = shown(options)
+    for experiment in experiments:
+        page = write_results(experiment, planned[experiment.name], results, command)
+        print(f"{experiment.name}: {page}, {total_minutes(planned[experiment.name]):.1f} minutes of jobs")
+    for folder, reason in failed.items():
+        print(f"failed: {folder}: {reason}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def shown(options: argparse.Namespace) -> str:
+    """The command as it stands in the results: without folders of this machine."""
+    words = ["mosa-experiment", *options.names, *(["--quick"] if options.quick else [])]
+    for name in ("seeds", "devices"):
+        words += [f"--{name}", getattr(options, name)] if getattr(options, name) is not None else []
+    words += ["--jobs", str(options.jobs)] if options.jobs != 1 else []
+    words += [word for each in options.only for word in ("--only", each)]
+    return shlex.join([*words, *(word for each in options.overrides for word in ("--set", each))])
+
+
+def whole_numbers(where: str, text: str) -> list[int]:
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise ConfigError(f"{where}: expected whole numbers as 0,1, found {text!r}") from None

@@ -1,0 +1,79 @@
+"""Jobs side by side: a process of train.py each, on CPU cores or on the GPUs named; what is complete is not run again."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from mosa.experiments.specification import Job
+
+PROGRAM = "from mosa.commands.train import main; main()"
+WAIT = 0.2
+"""Seconds between looks at the running jobs."""
+
+
+def command_of(job: Job) -> list[str]:
+    """A run with the job's overrides in its folder, which goes on from a checkpoint that it finds there."""
+    folder = str(job.folder.resolve()).replace("'", "\\'")
+    return [sys.executable, "-c", PROGRAM, *job.overrides, "resume=auto", f"hydra.run.dir='{folder}'"]
+
+
+def run_jobs(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: int) -> dict[str, str]:
+    """Run what is not complete; {folder: reason} of the jobs that failed. devices: GPUs, [None] for the CPU.
+
+    Of jobs that share a reconstruction the first runs alone, and the others find it in the cache."""
+    waiting = [job for job in jobs if not job.finished]
+    known = {job.first for job in jobs if job.finished}
+    free = [device for device in devices for _ in range(side_by_side)]
+    running: dict[subprocess.Popen, tuple[Job, int | None, float]] = {}
+    failed: dict[str, str] = {}
+    done, total = 0, len(waiting)
+    try:
+        while waiting or running:
+            for process in [p for p in running if p.poll() is not None]:
+                job, device, began = running.pop(process)
+                free.append(device)
+                known.add(job.first)
+                done += 1
+                if process.returncode != 0 or not job.finished:
+                    failed[job.folder.name] = reason(job, process.returncode)
+                outcome = "failed" if job.folder.name in failed else "complete"
+                print(
+                    f"[{done}/{total}] {job.folder.name}: {outcome} after {(time.perf_counter() - began) / 60:.1f} min", flush=True
+                )
+            making = {job.first for job, _, _ in running.values()} - known
+            ready = next((job for job in waiting if job.first not in making), None)
+            if free and ready is not None:
+                waiting.remove(ready)
+                device = free.pop(0)
+                running[begin(ready, device)] = (ready, device, time.perf_counter())
+            else:
+                time.sleep(WAIT)
+    finally:
+        for process in running:  # Ctrl-C: each writes its checkpoint and ends
+            process.terminate()
+        for process in running:
+            process.wait()
+    return failed
+
+
+def begin(job: Job, device: int | None) -> subprocess.Popen:
+    job.folder.mkdir(parents=True, exist_ok=True)
+    environment = dict(os.environ)
+    environment.setdefault("OMP_NUM_THREADS", "1")
+    if device is not None:
+        listed = [part for part in environment.get("CUDA_VISIBLE_DEVICES", "").split(",") if part]
+        environment["CUDA_VISIBLE_DEVICES"] = listed[device] if device < len(listed) else str(device)
+    with open(job.folder / "screen.log", "ab") as screen:
+        return subprocess.Popen(command_of(job), stdout=screen, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, env=environment)
+
+
+def reason(job: Job, code: int) -> str:
+    """The last line with a message of what a failed job had on the screen."""
+    lines = (job.folder / "screen.log").read_text(errors="replace").splitlines()
+    said = [line.strip() for line in lines if "Error" in line or "Diverged" in line]
+    return said[-1][:300] if said else f"exit code {code}, see {Path(job.folder) / 'screen.log'}"

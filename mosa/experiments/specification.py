@@ -1,0 +1,258 @@
+"""What an experiment is: axes of overrides whose combinations are jobs of train.py, and how their figures become a table."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from mosa.errors import ConfigError, DataError
+
+PLOTS = ("bars", "lines", "map", None)
+SHARED = "_shared"
+"""File of axes that several experiments name."""
+
+
+@dataclass(frozen=True)
+class Option:
+    """A place on an axis. overrides: of train.py; prefix: of the figures to read (`prior/`: the calibrated prior of the same run);
+    cost: of a job over the experiment's minutes; value: of a numeric axis."""
+
+    name: str
+    overrides: tuple[str, ...] = ()
+    prefix: str = ""
+    cost: float = 1.0
+    value: float | None = None
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure of metrics.json in a table. scale: from its unit to the one shown; best: most | least | None; decimals."""
+
+    label: str
+    figure: str
+    scale: float = 1.0
+    decimals: int = 2
+    best: str | None = None
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """rows, columns: axes of the table (every other one but the seed is a table of its own); printed: entry of printed.yaml; note:
+    how the data differ from the paper's; minutes: of a job on cpu and gpu; analysis: a function of `analyses`, or None."""
+
+    name: str
+    title: str
+    axes: dict[str, tuple[Option, ...]]
+    rows: str
+    columns: str
+    figures: tuple[Figure, ...]
+    seeds: tuple[int, ...] = (0,)
+    common: tuple[str, ...] = ()
+    printed: str | None = None
+    note: str = ""
+    minutes: dict[str, float] = field(default_factory=lambda: {"cpu": 10.0, "gpu": 2.0})
+    plot: str | None = "bars"
+    analysis: str | None = None
+    mean: bool = True
+    quick: bool = False
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of train.py. places: option by axis, of each cell that reads it; first: what it shares a reconstruction with."""
+
+    folder: Path
+    overrides: tuple[str, ...]
+    seed: int
+    places: tuple[dict[str, Option], ...]
+    minutes: dict[str, float]
+    first: str
+
+    @property
+    def finished(self) -> bool:
+        return (self.folder / "metrics.json").is_file()
+
+
+def experiment_names(folder: Path) -> list[str]:
+    return sorted(file.stem for file in folder.glob("*.yaml") if not file.stem.startswith("_"))
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Errors: ConfigError naming the file."""
+    try:
+        found = yaml.safe_load(path.read_text())
+    except (OSError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path}: no readable YAML ({error})") from error
+    if not isinstance(found, dict):
+        raise ConfigError(f"{path}: expected keys, found {type(found).__name__}")
+    return found
+
+
+def load_experiment(folder: Path, name: str, quick: bool = False) -> Experiment:
+    """folder/<name>.yaml; quick: with its section `quick` in place of other keys. Errors: ConfigError naming the key."""
+    if name not in experiment_names(folder):
+        raise ConfigError(f"experiment: expected one of {', '.join(experiment_names(folder))} or all, found {name!r}")
+    keys, shared = read_yaml(folder / f"{name}.yaml"), read_yaml(folder / f"{SHARED}.yaml")
+    small = keys.pop("quick", None)
+    if quick:
+        if not small:
+            raise ConfigError(f"{name}: expected a section quick, found none")
+        keys |= small
+    known = set(Experiment.__dataclass_fields__) - {"name", "quick"}
+    if unknown := sorted(set(keys) - known):
+        raise ConfigError(f"{name}: {unknown[0]}: unknown key; expected one of {', '.join(sorted(known | {'quick'}))}")
+    if missing := [key for key in ("title", "axes", "rows", "columns", "figures") if key not in keys]:
+        raise ConfigError(f"{name}: {missing[0]}: expected this key, found none")
+    keys["axes"] = {axis: options_of(f"{name}: axes.{axis}", found, shared) for axis, found in keys["axes"].items()}
+    for place in ("rows", "columns"):
+        if keys[place] not in keys["axes"]:
+            raise ConfigError(f"{name}: {place}: expected one of {', '.join(keys['axes'])}, found {keys[place]!r}")
+    if keys.get("plot", "bars") not in PLOTS:
+        raise ConfigError(f"{name}: plot: expected bars, lines, map or null, found {keys['plot']!r}")
+    try:
+        keys["figures"] = tuple(Figure(**figure) for figure in keys["figures"])
+    except TypeError as error:
+        raise ConfigError(f"{name}: figures: expected sections of {', '.join(Figure.__dataclass_fields__)} ({error})") from error
+    keys["seeds"], keys["common"] = tuple(keys.get("seeds", (0,))), tuple(keys.get("common", ()))
+    return Experiment(name=name, quick=quick, **keys)
+
+
+def options_of(where: str, found: Any, shared: Mapping[str, Any]) -> tuple[Option, ...]:
+    """The options of an axis: a mapping of name to overrides (a list, or a section with the fields of `Option`), the name of a
+    shared axis, or {of: <shared axis>, only: [names]}."""
+    only = None
+    if isinstance(found, Mapping) and set(found) <= {"of", "only"} and "of" in found:
+        found, only = found["of"], found.get("only")
+    if isinstance(found, str):
+        if found not in shared:
+            raise ConfigError(f"{where}: expected one of {', '.join(shared)}, found {found!r}")
+        found = shared[found]
+    if not isinstance(found, Mapping):
+        raise ConfigError(f"{where}: expected a section of options, found {found!r}")
+    options = []
+    for name, content in found.items():
+        section = {"overrides": content} if isinstance(content, (list, tuple)) or content is None else dict(content)
+        section["overrides"] = tuple(str(each) for each in section.get("overrides") or ())
+        try:
+            options.append(Option(str(name), **section))
+        except TypeError as error:
+            raise ConfigError(f"{where}.{name}: expected fields of {', '.join(Option.__dataclass_fields__)} ({error})") from error
+    return chosen(where, tuple(options), only)
+
+
+def chosen(where: str, options: tuple[Option, ...], only: Sequence[str] | None) -> tuple[Option, ...]:
+    """Those that are named, in the order they are named. Errors: ConfigError naming the axis."""
+    if only is None:
+        return options
+    known = {option.name: option for option in options}
+    if unknown := [name for name in only if str(name) not in known]:
+        raise ConfigError(f"{where}: expected some of {', '.join(known)}, found {unknown[0]!r}")
+    return tuple(known[str(name)] for name in only)
+
+
+def pairs(words: Sequence[str], axes: Sequence[str]) -> dict[str, list[str]]:
+    """{axis: names} of words AXIS=NAME,NAME. Errors: ConfigError."""
+    found = {}
+    for word in words:
+        axis, mark, names = word.partition("=")
+        if not mark or axis not in axes:
+            raise ConfigError(f"--only: expected AXIS=NAME,NAME with an axis of {', '.join(dict.fromkeys(axes))}, found {word!r}")
+        found[axis] = names.split(",")
+    return found
+
+
+def narrowed(experiment: Experiment, only: Mapping[str, Sequence[str]], seeds: tuple[int, ...] | None) -> Experiment:
+    """With these options and seeds alone."""
+    axes = {axis: chosen(f"--only {axis}", options, only.get(axis)) for axis, options in experiment.axes.items()}
+    return replace(experiment, axes=axes, seeds=experiment.seeds if seeds is None else seeds)
+
+
+def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> list[Job]:
+    """The jobs of all combinations of options and seeds, each once: cells that need the same run share it.
+
+    A run's folder is named after its overrides, so that other experiments share it too."""
+    found: dict[Path, Job] = {}
+    for options in itertools.product(*experiment.axes.values()):
+        place = dict(zip(experiment.axes, options))
+        for seed in experiment.seeds:
+            overrides = (*experiment.common, *(each for option in options for each in option.overrides), *more, f"seed={seed}")
+            folder = runs / folder_name(overrides)
+            cost = 1.0
+            for option in options:
+                cost *= option.cost
+            known = found.get(folder)
+            if known is not None:
+                found[folder] = replace(known, places=(*known.places, place))
+                continue
+            scene = next((each for each in overrides if each.startswith(("scene=", "experiment="))), "")
+            rest = [
+                each for each in overrides if each.split(".")[0].split("=")[0] in ("scene", "reconstruction", "seed", "simulation")
+            ]
+            minutes = {device: value * cost for device, value in experiment.minutes.items()}
+            found[folder] = Job(folder, overrides, seed, (place,), minutes, " ".join([scene, *rest]))
+    return list(found.values())
+
+
+QUIET = ("logger", "evaluation.video")
+"""Overrides that the name of a folder leaves to its digest."""
+
+
+def folder_name(overrides: Sequence[str]) -> str:
+    """Values of the overrides, and a digest of all of them, whatever the order of different keys is."""
+    ordered = sorted(overrides, key=lambda each: each.split("=")[0])
+    said = [each.split("=", 1)[-1] for each in ordered if each.split("=")[0] not in QUIET]
+    readable = "-".join("".join(c if c.isalnum() else "_" for c in value) for value in said)
+    return f"{readable[:80]}-{hashlib.sha256(chr(10).join(ordered).encode()).hexdigest()[:10]}"
+
+
+def figures_of(job: Job) -> dict[str, float | str]:
+    """metrics.json of a complete job. Errors: DataError for a damaged one."""
+    from mosa.run import read_figures  # which imports the simulator: a list of jobs does not wait for it
+
+    return read_figures(job.folder / "metrics.json")
+
+
+def minutes_taken(job: Job) -> float | None:
+    """Wall time of a complete job's stages [min], None where it is not complete."""
+    if not job.finished:
+        return None
+    figures = figures_of(job)
+    return sum(value for key, value in figures.items() if key.startswith("time/") and key.endswith("_s") and key.count("_") == 1
+               and isinstance(value, (int, float))) / 60  # fmt: skip
+
+
+def total_minutes(jobs: Sequence[Job]) -> float:
+    return sum(minutes_taken(job) or 0.0 for job in jobs)
+
+
+def estimate(jobs: Sequence[Job], gpu: bool, slots: int) -> list[str]:
+    """A line for each job and one for all of them. Minutes of jobs to come are scaled by those that are complete."""
+    device = "gpu" if gpu else "cpu"
+    taken = {job.folder: minutes_taken(job) for job in jobs}
+    done = [(taken[job.folder], job.minutes[device]) for job in jobs if taken[job.folder] is not None]
+    scale = sum(t for t, _ in done) / sum(m for _, m in done) if done else 1.0
+    lines, total = [], 0.0
+    for job in jobs:
+        known = taken[job.folder]
+        expected = job.minutes[device] * scale
+        total += 0.0 if known is not None else expected
+        state = f"complete, {known:.1f} min" if known is not None else f"about {expected:.1f} min"
+        lines.append(f"{job.folder.name}: {state}: {' '.join(job.overrides)}")
+    left = sum(1 for job in jobs if taken[job.folder] is None)
+    return [*lines, f"{len(jobs)} jobs, {left} to run, about {total / slots:.0f} minutes with {slots} side by side"]
+
+
+def read_job(job: Job) -> dict[str, float | str] | None:
+    """metrics.json of a complete job. Errors: DataError for a damaged one."""
+    if not job.finished:
+        return None
+    try:
+        return figures_of(job)
+    except DataError as error:
+        raise DataError(f"{error}; it belongs to the job {' '.join(job.overrides)}") from error

@@ -1,0 +1,168 @@
+"""Results of an experiment on disk: Markdown, CSV and LaTeX, with the paper's printed figures beside ours, and its picture."""
+
+from __future__ import annotations
+
+import csv
+import platform
+import subprocess
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+import yaml
+
+import mosa
+from mosa.analysis.tables import markdown
+from mosa.experiments.collecting import Cell, Record, best_of, records_of, table
+from mosa.experiments.drawing import draw, save
+from mosa.experiments.specification import Experiment, Figure, Job, minutes_taken
+
+PRINTED = Path(__file__).with_name("printed.yaml")
+
+
+def write_results(experiment: Experiment, jobs: Sequence[Job], folder: Path, command: str) -> Path:
+    """Tables and pictures of the jobs that are complete into `folder`; the Markdown page's path."""
+    from mosa.experiments.analyses import ANALYSES
+
+    folder.mkdir(parents=True, exist_ok=True)
+    records = records_of(jobs)
+    tables = {figure.label: table(experiment, records, figure) for figure in experiment.figures}
+    name = experiment.name + ("_quick" if experiment.quick else "")
+    write_csv(folder / f"{name}.csv", experiment, records)
+    (folder / f"{name}.tex").write_text(latex(experiment, tables))
+    pictures = []
+    if experiment.plot is not None and (figure := draw(experiment, tables)) is not None:
+        pictures.append(save(figure, folder / name))
+    extra = ""
+    if experiment.analysis is not None:
+        extra, more = ANALYSES[experiment.analysis](experiment, records, folder / name)
+        pictures += more
+    page = folder / f"{name}.md"
+    page.write_text(markdown_page(experiment, jobs, records, tables, pictures, extra, command))
+    return page
+
+
+def markdown_page(
+    experiment: Experiment, jobs: Sequence[Job], records: Sequence[Record], tables: Mapping, pictures: Sequence[Path], extra: str,
+    command: str,
+) -> str:  # fmt: skip
+    parts = [f"# {experiment.title}"]
+    if experiment.quick:
+        parts.append(
+            "Quick variant: small and short. It shows that the experiment runs; its figures say nothing about the methods."
+        )
+    if experiment.note:
+        parts.append(experiment.note.strip())
+    for figure in experiment.figures:
+        rows = tables[figure.label]
+        header = [experiment.rows, *next(iter(rows.values()))]
+        lines = [[row, *(cell_text(rows, row, column, figure, "**{}**") for column in header[1:])] for row in rows]
+        parts.append(f"{figure.label}{arrow(figure)} (`{figure.figure}`)\n\n" + markdown(header, lines))
+    if experiment.mean and any("mean" in row for rows in tables.values() for row in rows.values()):
+        parts.append("Mean: over the columns that all rows have.")
+    if extra:
+        parts.append(extra)
+    parts += [f"![{experiment.title}]({picture.name})" for picture in pictures]
+    if experiment.printed is not None:
+        parts.append(printed_table(experiment.printed))
+    parts.append(provenance(experiment, jobs, records, command))
+    return "\n\n".join(parts) + "\n"
+
+
+def arrow(figure: Figure) -> str:
+    return {"most": ", more is better", "least": ", less is better", None: ""}[figure.best]
+
+
+def cell_text(
+    rows: Mapping[str, Mapping[str, Cell | None]], row: str, column: str, figure: Figure, bold: str, plus: str = "±"
+) -> str:
+    found = rows[row].get(column)
+    if found is None:
+        return ""
+    text = found.text(figure.decimals, plus)
+    return bold.format(text) if best_of(rows, column, figure.best) == row else text
+
+
+def printed_table(name: str) -> str:
+    """The paper's own figures as Markdown. Errors: KeyError for an entry that is not there."""
+    entry = yaml.safe_load(PRINTED.read_text())[name]
+    lines = [[row, *(" / ".join("" if v is None else str(v) for v in values) for values in cells)]
+             for row, cells in entry["rows"].items()]  # fmt: skip
+    return f"The paper prints ({entry['title']}; {' / '.join(entry['labels'])}):\n\n" + markdown(["", *entry["columns"]], lines)
+
+
+def provenance(experiment: Experiment, jobs: Sequence[Job], records: Sequence[Record], command: str) -> str:
+    """What the figures come from: commit, seeds, machine, time, and the jobs that are missing."""
+    complete = [job for job in jobs if job.finished]
+    devices = sorted(
+        {str(record.figures["time/device"]) for record in records if record.figures and "time/device" in record.figures}
+    )
+    minutes = [minutes_taken(job) or 0.0 for job in complete]
+    lines = [
+        f"- command: `{command}`",
+        f"- version {mosa.__version__}, commit {commit()}",
+        f"- seeds: {', '.join(map(str, experiment.seeds))}; ± is the standard deviation over them, of one seed there is none",
+        f"- machine: {', '.join(devices) or 'none'}; Python {platform.python_version()}",
+        f"- {len(complete)} of {len(jobs)} jobs complete, {sum(minutes):.1f} minutes of jobs, written "
+        f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+    ]
+    lines += [f"- missing: {job.folder.name} ({' '.join(job.overrides)})" for job in jobs if not job.finished]
+    return "\n".join(lines)
+
+
+def commit() -> str:
+    """Of the checkout that the package lies in, with a mark where it has changes; `unknown` where it is installed."""
+
+    def git(*words: str) -> str:
+        return subprocess.run(
+            ["git", "-C", str(Path(mosa.__file__).parent), *words], capture_output=True, text=True, check=True
+        ).stdout
+
+    try:
+        found = git("rev-parse", "--short=12", "HEAD").strip()
+        return found + (", with changes" if git("status", "--porcelain", "--untracked-files=no").strip() else "")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def write_csv(path: Path, experiment: Experiment, records: Sequence[Record]) -> None:
+    """One line for each cell, seed and figure, in the unit of metrics.json times `scale`; empty where it is missing."""
+    with open(path, "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow([*experiment.axes, "seed", "label", "figure", "value", "run"])
+        for record in records:
+            for figure in experiment.figures:
+                found = record.value(figure)
+                places = [record.place[axis].name for axis in experiment.axes]
+                writer.writerow(
+                    [
+                        *places,
+                        record.seed,
+                        figure.label,
+                        figure.figure,
+                        "" if found is None else repr(found),
+                        record.job.folder.name,
+                    ]
+                )
+
+
+def latex(experiment: Experiment, tables: Mapping[str, Mapping[str, Mapping[str, Cell | None]]]) -> str:
+    """A tabular for each figure; needs booktabs."""
+    parts = []
+    for figure in experiment.figures:
+        rows = tables[figure.label]
+        columns = list(next(iter(rows.values())))
+        lines = [rf"% {experiment.title}: {figure.label} ({figure.figure})", rf"\begin{{tabular}}{{l{'c' * len(columns)}}}",
+                 r"\toprule",
+                 " & ".join([escaped(figure.label), *map(escaped, columns)]) + r" \\", r"\midrule"]  # fmt: skip
+        for row in rows:
+            cells = (cell_text(rows, row, column, figure, r"\textbf{{{}}}", r"$\pm$") for column in columns)
+            lines.append(" & ".join([escaped(row), *cells]) + r" \\")
+        parts.append("\n".join([*lines, r"\bottomrule", r"\end{tabular}"]))
+    return "\n\n".join(parts) + "\n"
+
+
+def escaped(text: str) -> str:
+    for sign in ("\\", "&", "%", "_", "#", "$"):
+        text = text.replace(sign, r"\textbackslash{}" if sign == "\\" else f"\\{sign}")
+    return text

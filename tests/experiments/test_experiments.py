@@ -1,0 +1,314 @@
+"""The harness of the paper's tables: files that compose, jobs made once, tables of made-up figures, and one experiment for real."""
+
+import json
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from mosa.commands.experiment import arguments, run, shown
+from mosa.config import rehearse
+from mosa.errors import ConfigError, DataError
+from mosa.experiments import running
+from mosa.experiments.analyses import ANALYSES
+from mosa.experiments.collecting import Cell, best_of, records_of, table
+from mosa.experiments.specification import (
+    Experiment,
+    Figure,
+    Option,
+    estimate,
+    experiment_names,
+    folder_name,
+    jobs_of,
+    load_experiment,
+    narrowed,
+    pairs,
+)
+from mosa.experiments.writing import printed_table, write_results
+from mosa.schema import EVALUATION, TRAINING, check
+
+CONF = Path(__file__).parents[2] / "conf"
+PAPER = CONF / "experiment" / "paper"
+NAMES = experiment_names(PAPER)
+
+
+def experiment(**changes) -> Experiment:
+    """Three rows, of which two read the same runs, by two scenes and two seeds."""
+    axes = {
+        "method": (Option("prior", ("adapter=operator",), "prior/"), Option("box", ("adapter=direct",), cost=2.0),
+                   Option("ours", ("adapter=operator",))),
+        "scene": (Option("a", ("scene=a",)), Option("b", ("scene=b",))),
+    }  # fmt: skip
+    figures = (Figure("PSNR", "test/psnr_crop", best="most"), Figure("rms [mm]", "test/rms_m", 1e3, 1, "least"))
+    made = Experiment("made", "Made up", axes, "method", "scene", figures, seeds=(0, 1), minutes={"cpu": 3.0, "gpu": 1.0})
+    return replace(made, **changes)
+
+
+def write_metrics(job, rms=0.010, prior=0.020, **more) -> None:
+    job.folder.mkdir(parents=True, exist_ok=True)
+    figures = {"test/rms_m": rms, "prior/test/rms_m": prior, "test/psnr_crop": 30.0 - 100 * rms, "prior/test/psnr_crop": 25.0,
+               "time/fit_s": 60.0, "time/data_s": 60.0, "time/device": "a machine", **more}  # fmt: skip
+    (job.folder / "metrics.json").write_text(json.dumps(figures))
+
+
+# ------------------------------------------------------------------------------------------------ files
+def options_once(name: str, quick: bool) -> set[tuple[str, ...]]:
+    """Overrides of the first job, and of one for every other option of every axis."""
+    found = load_experiment(PAPER, name, quick)
+    first = {axis: options[0] for axis, options in found.axes.items()}
+    places = [first | {axis: option} for axis, options in found.axes.items() for option in options]
+    return {(*found.common, *(each for option in place.values() for each in option.overrides)) for place in places}
+
+
+def test_every_option_of_every_experiment_composes_and_passes_the_checks_before_a_run():
+    assert len(NAMES) >= 10
+    wanted = set().union(*(options_once(name, quick) for name in NAMES for quick in (False, True)))
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        for overrides in sorted(wanted):
+            config = OmegaConf.to_container(compose("train", overrides=list(overrides)), resolve=False)
+            check(config, TRAINING, EVALUATION)
+            rehearse(config)
+
+
+def test_every_entry_of_the_paper_that_is_named_exists():
+    for name in NAMES:
+        found = load_experiment(PAPER, name)
+        assert found.analysis is None or found.analysis in ANALYSES
+        if found.printed is not None:
+            assert "The paper prints" in printed_table(found.printed)
+
+
+def test_the_paper_s_figures_are_those_of_its_tables():
+    text = printed_table("generalisation")
+    row = next(line for line in text.splitlines() if line.startswith("| MoSA"))
+    values = [[float(v) for v in cell.split("/")] for cell in row.split("|")[2:-1]]
+    assert values[-1] == [31.35, 92.3]  # printed beside them
+    assert np.mean([psnr for psnr, _ in values[:-1]]) == pytest.approx(31.52, abs=0.01)  # the paper's own mean is not theirs
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("title: a\nrows: x\ncolumns: y\nfigures: []\n", "axes: expected this key"),
+    ("title: a\naxes: {x: {o: []}}\nrows: z\ncolumns: x\nfigures: []\n", "rows: expected one of x, found 'z'"),
+    ("title: a\naxes: {x: nothing}\nrows: x\ncolumns: x\nfigures: []\n", r"axes\.x: expected one of .*, found 'nothing'"),
+    ("title: a\naxes: {x: {of: objects, only: [q]}}\nrows: x\ncolumns: x\nfigures: []\n", r"axes\.x: expected some of .*'q'"),
+    ("title: a\naxes: {x: {o: {cots: 1}}}\nrows: x\ncolumns: x\nfigures: []\n", r"axes\.x\.o: expected fields of name"),
+    ("title: a\nfoo: 1\n", "foo: unknown key"),
+    ("[", "no readable YAML"),
+])  # fmt: skip
+def test_a_mistake_in_a_file_names_its_key(tmp_path, text, message):
+    (tmp_path / "_shared.yaml").write_text("objects: {a: []}\n")
+    (tmp_path / "wrong.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        load_experiment(tmp_path, "wrong")
+
+
+def test_mistakes_on_the_command_line_are_named(tmp_path, capsys):
+    for words, message in (
+        (["nothing"], "experiment: expected one of .* or all, found 'nothing'"),
+        (["table_time", "--jobs", "0"], "--jobs"),
+        (["table_time", "--seeds", "a"], "--seeds: expected whole numbers"),
+        (["table_time", "--only", "shoe=1"], "--only: expected AXIS=NAME"),
+        (["table_time", "--only", "scene=boat"], "--only scene: expected some of rabbit, found 'boat'"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            run(arguments([*words, "--dry-run", "--runs", str(tmp_path)]))
+
+
+# ------------------------------------------------------------------------------------------------ jobs
+def test_cells_that_need_the_same_run_share_it(tmp_path):
+    jobs = jobs_of(experiment(), tmp_path)
+    assert len(jobs) == 2 * 2 * 2 and len({job.folder for job in jobs}) == 8  # operator and direct, scenes, seeds
+    shared = [job for job in jobs if len(job.places) == 2]
+    assert len(shared) == 4 and {p["method"].name for p in shared[0].places} == {"prior", "ours"}
+    again = jobs_of(experiment(common=("x=1",)), tmp_path, ["y=2"])
+    assert all("x=1" in job.overrides and "y=2" in job.overrides and job.overrides[-1].startswith("seed=") for job in again)
+    assert not {job.folder for job in again} & {job.folder for job in jobs}
+
+
+def test_a_folder_s_name_does_not_depend_on_the_order_of_different_keys():
+    assert folder_name(["a=1", "b=2", "seed=0"]) == folder_name(["b=2", "seed=0", "a=1"])
+    assert folder_name(["a=1", "a=2"]) != folder_name(["a=2", "a=1"])  # the last one holds
+    assert len(folder_name(["scene.path=" + "x" * 500])) < 100
+
+
+def test_an_experiment_is_narrowed_to_options_and_seeds(tmp_path):
+    found = narrowed(experiment(), pairs(["method=ours", "scene=b"], ["method", "scene"]), (3,))
+    jobs = jobs_of(found, tmp_path)
+    assert [job.overrides for job in jobs] == [("adapter=operator", "scene=b", "seed=3")]
+
+
+def test_the_estimate_learns_from_the_jobs_that_are_complete(tmp_path):
+    jobs = jobs_of(experiment(), tmp_path)
+    assert estimate(jobs, gpu=False, slots=1)[-1] == "8 jobs, 8 to run, about 36 minutes with 1 side by side"  # 4 of 3, 4 of 6
+    assert "about 6 minutes with 2" in estimate(jobs, gpu=True, slots=2)[-1]
+    write_metrics(jobs[0], **{"time/fit_s": 300.0})  # six minutes in place of three
+    assert estimate(jobs, gpu=False, slots=1)[-1] == "8 jobs, 7 to run, about 66 minutes with 1 side by side"
+
+
+FAKE = """
+import json, os, pathlib, sys, time
+folder = pathlib.Path(sys.argv[1])
+log = folder.parent / "log.txt"
+with open(log, "a") as file:
+    file.write(f"begin {folder.name}\\n")
+time.sleep(0.3)
+with open(log, "a") as file:
+    file.write(f"end {folder.name}\\n")
+if "direct" in folder.name:
+    print("ConfigError: it broke")
+    sys.exit(2)
+(folder / "metrics.json").write_text(json.dumps({"gpu": os.environ.get("CUDA_VISIBLE_DEVICES", "")}))
+"""
+
+
+def test_jobs_run_side_by_side_once_and_the_first_of_a_reconstruction_alone(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(running, "command_of", lambda job: [sys.executable, "-c", FAKE, str(job.folder)])
+    jobs = jobs_of(experiment(), tmp_path)
+    failed = running.run_jobs(jobs, [None], 4)
+    assert len(failed) == 4 and set(failed.values()) == {"ConfigError: it broke"}
+    assert capsys.readouterr().out.count("complete after") == 4
+    firsts = {job.folder.name: job.first for job in jobs}
+    done, now = set(), []
+    for line in (tmp_path / "log.txt").read_text().splitlines():
+        word, name = line.split()
+        if word == "begin":
+            assert firsts[name] in done or firsts[name] not in [firsts[other] for other in now], "two make the same reconstruction"
+            now.append(name)
+        else:
+            now.remove(name)
+            done.add(firsts[name])
+    (tmp_path / "log.txt").unlink()
+    assert len(running.run_jobs(jobs, [None], 4)) == 4
+    assert (tmp_path / "log.txt").read_text().count("begin") == 4  # those that failed, no other
+
+
+def test_every_gpu_has_its_own_jobs(tmp_path, monkeypatch):
+    monkeypatch.setattr(running, "command_of", lambda job: [sys.executable, "-c", FAKE, str(job.folder)])
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,7")
+    jobs = [job for job in jobs_of(experiment(), tmp_path) if "operator" in job.folder.name]
+    assert running.run_jobs(jobs, [0, 1], 1) == {}
+    assert {json.loads((job.folder / "metrics.json").read_text())["gpu"] for job in jobs} == {"4", "7"}
+
+
+# ------------------------------------------------------------------------------------------------ tables of made-up figures
+def made_up(tmp_path) -> tuple[Experiment, list]:
+    found = experiment()
+    jobs = jobs_of(found, tmp_path)
+    for job in jobs:
+        scene = job.places[0]["scene"].name
+        if job.places[0]["method"].name == "box" and scene == "b":
+            continue  # it failed
+        write_metrics(job, rms=(0.010 if scene == "a" else 0.030) + 0.002 * job.seed, prior=0.020)
+    return found, jobs
+
+
+def test_a_table_has_means_and_spreads_over_seeds_and_the_mean_over_columns_that_all_have(tmp_path):
+    found, jobs = made_up(tmp_path)
+    rows = table(found, records_of(jobs), found.figures[1])
+    assert rows["ours"]["a"] == Cell(pytest.approx(11.0), pytest.approx(math.sqrt(2)), 2)
+    assert rows["prior"]["a"] == Cell(pytest.approx(20.0), pytest.approx(0.0), 2)
+    assert rows["box"]["b"] is None
+    assert rows["ours"]["mean"] == rows["ours"]["a"]  # of a alone: b is missing of one row
+    assert best_of(rows, "a", "least") in ("ours", "box") and best_of(rows, "b", "least") == "prior"
+    assert best_of(rows, "a", None) is None
+    only = narrowed(found, {"method": ["prior", "ours"]}, None)
+    rows = table(only, records_of(jobs_of(only, tmp_path)), found.figures[1])
+    assert rows["ours"]["mean"] == Cell(pytest.approx(21.0), pytest.approx(math.sqrt(2)), 2)
+
+
+def test_what_was_identified_before_the_adapter_has_its_own_name_and_infinite_figures_are_read(tmp_path):
+    found = experiment(figures=(Figure("E", "id/E", 1e-5), Figure("growth", "id/growth_per_period")), seeds=(0,))
+    jobs = jobs_of(found, tmp_path)
+    for job in jobs:
+        write_metrics(job, **{"id/E": 3e5, "id_prior/E": 2e5, "id/growth_per_period": "Infinity"})
+    rows = table(found, records_of(jobs), found.figures[0])
+    assert rows["prior"]["a"].mean == pytest.approx(2.0) and rows["ours"]["a"].mean == pytest.approx(3.0)
+    assert rows["ours"]["a"].sd is None and rows["ours"]["a"].text(2) == "3.00"
+    assert table(found, records_of(jobs), found.figures[1])["ours"]["a"].text(2) == "inf"
+
+
+def test_the_page_says_where_its_figures_come_from_and_what_is_missing(tmp_path):
+    found, jobs = made_up(tmp_path / "runs")
+    page = write_results(replace(found, printed="generalisation"), jobs, tmp_path / "results", "the command")
+    text = page.read_text()
+    for part in ("| ours ", "11.0 ± 1.4", "`the command`", "seeds: 0, 1", "a machine", "6 of 8 jobs complete",
+                 "12.0 minutes", "The paper prints", "31.35 / 92.3", "made.png"):  # fmt: skip
+        assert part in text, part
+    assert text.count("- missing: ") == 2
+    assert (tmp_path / "results" / "made.png").stat().st_size > 1000 and (tmp_path / "results" / "made.pdf").is_file()
+    lines = (tmp_path / "results" / "made.csv").read_text().splitlines()
+    assert lines[0] == "method,scene,seed,label,figure,value,run" and len(lines) == 1 + 3 * 2 * 2 * 2
+    tex = (tmp_path / "results" / "made.tex").read_text()
+    assert tex.count(r"\begin{tabular}{lccc}") == 2 and r"$\pm$" in tex and r"\textbf{" in tex
+
+
+@pytest.mark.parametrize("plot", ["lines", "map", None])
+def test_every_kind_of_picture_is_drawn_also_where_cells_are_missing(tmp_path, plot):
+    found, jobs = made_up(tmp_path / "runs")
+    write_results(replace(found, plot=plot), jobs, tmp_path / "results", "")
+    assert (tmp_path / "results" / "made.png").is_file() == (plot is not None)
+
+
+def test_nothing_complete_is_a_page_without_figures(tmp_path):
+    found = experiment()
+    page = write_results(found, jobs_of(found, tmp_path), tmp_path / "results", "")
+    assert "0 of 8 jobs complete" in page.read_text() and not (tmp_path / "results" / "made.png").exists()
+
+
+def test_a_damaged_metrics_file_is_named(tmp_path):
+    _, jobs = made_up(tmp_path)
+    (jobs[0].folder / "metrics.json").write_text("{")
+    with pytest.raises(DataError, match=r"metrics\.json.*belongs to the job adapter=operator scene=a seed=0"):
+        records_of(jobs)
+
+
+def test_the_command_is_written_without_folders_of_this_machine():
+    words = ["table_time", "--quick", "--runs", "/a/b", "--results", "/c", "--only", "method=prior only", "--set", "x=1"]
+    options = arguments(words)
+    assert shown(options) == "mosa-experiment table_time --quick --only 'method=prior only' --set x=1"
+
+
+def test_errors_frame_by_frame_are_those_of_the_motions(tmp_path):
+    found = replace(experiment(), seeds=(0,), analysis="long_term", plot=None)
+    jobs = jobs_of(found, tmp_path / "runs")
+    x = np.zeros((4, 5, 3), np.float32)
+    for job in jobs:
+        write_metrics(job)
+        np.savez(job.folder / "truth.npz", **{"train/x": x, "test/one/x": x, "test/two/x": x})
+        for name, size in (("rollout", 0.001), ("prior", 0.002)):
+            moved = {"test/one/x": x + size * np.eye(3)[0], "test/two/x": x + 3 * size * np.eye(3)[1],
+                     "test/one/times": np.arange(4) / 10, "test/two/times": np.arange(4) / 10}  # fmt: skip
+            np.savez(job.folder / f"{name}.npz", **moved)
+    write_results(found, jobs, tmp_path / "results", "")
+    lines = (tmp_path / "results" / "made_frames.csv").read_text().splitlines()
+    assert len(lines) == 1 + 2 * 3 * 4 and lines[0] == "scene,method,time_s,rms_mm,sd_mm"
+    assert "a,prior,0.1000,4.0000,0.0000" in lines and "a,ours,0.3000,2.0000,0.0000" in lines
+    assert (tmp_path / "results" / "made_frames.png").is_file()
+
+
+# ------------------------------------------------------------------------------------------------ one for real
+@pytest.mark.slow
+def test_a_quick_variant_runs_to_its_table_and_is_not_run_again(tmp_path, capsys):
+    words = ["table_generalisation", "figure_heterogeneity", "--quick", "--runs", str(tmp_path / "runs"), "--seeds", "0",
+             "--only", "method=ours", "--set", f"scene.cache={tmp_path / 'cache'}"]  # fmt: skip
+    assert run(arguments(words)) == 0
+    assert "1 jobs, 1 to run" in capsys.readouterr().out  # both read the same run
+    results = tmp_path / "runs" / "results"
+    for name in ("table_generalisation_quick", "figure_heterogeneity_quick"):
+        assert "1 of 1 jobs complete" in (results / f"{name}.md").read_text()
+    assert "correlation" in (results / "figure_heterogeneity_quick.md").read_text()
+    assert (results / "figure_heterogeneity_quick_factor.png").is_file()
+    assert run(arguments(words)) == 0
+    assert "0 to run" in capsys.readouterr().out
+    one = narrowed(load_experiment(PAPER, "table_generalisation", quick=True), {"method": ["ours"]}, (0,))
+    text, pictures = ANALYSES["directions"](one, records_of(jobs_of(one, tmp_path / "runs", words[-1:])), tmp_path / "law")
+    assert "| tiny  | ours" in text and len(pictures) == 1
+    rows = [line.split(",") for line in (tmp_path / "law_directions.csv").read_text().splitlines()[1:]]
+    true = [float(row[5]) for row in rows]
+    assert true[0] / true[18] == pytest.approx(1.6, rel=0.01)  # along the rabbit's fibres and across
+    assert float(rows[0][4]) > 0 and float(rows[0][3]) >= 0
