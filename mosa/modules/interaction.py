@@ -49,7 +49,7 @@ class InteractionNetwork(Adapter):
     replaces_law = True
     chained = False
 
-    def __init__(self, *, hidden: int = 32, nodes: int = 400, neighbours: int = 12, stiffer: float = 2.0) -> None:
+    def __init__(self, *, hidden: int = 32, nodes: int = 250, neighbours: int = 12, stiffer: float = 1.0) -> None:
         super().__init__()
         for name, value, low in (("nodes", nodes, 8), ("neighbours", neighbours, 4)):
             if isinstance(value, bool) or not isinstance(value, int) or value < low:
