@@ -56,10 +56,12 @@ def simulate(
     frame_dt, dx = 1 / body.footage.fps, 2 * body.spacing
     reach = drop.speed + 9.8 * frame_dt * body.footage.frames
     substeps = required_substeps(
-        material.wave_modulus(), material.density, frame_dt, dx, v_max=reach, courant=COURANT, limit=5000
+        material.wave_modulus(), material.density, frame_dt, dx, v_max=reach, courant=COURANT, limit=5000,
+        viscosity=material.viscosity(),
     )
     simulator = Simulator(
-        material.law, dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=GRAVITY, ground=Ground(0.0), up=(0.0, 1.0, 0.0)
+        material.law, dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=GRAVITY, ground=Ground(0.0), up=(0.0, 1.0, 0.0),
+        **material.options,
     )
     velocity = np.array([0.0, -drop.speed, 0.0])
     n = len(particles)

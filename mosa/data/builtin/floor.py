@@ -46,6 +46,7 @@ def floor_rollout(body, scene: Scene, world) -> Tensor:
         v_max=speed,
         courant=min(settings.courant, 0.3),
         limit=5000,
+        viscosity=hidden.viscosity(),
     )
     simulator = Simulator(
         hidden.law,
@@ -58,6 +59,7 @@ def floor_rollout(body, scene: Scene, world) -> Tensor:
         planes=world.planes,
         colliders=world.colliders,
         device=device,
+        **hidden.options,
     )
     n, gravity, up = len(rest), world.gravity.float().cpu(), world.up.float().cpu()
     lift = body.contact().detach().float().cpu() * up

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -24,6 +24,15 @@ class Hidden:
     period: float
     axis: tuple[float, float, float] = (1.0, 0.0, 0.0)
     density: float = 1000.0
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Of `Simulator`."""
+        return {}
+
+    def viscosity(self) -> float:
+        """Viscosity that bounds the time step [Pa s]."""
+        return 0.0
 
     @property
     def known(self) -> dict[str, float]:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from mosa.data.builtin.hidden import Hidden
 from mosa.data.builtin.hidden_material import HiddenMaterial
 from mosa.data.builtin.hidden_yield import HiddenYield
+from mosa.data.builtin.published import PublishedMaterial
 from mosa.errors import ConfigError
 
 
@@ -49,15 +50,19 @@ class Footage:
 @dataclass(frozen=True)
 class BuiltinObject:
     """height: of the shape [m]; spacing of the truth's particles [m] (its grid is twice as coarse: 0.015 m for the
-    rabbit, finer than a learner's of up to 9000 particles); pitch of its surface mesh [m]."""
+    rabbit, finer than a learner's of up to 9000 particles); pitch of its surface mesh [m]. remesh: whether the surface is found
+    anew in every frame, as that of what flows; reach: half width of the world that may be used [m], None: as for all."""
 
     shape: str
     height: float
-    material: Hidden
+    material: Hidden | PublishedMaterial
     drops: dict[str, Drop]
     footage: Footage = field(default_factory=Footage)
     spacing: float = 0.0075
     pitch: float = 0.0025
+    # no part of a cached film's name, or those of the other objects would all be made again
+    remesh: bool = field(default=False, repr=False)
+    reach: float | None = field(default=None, repr=False)
 
 
 RABBIT = HiddenMaterial(E=2e5, nu=0.3, ratio=1.6, fibre=(1.0, 0.3, 0.0), amplitude=0.2, period=0.125)
@@ -143,6 +148,40 @@ OBJECTS = {
         {name: Drop(d.speed, d.axis, d.degrees, d.offset, contact=0.032) for name, d in DROPS.items()},
         Footage(cameras=6, frames=5, size=128, field=0.25, target=0.165), spacing=0.0125, pitch=0.006,
     ),
+}  # fmt: skip
+
+
+PACNERF = {"train": Drop(speed=0.5, contact=0.21)}
+"""As the bird's: half a metre a second at frame 0, the ground five frames later."""
+
+
+def stand_in(shape: str, height: float, law: str, *, spacing: float = 0.0125, remesh: bool = False, frames: int = 14,
+             held: tuple[str, ...] = (), convention: str = "paper", **values: float) -> BuiltinObject:  # fmt: skip
+    """An object that stands in for a scene of PAC-NeRF, with its published law and parameters, filmed as there: 11 cameras, 24
+    frames a second."""
+    material = PublishedMaterial(law=law, values=tuple(values.items()), held=held, convention=convention)
+    film = Footage(cameras=11, frames=frames, size=400, fps=24.0, field=0.52, target=0.38, distance=3.0)
+    return BuiltinObject(shape, height, material, PACNERF, film, spacing=spacing, pitch=0.006, remesh=remesh, reach=1.6)
+
+
+OBJECTS |= {
+    "torus": stand_in("torus", 0.313, "neo_hookean", E=1e6, nu=0.3, spacing=0.011),
+    "bird": stand_in("bird", 0.398, "neo_hookean", E=3e5, nu=0.3),
+    "playdoh": stand_in("playdoh", 0.32, "von_mises", E=2e6, nu=0.3, yield_stress=1.54e4, convention="sqrt23", frames=12,
+                        spacing=0.011),
+    "cat": stand_in("cat", 0.497, "von_mises", E=1e6, nu=0.3, yield_stress=3.85e3, convention="sqrt23", frames=12),
+    "droplet": stand_in("droplet", 0.375, "newtonian", mu=200.0, kappa=1e5, remesh=True, frames=13, spacing=0.011),
+    "letter": stand_in("letter", 0.45, "newtonian", mu=100.0, kappa=1e5, remesh=True, frames=16, spacing=0.0095),
+    "cream": stand_in("cream", 0.365, "herschel_bulkley_hencky", mu=1e4, kappa=1e6, yield_stress=3e3, viscosity=10.0, remesh=True,
+                      spacing=0.011),
+    "toothpaste": replace(
+        stand_in("toothpaste", 0.051, "herschel_bulkley_hencky", mu=5e3, kappa=1e5, yield_stress=200.0, viscosity=10.0, remesh=True,
+                 spacing=0.0013),
+        drops={"train": Drop(speed=0.2, contact=0.1)},
+        footage=Footage(cameras=11, frames=14, size=400, fps=50.0, field=0.075, target=0.058, distance=0.45), pitch=0.0008,
+    ),
+    "trophy": stand_in("trophy", 0.418, "drucker_prager", E=1e6, nu=0.3, friction_angle=40.0, cohesion=0.0,
+                       held=("E", "nu", "cohesion"), remesh=True),
 }  # fmt: skip
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from mosa.data.builtin.open_shapes import calf_color, calf_distance, gorilla_color, gorilla_distance, ring_color, ring_distance
 from mosa.data.builtin.parts import Shape, blend, capsule, coat, ellipsoid, join, mirrored, sphere, step, waves
+from mosa.data.builtin.standin_shapes import STANDIN_SHAPES
 
 # --- rabbit ---------------------------------------------------------------------------------------------------------------
 
@@ -208,5 +209,6 @@ SHAPES = {
     "rainbowball": Shape(rainbowball_distance, rainbowball_color, np.array([[-0.11, -0.01, -0.11], [0.11, 0.21, 0.11]])),
     "gorilla": Shape(gorilla_distance, gorilla_color, np.array([[-0.15, -0.01, -0.16], [0.19, 0.28, 0.16]])),
     "calf": Shape(calf_distance, calf_color, np.array([[-0.17, -0.01, -0.11], [0.19, 0.28, 0.11]])),
+    **STANDIN_SHAPES,
     "ring": Shape(ring_distance, ring_color, np.array([[-0.13, -0.01, -0.13], [0.13, 0.22, 0.13]])),
 }

@@ -96,3 +96,34 @@ def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
         [np.bincount(triangles.ravel(), np.repeat(facing[:, d], 3), len(vertices)) for d in range(3)], -1
     )
     return normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+
+
+AROUND = 3.0
+"""Spacings within which particles make the surface of what flows."""
+
+
+def flowing_surface(positions: np.ndarray, colors: np.ndarray, spacing: float, pitch: float) -> Surface:
+    """Surface of particles (N, 3) [m] that no skin could follow, with the particles' colors (N, 3).
+
+    The level |x - mean of the particles around x| = 0.85 spacings (Zhu and Bridson 2005), weights (1 - (d/3 spacings)^2)^3.
+    """
+    tree, reach = cKDTree(positions), AROUND * spacing
+
+    def around(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(weights (M, k) with a column of sums at least 1e-12, indices (M, k), whether any particle is near (M,))."""
+        distance, index = tree.query(points, k=min(24, len(positions)), distance_upper_bound=reach)
+        near = np.isfinite(distance[:, 0])
+        weight = np.where(np.isfinite(distance), np.maximum(1 - (np.minimum(distance, reach) / reach) ** 2, 0) ** 3, 0.0)
+        return weight / np.maximum(weight.sum(1, keepdims=True), 1e-12), np.minimum(index, len(positions) - 1), near
+
+    def distance(points: np.ndarray) -> np.ndarray:
+        weight, index, near = around(points)
+        mean = np.einsum("mk,mkd->md", weight, positions[index])
+        return np.where(near, np.linalg.norm(points - mean, axis=-1), reach) - 0.85 * spacing
+
+    def color(points: np.ndarray, _rng: np.random.Generator) -> np.ndarray:
+        weight, index, _ = around(points)
+        return np.einsum("mk,mkd->md", weight, colors[index])
+
+    bounds = np.stack([positions.min(0) - 2 * spacing, positions.max(0) + 2 * spacing])
+    return extract_surface(Shape(distance, color, bounds), max(pitch, 0.8 * spacing), np.random.default_rng(0))

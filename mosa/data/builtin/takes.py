@@ -17,7 +17,7 @@ from mosa.data.builtin.drop import simulate
 from mosa.data.builtin.objects import OBJECTS, BuiltinObject, drop_named, object_named
 from mosa.data.builtin.renderer import render_surface, ring_of_cameras
 from mosa.data.builtin.shapes import SHAPES
-from mosa.data.builtin.surface import Skin, Surface, bind, extract_surface, fill
+from mosa.data.builtin.surface import Skin, Surface, bind, extract_surface, fill, flowing_surface
 from mosa.data.footage import WHITE
 from mosa.data.images import composite, resize
 from mosa.errors import ConfigError, DataError
@@ -119,7 +119,15 @@ def film_drop(name: str, sequence: str, material: str, seed: int, progress: bool
             progress=lambda frame: bar.update(),
         )  # fmt: skip
     cameras = cameras_of(body, seed)
-    film_frame = threaded(lambda x: render_surface(surface, skin.follow(x), cameras), fall.positions)
+    paint = SHAPES[body.shape].color(particles, np.random.default_rng([seed, 1])) if body.remesh else None  # as the surface's
+
+    def film_at(x: np.ndarray) -> np.ndarray:
+        if not body.remesh:
+            return render_surface(surface, skin.follow(x), cameras)
+        found = flowing_surface(x, paint, body.spacing, body.pitch)
+        return render_surface(found, found.vertices, cameras)
+
+    film_frame = threaded(film_at, fall.positions)
     with tqdm(total=film.frames, desc=f"{label}: film", unit="frame", disable=not progress, dynamic_ncols=True) as bar:
         pictures = []
         for picture in film_frame:

@@ -13,7 +13,7 @@ from mosa.errors import ConfigError
 from mosa.types import Scene
 
 LATTICE = 0.004
-"""Spacing of the points that stand for the true body [m]."""
+"""Spacing of the points that stand for the true body [m]; less where the truth's own particles are closer."""
 OUTSIDE = 0.7
 """Spacings beyond the true surface from which a particle counts as outside."""
 FARTHEST = 1.0
@@ -40,7 +40,8 @@ def geometry_figures(rest: Tensor, volume: Tensor, scene: Scene) -> dict[str, fl
     shape = SHAPES[object_named(scene.name).shape]
     shift = origin(scene.name)
     points, held = rest.detach().double().cpu().numpy() - shift, volume.detach().double().cpu().numpy()
-    axes = [np.arange(a, b + LATTICE, LATTICE) for a, b in zip(*shape.bounds)]
+    lattice = min(LATTICE, object_named(scene.name).spacing)
+    axes = [np.arange(a, b + lattice, lattice) for a, b in zip(*shape.bounds)]
     true = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     true = true[shape.distance(true) < 0]
     spacing = held.mean() ** (1 / 3)
@@ -48,6 +49,6 @@ def geometry_figures(rest: Tensor, volume: Tensor, scene: Scene) -> dict[str, fl
     return {
         "floor/geometry/outside_share": float((shape.distance(points) > OUTSIDE * spacing).mean()),
         "floor/geometry/missing_share": float((away > FARTHEST * spacing).mean()),
-        "floor/geometry/volume_error": float(held.sum() / (len(true) * LATTICE**3) - 1),
+        "floor/geometry/volume_error": float(held.sum() / (len(true) * lattice**3) - 1),
         "floor/geometry/center_error_m": float(np.linalg.norm(held @ points / held.sum() - true.mean(0))),
     }
