@@ -26,7 +26,7 @@ NEGLIGIBLE = 1e-3
 
 def longitudinal_modulus(material: Material) -> float:
     """E [Pa] of the small-strain response, kappa of a fluid: what a block swings with along its length."""
-    p = {name: float(value) for name, value in material.physical().items()}
+    p = {name: float(value.detach()) for name, value in material.physical().items()}
     if "E" in p:
         return p["E"]
     if float(material.max_viscosity()) > 0:

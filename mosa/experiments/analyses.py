@@ -5,6 +5,7 @@ An analysis gets (experiment, records, stem of its files) and gives (Markdown, p
 from __future__ import annotations
 
 import csv
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -14,9 +15,12 @@ from matplotlib.figure import Figure as Canvas
 from torch import Tensor
 
 from mosa.analysis.anisotropy import directional_modulus, directions_in_plane, redistribution_response, stress_jacobian
+from mosa.analysis.compression import Pressed, press
 from mosa.analysis.stiffness import angle_between, directional_moduli
 from mosa.analysis.tables import markdown
+from mosa.analysis.vibration import longitudinal_modulus
 from mosa.data.builtin.objects import OBJECTS
+from mosa.errors import SimulationDiverged
 from mosa.experiments.collecting import Record
 from mosa.experiments.drawing import save
 from mosa.experiments.specification import Experiment
@@ -24,6 +28,8 @@ from mosa.modules.body import Body
 from mosa.modules.hyperelastic import HyperelasticAdapter
 from mosa.modules.material import material_states
 from mosa.twin import Twin
+
+log = logging.getLogger(__name__)
 
 MOTIONS = {"": "rollout.npz", "prior/": "prior.npz"}
 """File of a run's motions, by the prefix of the model's figures."""
@@ -91,13 +97,14 @@ def long_term(experiment: Experiment, records: Sequence[Record], stem: Path) -> 
 
 
 # ------------------------------------------------------------------------------------------------ laws
-def loaded(records: Sequence[Record], every_seed: bool = False) -> Iterator[tuple[Record, Twin]]:
-    """The records that are the learned law itself and have a checkpoint, with it; of several seeds the first."""
+def loaded(records: Sequence[Record], prefixes: Sequence[str] = ("",)) -> Iterator[tuple[Record, Twin]]:
+    """The records of these models that have a checkpoint, with it (the learned law's, where nothing else is said); of several seeds
+    the first."""
     seen = set()
     for record in records:
         key = tuple(option.name for option in record.place.values())
         path = record.job.folder / "checkpoints" / "last.ckpt"
-        if prefix(record) or not path.is_file() or (key in seen and not every_seed):
+        if prefix(record) not in prefixes or not path.is_file() or key in seen:
             continue
         seen.add(key)
         yield record, Twin.load(path)
@@ -239,6 +246,75 @@ def heterogeneity(experiment: Experiment, records: Sequence[Record], stem: Path)
     return "Stiffness over the body:\n\n" + markdown(header, lines), [save(canvas, stem.with_name(stem.name + "_factor"))]
 
 
+def pressed_modulus(twin: Twin, variant: str, directions: Tensor) -> list[Pressed]:
+    """A specimen of a model's law between two plates, along unit vectors (K, 3)."""
+    body = twin.body
+    material, _, _, adapter = body.parts(variant)
+    adapter = adapter if adapter is not None and adapter.is_on else None
+    poisson = float(material.poisson().detach())
+    return [press(material.law, material.per_particle(), n, modulus=longitudinal_modulus(material), poisson=poisson,
+                  density=body.density, adapter=adapter, stride=body.settings.stride, law_options=body.law_options,
+                  stiffening=1.0 if adapter is None else adapter.stiffening(poisson)) for n in directions]  # fmt: skip
+
+
+def compression(experiment: Experiment, records: Sequence[Record], stem: Path) -> tuple[str, list[Path]]:
+    """E(theta) from the force on two plates, of the true law and of every model, in the plane of the fibres and the vertical."""
+    angles, n = directions_in_plane((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), 13)
+    variants = {"": "adapted", "prior/": "prior"}
+    found: list[tuple[str, list[Pressed]]] = []
+    for record, twin in loaded(records, tuple(variants)):
+        if hasattr(twin.body.adapter, "simulator") and not prefix(record):
+            continue  # no law that a specimen could be made of
+        name = twin.config["cfg"]["scene"].get("name")
+        if not found and name in OBJECTS:
+            hidden = OBJECTS[name].material.variant(twin.config["cfg"]["scene"].get("material", "anisotropic"))
+            one = {key: (value[0] if value.ndim else value) for key, value in hidden.parameters(torch.zeros(1, 3)).items()}
+            found.append(("truth", [press(hidden.law, one, k, modulus=hidden.wave_modulus(), poisson=hidden.known["nu"],
+                                          density=hidden.density, stiffening=1.0) for k in n]))  # fmt: skip
+        try:
+            found.append((label(experiment, record), pressed_modulus(twin, variants[prefix(record)], n)))
+        except SimulationDiverged as error:
+            found.append((label(experiment, record), []))
+            log.warning("%s: %s", label(experiment, record), error)
+    if len(found) < 2 or found[0][0] != "truth":
+        return "", []
+    true = found[0][1]
+    degrees = torch.rad2deg(angles)
+    canvas = Canvas(figsize=(9.0, 3.6), layout="constrained")
+    left, right = canvas.subplots(1, 2, subplot_kw=None)
+    rows, lines = [], []
+    for name, results in found:
+        if not results:
+            lines.append([name, "", "", ""])
+            continue
+        E = torch.tensor([each.modulus for each in results])
+        reference = torch.tensor([each.modulus for each in true])
+        style = "k--" if name == "truth" else "-"
+        left.plot(degrees, E / 1e3, style, label=name)
+        right.plot(100 * results[0].strain, results[0].force, style, label=name)
+        rows += [[name, f"{float(a):.1f}", f"{float(e):.6g}", f"{float(t):.6g}"] for a, e, t in zip(degrees, E, reference)]
+        if name != "truth":
+            off = (E / reference - 1).abs()
+            forces = [abs(force_at(a, 0.04) / force_at(b, 0.04) - 1) for a, b in zip(results, true)]
+            lines.append([name, f"{100 * float(off.mean()):.1f}", f"{100 * float(off.max()):.1f}", f"{100 * max(forces):.1f}"])
+    left.set_xlabel("angle from x towards y [degrees]")
+    left.set_ylabel("E between plates [kPa]")
+    right.set_xlabel("strain along x [%]")
+    right.set_ylabel("force [N]")
+    left.legend(fontsize=8)
+    path = stem.with_name(stem.name + "_plates")
+    write_table(path.with_suffix(".csv"), [experiment.rows, "degrees", "E_Pa", "true_E_Pa"], rows)
+    header = [experiment.rows, "E off, mean [%]", "E off, largest [%]", "force at 4 % strain off, largest [%]"]
+    return "A specimen between plates, first seed, against the true law:\n\n" + markdown(header, lines), [save(canvas, path)]
+
+
+def force_at(result: Pressed, strain: float) -> float:
+    """[N] at a strain, by linear interpolation."""
+    order = result.strain.argsort()
+    return float(np.interp(strain, result.strain[order].numpy(), result.force[order].numpy()))
+
+
 ANALYSES: dict[str, Callable[[Experiment, Sequence[Record], Path], tuple[str, list[Path]]]] = {
     "long_term": long_term, "directions": directions, "heterogeneity": heterogeneity,
+    "compression": compression,
 }  # fmt: skip

@@ -90,6 +90,9 @@ CALF = HiddenMaterial(E=3.5e5, nu=0.33, ratio=1.65, fibre=(1.0, 0.2, 0.35), ampl
 # no directions, one stiffness: what is learned of it has to be nothing
 RING = HiddenMaterial(E=2.5e5, nu=0.34, ratio=1.0, fibre=(1.0, 0.0, 0.0), amplitude=0.0, period=0.1)
 
+# strong fibres in the plane of x and the vertical, no other variation: what a compression test of a specimen measures
+CYLINDER = HiddenMaterial(E=2e5, nu=0.3, ratio=1.8, fibre=(1.0, 0.4, 0.0), amplitude=0.0, period=0.1)
+
 DROPS = {
     "train": Drop(speed=2.5),
     "test_60": Drop(speed=2.5, axis=(0.3, 0.2, 1.0), degrees=60.0, offset=(-0.035, -0.010)),
@@ -141,6 +144,12 @@ OBJECTS = {
         {"train": Drop(speed=2.2), "test_60": Drop(speed=2.5, axis=(0.2, 0.3, 1.0), degrees=60.0),
          "test_110": Drop(speed=2.8, axis=(1.0, 0.2, -0.4), degrees=110.0)},
         Footage(target=0.24), spacing=0.005, pitch=0.002,
+    ),
+    "cylinder": BuiltinObject(
+        "cylinder", 0.24, CYLINDER,
+        {"train": Drop(speed=2.5), "test_60": Drop(speed=2.5, axis=(0.3, 0.2, 1.0), degrees=60.0),
+         "test_90": Drop(speed=3.0, axis=(0.0, 0.0, 1.0), degrees=90.0)},
+        Footage(target=0.30), spacing=0.0065,
     ),
     # the rabbit, small and short, for tests and sweeps: every stage of the program, none of its accuracy
     "tiny": BuiltinObject(

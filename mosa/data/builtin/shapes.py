@@ -200,7 +200,31 @@ def rainbowball_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarra
     return np.clip(color, 0.02, 1.0)
 
 
+# --- cylinder -------------------------------------------------------------------------------------------------------------
+
+
+CYLINDER_AXIS = np.array([0.30, 0.92, 0.18]) / np.linalg.norm([0.30, 0.92, 0.18])
+
+
+def cylinder_distance(points: np.ndarray) -> np.ndarray:
+    """A cylinder, 0.2 m long and 0.17 m wide, its edges rounded by 0.012 m; it leans and lands on an edge."""
+    rounding, half = 0.012, 0.1
+    arm = points - np.array([0.0, 0.122, 0.0])
+    along = arm @ CYLINDER_AXIS
+    away = np.linalg.norm(arm - along[:, None] * CYLINDER_AXIS, axis=-1) - (0.085 - rounding)
+    over = np.abs(along) - (half - rounding)
+    return np.minimum(np.maximum(away, over), 0) + np.hypot(np.maximum(away, 0), np.maximum(over, 0)) - rounding
+
+
+def cylinder_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Grey rubber with blue and ochre patches, a red spot on one side, a white one near the top of another."""
+    color = coat(points, rng, (0.62, 0.64, 0.66), (0.20, 0.36, 0.66), (0.86, 0.66, 0.28), patch=0.085, grain=0.026)
+    color = blend(color, (0.80, 0.20, 0.18), step(-sphere(points, (0.090, 0.080, 0.020), 0.034), 0.0, 0.006))
+    return np.clip(blend(color, (0.95, 0.94, 0.90), step(-sphere(points, (-0.040, 0.160, 0.075), 0.030), 0.0, 0.006)), 0.02, 1.0)
+
+
 SHAPES = {
+    "cylinder": Shape(cylinder_distance, cylinder_color, np.array([[-0.13, -0.02, -0.12], [0.13, 0.27, 0.12]])),
     "rabbit": Shape(rabbit_distance, rabbit_color, np.array([[-0.15, -0.01, -0.10], [0.13, 0.27, 0.10]])),
     "peanut": Shape(peanut_distance, peanut_color, np.array([[-0.15, -0.03, -0.09], [0.15, 0.16, 0.09]])),
     "mandarin": Shape(mandarin_distance, mandarin_color, np.array([[-0.13, -0.02, -0.12], [0.13, 0.21, 0.12]])),
