@@ -295,7 +295,9 @@ def test_errors_frame_by_frame_are_those_of_the_motions(tmp_path):
 @pytest.mark.slow
 def test_a_quick_variant_runs_to_its_table_and_is_not_run_again(tmp_path, capsys):
     words = ["table_generalisation", "figure_heterogeneity", "--quick", "--runs", str(tmp_path / "runs"), "--seeds", "0",
-             "--only", "method=ours", "--set", f"scene.cache={tmp_path / 'cache'}"]  # fmt: skip
+             "--only", "method=ours"]  # fmt: skip
+    more = [f"scene.cache={tmp_path / 'cache'}", "evaluation.samples=500", "evaluation.assignment=100"]
+    words += [word for each in more for word in ("--set", each)]
     assert run(arguments(words)) == 0
     assert "1 jobs, 1 to run" in capsys.readouterr().out  # both read the same run
     results = tmp_path / "runs" / "results"
@@ -306,10 +308,10 @@ def test_a_quick_variant_runs_to_its_table_and_is_not_run_again(tmp_path, capsys
     assert run(arguments(words)) == 0
     assert "0 to run" in capsys.readouterr().out
     one = narrowed(load_experiment(PAPER, "table_generalisation", quick=True), {"method": ["ours"]}, (0,))
-    text, pictures = ANALYSES["directions"](one, records_of(jobs_of(one, tmp_path / "runs", words[-1:])), tmp_path / "law")
+    text, pictures = ANALYSES["directions"](one, records_of(jobs_of(one, tmp_path / "runs", more)), tmp_path / "law")
     assert "| tiny  | ours" in text and len(pictures) == 1
     rows = [line.split(",") for line in (tmp_path / "law_directions.csv").read_text().splitlines()[1:]]
-    text, _ = ANALYSES["compression"](one, records_of(jobs_of(one, tmp_path / "runs", words[-1:])), tmp_path / "law")
+    text, _ = ANALYSES["compression"](one, records_of(jobs_of(one, tmp_path / "runs", more)), tmp_path / "law")
     assert "| ours " in text and (tmp_path / "law_plates.png").is_file()
     assert len((tmp_path / "law_plates.csv").read_text().splitlines()) == 1 + 2 * 13  # the truth and ours
     true = [float(row[5]) for row in rows]
