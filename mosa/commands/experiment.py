@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import shlex
+import signal
 import sys
 from pathlib import Path
 
@@ -39,6 +40,7 @@ def arguments(words: list[str]) -> argparse.Namespace:
 
 def main(words: list[str] | None = None) -> None:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    signal.signal(signal.SIGTERM, interrupt)  # or the jobs would go on without anyone who waits for them
     try:
         code = run(arguments(sys.argv[1:] if words is None else words))
     except MosaError as error:
@@ -48,6 +50,10 @@ def main(words: list[str] | None = None) -> None:
         print("\nstopped; the same command goes on from here", file=sys.stderr)
         code = 130
     sys.exit(code)
+
+
+def interrupt(*_) -> None:
+    raise KeyboardInterrupt
 
 
 def run(options: argparse.Namespace) -> int:

@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from mosa.experiments.specification import Job
+from mosa.experiments.specification import MINUTES, Job
 
 PROGRAM = "from mosa.commands.train import main; main()"
 WAIT = 0.2
@@ -25,7 +25,7 @@ def command_of(job: Job) -> list[str]:
 def run_jobs(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: int) -> dict[str, str]:
     """Run what is not complete; {folder: reason} of the jobs that failed. devices: GPUs, [None] for the CPU.
 
-    Of jobs that share a reconstruction the first runs alone, and the others find it in the cache."""
+    Of jobs that share a reconstruction the first runs alone until it is made, and the others find it in the cache."""
     waiting = [job for job in jobs if not job.finished]
     known = {job.first for job in jobs if job.finished}
     free = [device for device in devices for _ in range(side_by_side)]
@@ -42,10 +42,11 @@ def run_jobs(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: i
                 if process.returncode != 0 or not job.finished:
                     failed[job.folder.name] = reason(job, process.returncode)
                 outcome = "failed" if job.folder.name in failed else "complete"
-                print(
-                    f"[{done}/{total}] {job.folder.name}: {outcome} after {(time.perf_counter() - began) / 60:.1f} min", flush=True
-                )
-            making = {job.first for job, _, _ in running.values()} - known
+                minutes = (time.perf_counter() - began) / 60
+                if outcome == "complete":
+                    (job.folder / MINUTES).write_text(f"{minutes:.3f}\n")
+                print(f"[{done}/{total}] {job.folder.name}: {outcome} after {minutes:.1f} min", flush=True)
+            making = {job.first for job, _, _ in running.values() if not reconstructed(job)} - known
             ready = next((job for job in waiting if job.first not in making), None)
             if free and ready is not None:
                 waiting.remove(ready)
@@ -68,8 +69,14 @@ def begin(job: Job, device: int | None) -> subprocess.Popen:
     if device is not None:
         listed = [part for part in environment.get("CUDA_VISIBLE_DEVICES", "").split(",") if part]
         environment["CUDA_VISIBLE_DEVICES"] = listed[device] if device < len(listed) else str(device)
-    with open(job.folder / "screen.log", "ab") as screen:
+    with open(job.folder / "screen.log", "wb") as screen:
         return subprocess.Popen(command_of(job), stdout=screen, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, env=environment)
+
+
+def reconstructed(job: Job) -> bool:
+    """Whether a running job has its films and its reconstruction, which are then in the cache."""
+    screen = job.folder / "screen.log"
+    return screen.is_file() and "reconstruction took" in screen.read_text(errors="replace")
 
 
 def reason(job: Job, code: int) -> str:

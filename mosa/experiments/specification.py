@@ -199,6 +199,8 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
     return list(found.values())
 
 
+MINUTES = "minutes.txt"
+"""File of a job's folder with the wall time of its process."""
 QUIET = ("logger", "evaluation.video")
 """Overrides that the name of a folder leaves to its digest."""
 
@@ -219,9 +221,12 @@ def figures_of(job: Job) -> dict[str, float | str]:
 
 
 def minutes_taken(job: Job) -> float | None:
-    """Wall time of a complete job's stages [min], None where it is not complete."""
+    """Wall time of a complete job [min], without its start where that was not measured; None where it is not complete."""
     if not job.finished:
         return None
+    measured = job.folder / MINUTES
+    if measured.is_file():
+        return float(measured.read_text())
     figures = figures_of(job)
     return sum(value for key, value in figures.items() if key.startswith("time/") and key.endswith("_s") and key.count("_") == 1
                and isinstance(value, (int, float))) / 60  # fmt: skip

@@ -187,6 +187,18 @@ def test_jobs_run_side_by_side_once_and_the_first_of_a_reconstruction_alone(tmp_
     assert (tmp_path / "log.txt").read_text().count("begin") == 4  # those that failed, no other
 
 
+def test_what_shares_a_reconstruction_begins_when_that_is_made(tmp_path, monkeypatch):
+    said = FAKE.replace("time.sleep(0.3)", "time.sleep(0.2); print('reconstruction took 1 s', flush=True); time.sleep(1.5)")
+    monkeypatch.setattr(running, "command_of", lambda job: [sys.executable, "-c", said, str(job.folder)])
+    jobs = jobs_of(narrowed(experiment(), {"scene": ["a"]}, (0,)), tmp_path)
+    assert len(jobs) == 2
+    running.run_jobs(jobs, [None], 2)
+    words = [line.split()[0] for line in (tmp_path / "log.txt").read_text().splitlines()]
+    assert words == ["begin", "begin", "end", "end"]
+    taken = [float((job.folder / "minutes.txt").read_text()) for job in jobs if job.finished]
+    assert len(taken) == 1 and taken[0] > 1.5 / 60  # one of them fails
+
+
 def test_every_gpu_has_its_own_jobs(tmp_path, monkeypatch):
     monkeypatch.setattr(running, "command_of", lambda job: [sys.executable, "-c", FAKE, str(job.folder)])
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,7")
