@@ -172,6 +172,11 @@ class Interactions:
         return Rollout(x=xs, v=vs, F=Fs, F_tot=Fs, times=times, final=final, inverted=inverted, reactions=None,
                        counts=(self.substeps,) * (frames - 1))
 
+    def stepper(self, *_, **__) -> None:
+        raise ConfigError("adapter=interaction: expected a whole rollout (Twin.simulate); its nodes are not advanced step by step")
+
+    rollout_worlds = stepper
+
     def frame(self, x: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         """(x, v) (M, 3) of the nodes one frame later."""
         network, dt = self.network, self.frame_dt / self.substeps
