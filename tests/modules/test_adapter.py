@@ -285,3 +285,18 @@ def test_all_combinations_of_switches_evaluate():
         for dependence in ("full", "constant"):
             answer = drawn_adapter(hidden=4, state_dependence=dependence, **options)(material_state(w, s))
             assert torch.isfinite(answer.G).all() and torch.isfinite(answer.h).all(), options
+
+
+@pytest.mark.parametrize("dependence", ["full", "constant"])
+def test_the_matrix_between_the_planes_has_a_bound_of_its_own(dependence):
+    """The paper's two alphas: entries of a product of LU factors within alpha are within 3 alpha (1 + alpha) of the identity's."""
+    w, s = drawn_states(40)
+    largest = []
+    for bound in (None, 0.01, 0.2):
+        adapter = drawn_adapter(size=30.0, alpha=0.1, alpha_normal=bound, state_dependence=dependence)  # every tanh at its end
+        C = adapter.affine(adapter.operator, w, s)[2].C.detach()
+        largest.append((float(C[:, :3].abs().max()), float(C[:, 3].abs().max())))
+    assert largest[0][0] == largest[1][0] == largest[2][0]
+    assert largest[1][1] <= 0.01 * 3 * 1.01 < largest[0][1] < largest[2][1]
+    with pytest.raises(ConfigError, match=r"adapter\.alpha_normal"):
+        drawn_adapter(alpha_normal=1.5)
