@@ -65,6 +65,14 @@ def test_the_commands_find_their_configuration_and_an_experiment_of_ones_own(bui
     assert configured(built, tmp_path, "eval", "ckpt_path=x.ckpt").ckpt_path == "x.ckpt"
 
 
+def test_the_experiments_are_installed_with_the_paper_s_figures(built, tmp_path):
+    result = call(built, tmp_path, "experiment")
+    assert result.returncode == 0 and "table_generalisation" in result.stdout, result.stderr[-2000:]
+    assert (built / "mosa" / "experiments" / "printed.yaml").is_file()
+    wrong = call(built, tmp_path, "experiment", "nothing", "--dry-run")
+    assert wrong.returncode == 2 and "ConfigError: experiment: expected one of" in wrong.stderr
+
+
 def test_in_a_clone_the_configuration_is_where_it_is_edited():
     assert Path(commands.configuration()) == ROOT / "conf"
 
@@ -75,7 +83,8 @@ def test_there_is_one_version_and_every_command_has_its_function():
     for target in project["project"]["scripts"].values():
         module, function = target.split(":")
         assert callable(getattr(__import__(module, fromlist=[function]), function))
-    assert set(project["project"]["scripts"]) == {"mosa-train", "mosa-eval", "mosa-view", "mosa-splats"}
+    names = {"mosa-train", "mosa-eval", "mosa-view", "mosa-splats", "mosa-experiment"}
+    assert set(project["project"]["scripts"]) == names
 
 
 @pytest.mark.parametrize("flag", ["--help", "-h"])
