@@ -188,6 +188,8 @@ def directions(experiment: Experiment, records: Sequence[Record], stem: Path) ->
             [names[column], name, "" if w is None else f"{float(w.max()):.3f}", f"{spread:.3f}", ratio, f"{float(axis):.0f}"]
         )
     grid[0, 0].set_ylabel("w")
+    for place in grid[0]:
+        place.set_ylim(0, max(0.05, *(float(w.max()) for _, _, _, w, _, _ in found if w is not None), 0.05) * 1.05)
     grid[1, 0].set_ylabel("E over its mean")
     grid[1, -1].legend(fontsize=8)
     path = stem.with_name(stem.name + "_directions")
