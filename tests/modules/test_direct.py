@@ -36,7 +36,7 @@ def test_increment_and_redistribution_say_the_same():
     w, s = drawn_states(10)
     A, b = adapter.redistribution(w, s)
     torch.testing.assert_close((A @ s[..., None])[..., 0] - s + b, adapter.increment(w, s), rtol=0, atol=1e-14)
-    torch.testing.assert_close(adapter(material_state(w, s)).h, E_REF * b, rtol=1e-14, atol=0)
+    torch.testing.assert_close(adapter(material_state(w, s)).h, E_REF * b, rtol=1e-13, atol=0)  # sums of six in other orders
 
 
 @pytest.mark.parametrize("switch", ["no_C", "no_pre", "no_post", "no_prior_stress"])

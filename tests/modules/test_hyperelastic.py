@@ -96,7 +96,8 @@ def test_stiffness_stays_positive_where_the_prior_moved_after_the_stage_began():
 
 @torch.no_grad()
 def test_the_numbers_leave_the_isotropic_part_to_the_prior():
-    """log(C0^-1/2 (C0 + S) C0^-1/2) has no isotropic part, whatever the numbers are."""
+    """log(C0^-1/2 (C0 + S) C0^-1/2) has no isotropic part, whatever the numbers are, to what torch.matrix_exp is exact to: 1e-11 of
+    matrices of size 0.01, more than of any others, and not the same on all processors."""
     nu = torch.tensor(0.3, dtype=torch.float64)
     inner = torch.linalg.inv(root_stiffness(nu))
     assert torch.allclose(root_stiffness(nu) @ root_stiffness(nu), isotropic_stiffness(nu), rtol=0, atol=1e-15)
@@ -105,7 +106,7 @@ def test_the_numbers_leave_the_isotropic_part_to_the_prior():
         M = inner @ adapter_of(row).stiffness() @ inner
         values, V = torch.linalg.eigh(0.5 * (M + M.T))
         A = V @ torch.diag(values.log()) @ V.T
-        assert abs(float(A.trace())) < 1e-12 and abs(float(one @ A @ one)) < 1e-12
+        assert abs(float(A.trace())) < 1e-10 and abs(float(one @ A @ one)) < 1e-10
 
 
 @pytest.mark.parametrize("nu", [0.2, 0.3, 0.4, 0.48])

@@ -51,7 +51,7 @@ def test_a_sure_law_is_off_by_the_models_error_alone_and_an_unsure_one_by_more()
     rollout, sd = sure.predict(draws=4, frames=6)
     assert sd.shape == rollout.x.shape[:2] and float((sd - 0.004).abs().max()) < 1e-5
     before = read_numbers(unsure.body)
-    _, wider = unsure.predict(draws=4, frames=6)
+    _, wider = unsure.predict(draws=4, frames=9)
     assert float(wider[-1].mean()) > 0.0041 and torch.equal(read_numbers(unsure.body), before)
     with pytest.raises(ConfigError, match="no posterior"):
         Twin(sure.body, WORLD, 0.01, {}, start(height=0.05, speed=-1.0)).predict(frames=3)
