@@ -117,7 +117,7 @@ def stored(
     folder = _geometry_cache(scene, settings, cache_dir).folder
     if folder is None or settings.splats is not None or not (folder / "geometry.pt").is_file():
         return False
-    folder = _open_cache(cache_dir, scene, asdict(settings), seed, spacing=spacing()).folder
+    folder = _open_cache(cache_dir, scene, _motion_settings(settings), seed, spacing=spacing()).folder
     return folder is not None and (folder / "motion.pt").is_file()
 
 
@@ -256,9 +256,9 @@ def reconstruct(
         appearance = Appearance(static, constant_coefficients(static.colors))
     else:  # a folder of its own: nothing else depends on its settings
         apart = _open_cache(cache_dir, scene, asdict(settings), seed, **more)
-        stored = apart.stage("carried", carried_stage)
-        colored = {name: stored.pop(name) for name in ("harmonics", "normals", "light")}
-        appearance = Appearance(Splats(**stored), **colored)
+        parts = apart.stage("carried", carried_stage)
+        colored = {name: parts.pop(name) for name in ("harmonics", "normals", "light")}
+        appearance = Appearance(Splats(**parts), **colored)
     return Reconstruction(splats, spacing, volume, cues_of(motion, splats, settings), static, geometry.figures(spacing), appearance)
 
 

@@ -96,12 +96,14 @@ def test_results_come_from_the_cache(squashed, found, spacing, cache, monkeypatc
     again = reconstruct(squashed, settings=SETTINGS, spacing=spacing, cache_dir=cache, progress=False)
     assert torch.equal(again.cues.positions, found.cues.positions) and torch.equal(again.splats.colors, found.splats.colors)
     assert torch.equal(again.appearance.harmonics, found.appearance.harmonics)
+    assert pipeline.stored(squashed, lambda: spacing, SETTINGS, cache_dir=cache)
     folders = [{p.name for p in folder.iterdir()} for folder in sorted((cache / "reconstruction").iterdir())]
     # the geometry does not depend on the particles' spacing, and nothing on the carried splats
     carried, geometry, rest = sorted(folders, key=lambda names: (len(names), "geometry.pt" in names))
     assert carried == {"key.json", "carried.pt"} and geometry == {"key.json", "geometry.pt"}
     assert {"static.png", "particles.png", "motion.png", "key.json", "motion.pt"} <= rest
     assert not any(n.endswith(".tmp") for n in rest)
+    assert not pipeline.stored(squashed, lambda: 2 * spacing, SETTINGS, cache_dir=cache)
 
 
 def test_a_damaged_stage_is_computed_again_and_the_rest_kept(squashed, found, spacing, cache, monkeypatch):
