@@ -197,7 +197,7 @@ class Identification:
         bodies = [body][:seats] + [copy.deepcopy(body) for _ in range(seats - 1)]
         self.iteration, self.noise, self.substeps = 0, None, None
         self.grid: list[residuals.Fields] | None = None  # differences between the two grids, of every pair
-        if self.settings.grid_error > 0 and not self.calibrating:
+        if self.knows_grid:
             blocks.append(Block("grid", torch.zeros(1), torch.full((1,), float(settings.grid_error)), 0.2, nuisance=True))
         self.newton = GaussNewton(blocks, [self._seat(each) for each in bodies], progress=progress,
                                   many=self._many if body.rest.is_cuda and not body.settings.adaptive else None)
@@ -214,9 +214,14 @@ class Identification:
     def _seat(self, body: Body) -> Seat:
         multiple = torch.zeros(1, dtype=torch.float64)
         tensors = tensors_of(body, adapter=self.adapter, heterogeneity=self.heterogeneity)
-        if self.settings.grid_error > 0 and not self.calibrating:
+        if self.knows_grid:
             tensors.append(multiple)
         return Seat(tensors, lambda: self._whitened(body, float(multiple)))
+
+    @property
+    def knows_grid(self) -> bool:
+        """Whether there is a second grid, and with it a last number: the multiple of the difference."""
+        return self.settings.grid_error > 0 and not self.calibrating
 
     @property
     def pairs(self) -> list[tuple[int, float]]:
@@ -250,7 +255,7 @@ class Identification:
                     len(take.cues.positions), self.world.colliders, observed=take.cues.positions if gain else None, gain=gain)
                 for k, own in enumerate(rollout.worlds()):
                     found[first + k].append(residuals.fields(own, take.cues, take.start.rotation, self.chosen))
-        multiples = rows[:, -1].tolist() if self.newton.blocks[-1].name == "grid" else [0.0] * len(rows)
+        multiples = rows[:, -1].tolist() if self.knows_grid else [0.0] * len(rows)
         return torch.stack([self._compared(own, multiple) for own, multiple in zip(found, multiples)])
 
     def _fields(self, body: Body) -> list[residuals.Fields]:
@@ -275,7 +280,7 @@ class Identification:
 
     def multiple(self) -> float:
         """Of the difference between the two grids that is identified beside the numbers; 0 where none is."""
-        return float(self.newton.seats[0].tensors[-1]) if self.newton.blocks[-1].name == "grid" else 0.0
+        return float(self.newton.seats[0].tensors[-1]) if self.knows_grid else 0.0
 
     def _coarser(self) -> list[residuals.Fields] | None:
         """What the numbers predict on a coarser grid; None where it cannot simulate them."""
@@ -291,7 +296,7 @@ class Identification:
     def _measure_noise(self) -> None:
         """Noise and what the grid gets wrong, at the numbers in use."""
         found = self._fields(self.body)
-        if self.settings.grid_error > 0 and not self.calibrating:
+        if self.knows_grid:
             coarser = self._coarser()
             if coarser is not None:
                 self.grid = residuals.difference(found, coarser)
@@ -370,7 +375,7 @@ class Identification:
         self.noise = None if state["noise"] is None else [tuple(t.to(device) for t in each) for each in state["noise"]]
         if state.get("grid") is not None:
             self.grid = [residuals.Fields(*(t.to(device) for t in each)) for each in state["grid"]]
-        if self.newton.blocks[-1].name == "grid":
+        if self.knows_grid:
             self.newton.seats[0].tensors[-1].fill_(float(state.get("multiple", 0.0)))
 
     def posterior(self) -> Posterior:
