@@ -10,10 +10,10 @@ import time
 
 import torch
 
-from mosa.physics.boundary import Plane
-from mosa.physics.collider_motion import Motion
-from mosa.physics.colliders import Box, Capsule, Collider, Cylinder, HalfSpace, Sphere
-from mosa.physics.rollout import Simulator
+from mosa.physics.contact.colliders import Box, Capsule, Collider, Cylinder, HalfSpace, Sphere
+from mosa.physics.contact.motion import Motion
+from mosa.physics.contact.planes import Plane
+from mosa.physics.engine.simulator import Simulator
 from mosa.types import ParticleState
 
 SUBSTEPS, FRAMES = 32, 3

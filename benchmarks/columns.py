@@ -21,8 +21,8 @@ import time
 
 import torch
 
-from mosa.physics.boundary import Plane
-from mosa.physics.rollout import Simulator
+from mosa.physics.contact.planes import Plane
+from mosa.physics.engine.simulator import Simulator
 from mosa.types import ParticleState
 
 BASE, DENSITY, E, NU, GRAVITY = 0.2, 1500.0, 5e5, 0.3, 9.8

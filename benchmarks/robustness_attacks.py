@@ -28,7 +28,7 @@ from mosa.errors import MosaError
 from mosa.known import check_known
 from mosa.modules.body import Start
 from mosa.npz import read_npz, write_npz
-from mosa.physics.collider_mesh import field_of_mesh
+from mosa.physics.contact.mesh import field_of_mesh
 from mosa.reconstruction.cache import StageCache
 from mosa.schema import EVALUATION, TRAINING, check
 from mosa.twin import Twin

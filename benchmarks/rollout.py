@@ -46,8 +46,8 @@ from substep import body
 
 from mosa.config import build_adapter
 from mosa.modules.body import SimulationSettings
-from mosa.physics import workspace
-from mosa.physics.rollout import Simulator
+from mosa.physics.engine import workspace
+from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState
 
 HERE = Path(__file__).parent

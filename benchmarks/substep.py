@@ -16,8 +16,8 @@ import time
 
 import torch
 
-from mosa.physics.mpm import SegmentSolver, grid_window
-from mosa.physics.rollout import Simulator
+from mosa.physics.engine.segment import SegmentSolver, grid_window
+from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground
 
 

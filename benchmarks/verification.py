@@ -40,7 +40,7 @@ import stresses
 import unit_figures as units
 from bodies import DENSITY, ELASTIC, LAWS, PRECISIONS, E, is_fluid
 from gradients import Case
-from mosa.physics.laws import law_named
+from mosa.physics.constitutive.laws import law_named
 
 IMAGES = ROOT / "docs" / "images"
 SINGLE, DOUBLE = PRECISIONS

@@ -30,9 +30,9 @@ from mosa.episode import Episode
 from mosa.modules.body import Body, SimulationSettings, Start, World
 from mosa.modules.hyperelastic import NUMBERS, HyperelasticAdapter
 from mosa.modules.material import Material
-from mosa.physics.collider_motion import Motion
-from mosa.physics.colliders import Box, Collider, Sphere
-from mosa.physics.rollout import Simulator
+from mosa.physics.contact.colliders import Box, Collider, Sphere
+from mosa.physics.contact.motion import Motion
+from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState
 
 DX, STEP, DENSITY, MU, LAM = 1 / 32, 0.02, 1000.0, 1.2e4, 3e4

@@ -21,10 +21,10 @@ from mosa.modules.identification import IdentificationSettings, few_numbers
 from mosa.modules.material import Material
 from mosa.modules.stages import Stage
 from mosa.modules.stiffness_modes import StiffnessModes
-from mosa.physics.boundary import Plane
-from mosa.physics.collider_motion import Motion
-from mosa.physics.colliders import colliders_from_config, domain_walls
-from mosa.physics.laws import law_named
+from mosa.physics.constitutive.laws import law_named
+from mosa.physics.contact.colliders import colliders_from_config, domain_walls
+from mosa.physics.contact.motion import Motion
+from mosa.physics.contact.planes import Plane
 from mosa.types import Ground, Scene
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ from mosa.data.agreement import lines_of_sight, misses
 from mosa.errors import ConfigError, MosaError
 from mosa.limits import machine_memory
 from mosa.modules.body import Body, Start, World
-from mosa.physics.memory import KEPT_ON_CPU
+from mosa.physics.engine.budget import KEPT_ON_CPU
 from mosa.prediction import DRAWS
 from mosa.reconstruction.observed import object_windows
 from mosa.reconstruction.resolution import grid_spacing

@@ -17,9 +17,9 @@ from torch import Tensor
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body import Body, Ready, Start, World
 from mosa.modules.identification import each_law
-from mosa.physics.collider_motion import Poses, exponential, rotation_matrices, rotation_vector
-from mosa.physics.colliders import reach
-from mosa.physics.stepping import STATE, Moment, flat
+from mosa.physics.contact.colliders import reach
+from mosa.physics.contact.motion import Poses, exponential, rotation_matrices, rotation_vector
+from mosa.physics.engine.stepping import STATE, Moment, flat
 from mosa.types import ParticleState
 
 TWISTS, TARGETS = ("velocity", "angular_velocity"), ("position", "rotation")

@@ -15,8 +15,8 @@ from mosa.errors import ConfigError, DataError
 from mosa.known import check_known, conf_folder
 from mosa.limits import machine_memory
 from mosa.modules.body import Body, Start, World
-from mosa.physics.collider_overlap import check_clear
-from mosa.physics.colliders import colliders_from_config
+from mosa.physics.contact.colliders import colliders_from_config
+from mosa.physics.contact.overlap import check_clear
 from mosa.schema import EVALUATION, SIMULATION, SPLATS, TRAINING, check
 from mosa.twin import Twin
 from mosa.types import Scene

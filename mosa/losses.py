@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mosa.physics.factorisation import singular_value_decomposition
+from mosa.physics.constitutive.singular_values import singular_value_decomposition
 from mosa.rotations import axial, skew
 
 TINY = 1e-8

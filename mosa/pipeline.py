@@ -44,7 +44,7 @@ from mosa.modules.body import Body, Start, World
 from mosa.modules.carried_splats import CarriedSplats
 from mosa.modules.gauss_newton import Posterior
 from mosa.modules.lit_mosa import LitMosa, Take
-from mosa.physics.colliders import colliders_from_config
+from mosa.physics.contact.colliders import colliders_from_config
 from mosa.plan import plan, plan_text
 from mosa.prediction import determined, predicted_spread
 from mosa.progress import tqdm

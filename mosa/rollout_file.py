@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from mosa.npz import write_npz
-from mosa.physics.collider_motion import Motion, Trajectory, rotation_matrices
-from mosa.physics.colliders import Collider
+from mosa.physics.contact.colliders import Collider
+from mosa.physics.contact.motion import Motion, Trajectory, rotation_matrices
 from mosa.types import Rollout
 
 

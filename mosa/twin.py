@@ -31,8 +31,8 @@ from mosa.modules.carried_splats import CarriedSplats, seen
 from mosa.modules.gauss_newton import Posterior
 from mosa.modules.identification import each_law, read_numbers
 from mosa.npz import write_npz
-from mosa.physics.collider_overlap import check_clear
-from mosa.physics.colliders import Collider, colliders_from_config
+from mosa.physics.contact.colliders import Collider, colliders_from_config
+from mosa.physics.contact.overlap import check_clear
 from mosa.prediction import total_spread
 from mosa.progress import tqdm
 from mosa.rendering.cameras import look_at

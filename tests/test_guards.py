@@ -17,7 +17,7 @@ from mosa.data.particles import read_ply
 from mosa.errors import ConfigError, DataError
 from mosa.guards import check_begin, check_particles
 from mosa.limits import machine_memory
-from mosa.physics.collider_mesh import field_of_mesh
+from mosa.physics.contact.mesh import field_of_mesh
 from mosa.reconstruction.cache import StageCache
 from mosa.run import read_figures
 

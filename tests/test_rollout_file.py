@@ -7,8 +7,8 @@ import pytest
 import torch
 from test_world import PLATE, twin
 
-from mosa.physics.collider_motion import Motion
-from mosa.physics.colliders import Collider, Sphere, colliders_from_config
+from mosa.physics.contact.colliders import Collider, Sphere, colliders_from_config
+from mosa.physics.contact.motion import Motion
 from mosa.rollout_file import poses, save_rollout
 
 

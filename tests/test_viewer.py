@@ -19,7 +19,7 @@ from mosa.modules.body import Body, SimulationSettings, Start
 from mosa.modules.carried_splats import CarriedSplats
 from mosa.modules.heterogeneity import HeterogeneityField
 from mosa.modules.material import Material
-from mosa.physics.colliders import domain_walls
+from mosa.physics.contact.colliders import domain_walls
 from mosa.twin import Twin, save_observed, save_rollout
 from mosa.types import Appearance, MotionCues, Rollout, Splats
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.modules.adapter import Adapter
 from mosa.modules.microplane import MANDEL
-from mosa.physics.asking import MaterialState
+from mosa.physics.engine.adapter_interface import MaterialState
 
 States = Callable[[Tensor], MaterialState]
 """From F (M, 3, 3) float64 to what an adapter reads there: `mosa.modules.material.material_states`."""

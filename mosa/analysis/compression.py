@@ -15,11 +15,11 @@ from torch import Tensor
 
 from mosa.analysis.anisotropy import in_double
 from mosa.modules.adapter import Adapter
-from mosa.physics.collider_motion import Motion
-from mosa.physics.colliders import Box, Collider
-from mosa.physics.elasticity import wave_modulus
-from mosa.physics.rollout import Simulator
-from mosa.physics.time_step import required_substeps
+from mosa.physics.constitutive.elasticity import wave_modulus
+from mosa.physics.contact.colliders import Box, Collider
+from mosa.physics.contact.motion import Motion
+from mosa.physics.engine.simulator import Simulator
+from mosa.physics.engine.time_step import required_substeps
 from mosa.types import ParticleState
 
 HEIGHT, RADIUS, CELLS = 0.2, 0.08, 8

@@ -12,8 +12,8 @@ from mosa.errors import SimulationDiverged
 from mosa.modules.adapter import Adapter
 from mosa.modules.material import Material
 from mosa.modules.stiffening import ADAPTER_MARGIN
-from mosa.physics.rollout import Simulator
-from mosa.physics.time_step import step_rate
+from mosa.physics.engine.simulator import Simulator
+from mosa.physics.engine.time_step import step_rate
 from mosa.types import ParticleState
 
 GROWTH_LIMIT = 1.05

@@ -14,8 +14,8 @@ from mosa.modules import microplane
 from mosa.modules.fused.selection import PRECISIONS, check_options, chosen, weights_of
 from mosa.modules.progressive import Correction, ProgressiveOperator, apply
 from mosa.modules.stiffening import ADAPTER_MARGIN, acoustic_stiffening, worst_stiffening
-from mosa.physics.activations import backward_at_hand
-from mosa.physics.asking import AdapterOperator, MaterialState
+from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState
+from mosa.physics.engine.network_evaluation import backward_at_hand
 
 
 class OperatorStatistics(NamedTuple):

@@ -19,12 +19,12 @@ from mosa.modules.criteria import corrected_rollout
 from mosa.modules.heterogeneity import HeterogeneityField
 from mosa.modules.material import Material
 from mosa.modules.stiffness_modes import StiffnessModes
-from mosa.physics.adaptive import StepControl
-from mosa.physics.asking import AdapterOperator
-from mosa.physics.boundary import Plane
-from mosa.physics.colliders import Collider, reach
-from mosa.physics.rollout import Simulator
-from mosa.physics.time_step import required_substeps
+from mosa.physics.contact.colliders import Collider, reach
+from mosa.physics.contact.planes import Plane
+from mosa.physics.engine.adapter_interface import AdapterOperator
+from mosa.physics.engine.adaptive_steps import StepControl
+from mosa.physics.engine.simulator import Simulator
+from mosa.physics.engine.time_step import required_substeps
 from mosa.rotations import skew
 from mosa.types import Ground, ParticleState, Rollout
 
@@ -143,7 +143,7 @@ every change of the modulus would need new ones in nearly every step of a fit.""
 @dataclass(frozen=True)
 class SimulationSettings:
     """dx [m]; `stride`: substeps between evaluations of the networks; `max_substeps` per frame; `precision`: 32 | 64;
-    `adaptive`: choose the substeps of each frame from the state at its start, at least `min_substeps` (see `physics.adaptive`)."""
+    `adaptive`: choose the substeps of each frame from the state at its start, at least `min_substeps` (`adaptive_steps.py`)."""
 
     dx: float
     stride: int = 8

@@ -8,7 +8,7 @@ from torch import Tensor
 from mosa.errors import ConfigError
 from mosa.modules.adapter import Adapter, check_network, rested
 from mosa.modules.networks import TwoHiddenLayers, zero_outputs
-from mosa.physics.asking import AdapterOperator, MaterialState
+from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState
 
 
 class DirectAdapter(Adapter):

@@ -1,6 +1,6 @@
 """The default adapter: an anisotropic stiffness added to the prior's energy, so that the learned law has an energy at every strain.
 
-psi(F) = beta psi_prior(F) + mu E : (S + (1 - beta) C0) : E, E a strain in the material frame (`physics.strain`), mu the shear
+psi(F) = beta psi_prior(F) + mu E : (S + (1 - beta) C0) : E, E a strain in the material frame (`strain.py`), mu the shear
 modulus at the particle. At small strain the prior's stiffness 2 mu C0 becomes 2 mu (C0 + S). S follows from numbers A as
 
     C0 + S = C0^(1/2) exp(A) C0^(1/2),      A symmetric, orthogonal to the two isotropic tensors,
@@ -21,8 +21,8 @@ from mosa.errors import ConfigError
 from mosa.modules.adapter import Adapter, OperatorStatistics
 from mosa.modules.microplane import MANDEL, isotropic_stiffness
 from mosa.modules.stiffening import ADAPTER_MARGIN, acoustic_stiffening
-from mosa.physics.asking import AdapterOperator, MaterialState
-from mosa.physics.strain import STRAINS
+from mosa.physics.constitutive.strain import STRAINS
+from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState
 
 SHARPNESS = 60.0
 """Of the smoothed smallest eigenvalue: it is above the true one by at most log(6)/60."""

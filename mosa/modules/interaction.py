@@ -29,7 +29,7 @@ from torch.utils.checkpoint import checkpoint
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.modules.adapter import Adapter
 from mosa.modules.networks import TwoHiddenLayers, zero_outputs
-from mosa.physics.asking import AdapterOperator, MaterialState
+from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState
 from mosa.types import ParticleState, Rollout
 
 DAMPING = 0.1
@@ -190,7 +190,7 @@ class Interactions:
         return x, v
 
     def contact(self, x: Tensor, v: Tensor) -> Tensor:
-        """Velocities after the ground, as a grid node's (`mosa.physics.boundary`), but that a node may leave it in every mode: on a
+        """Velocities after the ground, as a grid node's (`contact/planes.py`), but that a node may leave it in every mode: on a
         grid the particles leave sticky nodes, which are no part of the body."""
         ground, up = self.world.ground, self.world.up.to(x)
         normal = (v @ up)[:, None]

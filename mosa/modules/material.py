@@ -10,11 +10,11 @@ import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError
-from mosa.physics.asking import MaterialState
-from mosa.physics.elasticity import lame, wave_modulus
-from mosa.physics.laws import law_named
-from mosa.physics.plasticity import friction_alpha
-from mosa.physics.rollout import Simulator
+from mosa.physics.constitutive.elasticity import lame, wave_modulus
+from mosa.physics.constitutive.laws import law_named
+from mosa.physics.constitutive.plasticity import friction_alpha
+from mosa.physics.engine.adapter_interface import MaterialState
+from mosa.physics.engine.simulator import Simulator
 
 NU_MAX, ANGLE_MAX = 0.49, 89.0
 AUTO = "auto"

@@ -21,8 +21,8 @@ from torch import Tensor, nn
 from mosa.errors import ConfigError
 from mosa.modules.adapter import Adapter
 from mosa.modules.warm_start import SMALLEST_STRAIN, drawn_stretches
-from mosa.physics.asking import AdapterOperator, MaterialState
-from mosa.physics.factorisation import singular_value_decomposition
+from mosa.physics.constitutive.singular_values import singular_value_decomposition
+from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState
 
 INPUTS, OUTPUTS = 13, 9
 PLACES = ((0, 5, 4), (5, 1, 3), (4, 3, 2))

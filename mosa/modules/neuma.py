@@ -16,7 +16,7 @@ from torch.nn.functional import linear
 
 from mosa.errors import ConfigError
 from mosa.modules.nclaw import NeuralLaw, network, pretrain
-from mosa.physics.asking import MaterialState
+from mosa.physics.engine.adapter_interface import MaterialState
 
 
 class LowRankLinear(nn.Linear):

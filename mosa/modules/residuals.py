@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mosa.physics.factorisation import singular_value_decomposition
+from mosa.physics.constitutive.singular_values import singular_value_decomposition
 from mosa.types import MotionCues, Rollout
 
 CUE_ERRORS = (1e-3, 0.02, 0.03)

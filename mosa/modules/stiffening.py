@@ -1,4 +1,4 @@
-"""By how much an adapter can stiffen the body, which the time step has to follow (`physics.time_step`)."""
+"""By how much an adapter can stiffen the body, which the time step has to follow (`physics.engine.time_step`)."""
 
 from __future__ import annotations
 

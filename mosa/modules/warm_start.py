@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mosa.errors import ConfigError
 from mosa.modules.adapter import StressAdapter
-from mosa.physics.asking import MaterialState
+from mosa.physics.engine.adapter_interface import MaterialState
 
 SMALLEST_STRAIN = 1e-3
 

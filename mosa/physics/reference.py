@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.physics.boundary import THICKNESS, WHOLE, Plane
+from mosa.physics.contact.planes import THICKNESS, WHOLE, Plane
 from mosa.types import ParticleState
 
 EYE = torch.eye(3, dtype=torch.float64)

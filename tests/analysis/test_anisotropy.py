@@ -12,8 +12,8 @@ from mosa.modules.adapter import Adapter, StressAdapter
 from mosa.modules.hyperelastic import HyperelasticAdapter
 from mosa.modules.material import material_states
 from mosa.modules.microplane import MANDEL
-from mosa.physics.asking import AdapterOperator
-from mosa.physics.elasticity import lame
+from mosa.physics.constitutive.elasticity import lame
+from mosa.physics.engine.adapter_interface import AdapterOperator
 
 E, NU = 1e5, 0.35
 MU, LAM = lame(torch.tensor(E, dtype=torch.float64), torch.tensor(NU, dtype=torch.float64))

@@ -8,8 +8,8 @@ from mosa.errors import ConfigError
 from mosa.modules.adapter import StressAdapter
 from mosa.modules.material import material_states
 from mosa.modules.warm_start import drawn_stretches, warm_start
-from mosa.physics.elasticity import lame
-from mosa.physics.rollout import Simulator
+from mosa.physics.constitutive.elasticity import lame
+from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState
 
 E, NU = 8e4, 0.4

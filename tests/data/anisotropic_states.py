@@ -2,9 +2,9 @@
 
 import torch
 
-from mosa.physics.particle_operations import first_advance
+from mosa.physics.constitutive.material_operations import first_advance
+from mosa.physics.engine.simulator import Simulator
 from mosa.physics.reference import polar, unvech
-from mosa.physics.rollout import Simulator
 
 
 def drawn_rotations(count: int, seed: int) -> torch.Tensor:

@@ -22,9 +22,9 @@ from mosa.data.images import composite, resize
 from mosa.data.scene import held_out_sequences, load_scene
 from mosa.errors import ConfigError
 from mosa.modules.body import World
-from mosa.physics.boundary import Plane
-from mosa.physics.collider_motion import Motion
-from mosa.physics.colliders import Collider, HalfSpace
+from mosa.physics.contact.colliders import Collider, HalfSpace
+from mosa.physics.contact.motion import Motion
+from mosa.physics.contact.planes import Plane
 from mosa.rendering.cameras import project
 
 

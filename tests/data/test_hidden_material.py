@@ -7,7 +7,7 @@ import warp as wp
 from mosa.data.builtin.hidden_material import LAW, fibre_energy, fibre_neo_hookean, fibre_stiffness
 from mosa.data.builtin.objects import OBJECTS, PEANUT, RABBIT
 from mosa.errors import ConfigError
-from mosa.physics.laws import LawParameters, law_named
+from mosa.physics.constitutive.laws import LawParameters, law_named
 
 wp.config.quiet = True
 

@@ -7,8 +7,8 @@ import torch
 
 from mosa.data.builtin.hill import COEFFICIENTS, HILL, HillMaterial
 from mosa.errors import ConfigError
+from mosa.physics.engine.simulator import Simulator
 from mosa.physics.reference import deviator, hencky_material, polar
-from mosa.physics.rollout import Simulator
 from mosa.types import Ground, ParticleState
 
 from .anisotropic_states import check_gradients, drawn_rotations, drawn_states, mapped, stress

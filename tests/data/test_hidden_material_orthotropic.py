@@ -6,7 +6,7 @@ import torch
 from mosa.data.builtin.axes import axes_matrix, axes_parameter
 from mosa.data.builtin.orthotropic import MODULI, ORTHOTROPIC, OrthotropicMaterial, orthotropic_energy
 from mosa.errors import ConfigError
-from mosa.physics.laws import law_named
+from mosa.physics.constitutive.laws import law_named
 from mosa.physics.reference import polar
 
 from .anisotropic_states import check_gradients, drawn_rotations, drawn_states, stress

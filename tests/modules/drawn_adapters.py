@@ -3,7 +3,7 @@
 import torch
 
 from mosa.modules.adapter import StressAdapter
-from mosa.physics.asking import MaterialState
+from mosa.physics.engine.adapter_interface import MaterialState
 
 E_REF = 2e5
 

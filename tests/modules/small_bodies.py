@@ -8,7 +8,7 @@ from mosa.modules.body import Body, SimulationSettings, Start, World
 from mosa.modules.hyperelastic import HyperelasticAdapter
 from mosa.modules.material import Material
 from mosa.modules.stiffness_modes import StiffnessModes
-from mosa.physics.factorisation import singular_value_decomposition
+from mosa.physics.constitutive.singular_values import singular_value_decomposition
 from mosa.types import Ground, MotionCues
 
 E, NU, DX, FRAME_DT = 3e4, 0.35, 0.04, 1 / 60

@@ -19,7 +19,7 @@ from mosa.modules.interaction import InteractionNetwork
 from mosa.modules.material import Material, material_states
 from mosa.modules.nclaw import NeuralLaw, invariants, matrix_of, polar_rotation, pretrain, vech_of
 from mosa.modules.neuma import LowRankLaw
-from mosa.physics.boundary import Plane
+from mosa.physics.contact.planes import Plane
 
 CONF = Path(__file__).parents[2] / "conf"
 E, NU = 3e4, 0.35

@@ -12,8 +12,8 @@ from small_bodies import FRAME_DT, STICKY, WORLD, small_body, start
 from mosa.episode import TwinState
 from mosa.errors import ConfigError, DataError
 from mosa.modules.identification import read_numbers
-from mosa.physics.collider_motion import Trajectory, exponential
-from mosa.physics.colliders import colliders_from_config
+from mosa.physics.contact.colliders import colliders_from_config
+from mosa.physics.contact.motion import Trajectory, exponential
 from mosa.twin import Twin
 
 STEPS = 8

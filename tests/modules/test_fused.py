@@ -10,8 +10,8 @@ from mosa.errors import ConfigError
 from mosa.modules.adapter import StressAdapter
 from mosa.modules.fused.half_weights import packed
 from mosa.modules.fused.selection import weights_of
-from mosa.physics.activations import at_hand, from_weights, same_weights
-from mosa.physics.rollout import Simulator
+from mosa.physics.engine.network_evaluation import at_hand, from_weights, same_weights
+from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState
 
 triton = pytest.importorskip("triton")

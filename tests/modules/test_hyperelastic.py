@@ -14,10 +14,10 @@ from mosa.modules.hyperelastic import NUMBERS, HyperelasticAdapter, anisotropic_
 from mosa.modules.microplane import isotropic_stiffness
 from mosa.modules.stiffening import ADAPTER_MARGIN
 from mosa.physics import reference
-from mosa.physics.asking import MaterialState
-from mosa.physics.laws import SLOTS, law_named
-from mosa.physics.material_kernels import field_types, stress_kernel
-from mosa.physics.strain import STRAINS
+from mosa.physics.constitutive.laws import SLOTS, law_named
+from mosa.physics.constitutive.material_kernels import field_types, stress_kernel
+from mosa.physics.constitutive.strain import STRAINS
+from mosa.physics.engine.adapter_interface import MaterialState
 
 SCALE = torch.tensor([1, 1, 1, 2**0.5, 2**0.5, 2**0.5], dtype=torch.float64)
 

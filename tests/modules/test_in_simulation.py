@@ -7,7 +7,7 @@ import torch
 from drawn_adapters import drawn_adapter, randomise
 
 from mosa.modules.adapter import StressAdapter
-from mosa.physics.rollout import Simulator
+from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState
 
 E, NU = 2e4, 0.3

@@ -10,8 +10,8 @@ from omegaconf import OmegaConf
 
 from mosa.errors import ConfigError
 from mosa.modules.material import ANGLE_MAX, FORMS, NU_MAX, Material
-from mosa.physics import laws
-from mosa.physics.laws import law_named
+from mosa.physics.constitutive import laws
+from mosa.physics.constitutive.laws import law_named
 
 CONF = Path(__file__).parents[2] / "conf" / "prior"
 ELASTIC = {"E": 1e5, "nu": 0.4}

@@ -9,7 +9,7 @@ from mosa.modules.body import EVEN, Body, SimulationSettings
 from mosa.modules.direct import DirectAdapter
 from mosa.modules.material import Material
 from mosa.modules.stiffening import ADAPTER_MARGIN, acoustic_stiffening, worst_stiffening
-from mosa.physics.time_step import required_substeps
+from mosa.physics.engine.time_step import required_substeps
 
 PLACES = ((0, 0), (1, 1), (2, 2), (1, 2), (2, 0), (0, 1))
 OPERATOR = {"state_dependence": "constant", "major_symmetry": True, "no_pre": True, "no_post": True}

@@ -5,7 +5,7 @@ import torch
 import warp as wp
 
 from mosa.errors import ConfigError
-from mosa.physics.boundary import MODES, THICKNESS, Plane, ground_plane, make_plane_functions, pack_planes
+from mosa.physics.contact.planes import MODES, THICKNESS, Plane, ground_plane, make_plane_functions, pack_planes
 from mosa.types import Ground
 
 collide, adj_collide = make_plane_functions(wp.float64)

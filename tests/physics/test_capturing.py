@@ -8,9 +8,9 @@ import pytest
 import torch
 import warp as wp
 
-from mosa.physics import workspace
-from mosa.physics.capturing import ATTEMPTS, uninterrupted
-from mosa.physics.rollout import Simulator
+from mosa.physics.engine import workspace
+from mosa.physics.engine.capture import ATTEMPTS, uninterrupted
+from mosa.physics.engine.simulator import Simulator
 
 
 def test_no_garbage_is_collected_while_a_graph_is_captured():

@@ -9,12 +9,12 @@ from torch.func import functional_call
 
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.modules.adapter import StressAdapter, pool
-from mosa.physics import chains as chains_module
-from mosa.physics import mpm as mpm_module
-from mosa.physics.asking import AdapterOperator
-from mosa.physics.capturing import ATTEMPTS
-from mosa.physics.chains import SEGMENT, Plan, chain_length, grouped
-from mosa.physics.rollout import Simulator
+from mosa.physics.engine import chain_schedule as chains_module
+from mosa.physics.engine import segment as mpm_module
+from mosa.physics.engine.adapter_interface import AdapterOperator
+from mosa.physics.engine.capture import ATTEMPTS
+from mosa.physics.engine.chain_schedule import SEGMENT, Plan, chain_length, grouped
+from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]

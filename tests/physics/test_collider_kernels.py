@@ -4,11 +4,11 @@ import pytest
 import torch
 import warp as wp
 
-from mosa.physics.collider_kernels import collider_kernels
-from mosa.physics.collider_mesh import SignedDistanceField
-from mosa.physics.collider_motion import exponential
-from mosa.physics.collider_reference import collide
-from mosa.physics.colliders import Box, Capsule, Collider, Cylinder, HalfSpace, Sphere, pack_colliders
+from mosa.physics.contact.collider_kernels import collider_kernels
+from mosa.physics.contact.colliders import Box, Capsule, Collider, Cylinder, HalfSpace, Sphere, pack_colliders
+from mosa.physics.contact.mesh import SignedDistanceField
+from mosa.physics.contact.motion import exponential
+from mosa.physics.contact.reference import collide
 
 DT, DX, DIMS, COUNT = 0.01, 0.05, (12, 11, 10), 12 * 11 * 10
 KERNELS = collider_kernels(wp.float64)

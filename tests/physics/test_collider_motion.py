@@ -7,7 +7,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from mosa.errors import ConfigError
-from mosa.physics.collider_motion import Motion, Trajectory, exponential, rotation_vector, sample_poses
+from mosa.physics.contact.motion import Motion, Trajectory, exponential, rotation_vector, sample_poses
 
 
 def exact(**tolerance):

@@ -7,10 +7,10 @@ import warp as wp
 from scipy.spatial import ConvexHull, cKDTree
 
 from mosa.errors import ConfigError
-from mosa.physics.collider_mesh import field_of_mesh, field_of_triangles
-from mosa.physics.collider_reference import signed_distance as twin
-from mosa.physics.collider_shapes import shape_functions
-from mosa.physics.colliders import Box, Capsule, Collider, Cylinder, HalfSpace, Sphere, pack_colliders
+from mosa.physics.contact.colliders import Box, Capsule, Collider, Cylinder, HalfSpace, Sphere, pack_colliders
+from mosa.physics.contact.mesh import field_of_mesh, field_of_triangles
+from mosa.physics.contact.reference import signed_distance as twin
+from mosa.physics.contact.shapes import shape_functions
 
 functions = shape_functions(wp.float64)
 signed_distance, curvature = functions.signed_distance, functions.curvature

@@ -6,13 +6,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mosa.physics.boundary import Plane
-from mosa.physics.collider_motion import Motion, Trajectory, exponential
-from mosa.physics.collider_reference import signed_distance
-from mosa.physics.colliders import Box, Capsule, Collider, Cylinder, HalfSpace, Sphere, domain_walls
-from mosa.physics.elasticity import lame
-from mosa.physics.rollout import Simulator
-from mosa.physics.time_step import required_substeps
+from mosa.physics.constitutive.elasticity import lame
+from mosa.physics.contact.colliders import Box, Capsule, Collider, Cylinder, HalfSpace, Sphere, domain_walls
+from mosa.physics.contact.motion import Motion, Trajectory, exponential
+from mosa.physics.contact.planes import Plane
+from mosa.physics.contact.reference import signed_distance
+from mosa.physics.engine.simulator import Simulator
+from mosa.physics.engine.time_step import required_substeps
 from mosa.types import ParticleState
 
 DX, SPACING, DENSITY = 0.04, 0.02, 1000.0
@@ -246,7 +246,7 @@ CASES = {
 def test_gradient_of_a_rollout(name, make_block, monkeypatch):
     """In pose, velocities (per frame), the body's position and velocity and its stiffness; loss on the state and the reactions."""
     shape, mode, friction, thickness = CASES[name]
-    monkeypatch.setattr("mosa.physics.stepping.SEGMENT", 8)
+    monkeypatch.setattr("mosa.physics.engine.stepping.SEGMENT", 8)
     state = make_block(velocity=(0.0, -0.8, 0.0))
     leaves = {"position": [0.15, -0.05, 0.11], "rotation": [0.2, -0.1, 0.3], "velocity": [[0.2, 0.4, 0.0], [0.0, 0.6, -0.2]],
               "angular_velocity": [[1.0, 0.0, 2.0], [0.0, -3.0, 1.0]], "x0": [0.0] * 3, "v0": [0.0] * 3, "mu": 4e4}  # fmt: skip

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError
-from mosa.physics.collider_motion import Motion
-from mosa.physics.collider_reference import signed_distance
-from mosa.physics.colliders import Collider, Sphere, colliders_from_config, pack_colliders, reach
-from mosa.physics.rollout import Simulator
+from mosa.physics.contact.colliders import Collider, Sphere, colliders_from_config, pack_colliders, reach
+from mosa.physics.contact.motion import Motion
+from mosa.physics.contact.reference import signed_distance
+from mosa.physics.engine.simulator import Simulator
 
 
 def test_every_type(tmp_path):

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from mosa.physics.collider_motion import Motion
-from mosa.physics.colliders import Box, Capsule, Collider, Cylinder, HalfSpace, Sphere
-from mosa.physics.rollout import Simulator
+from mosa.physics.contact.colliders import Box, Capsule, Collider, Cylinder, HalfSpace, Sphere
+from mosa.physics.contact.motion import Motion
+from mosa.physics.engine.simulator import Simulator
 from mosa.types import ParticleState
 
 pytestmark = pytest.mark.gpu

@@ -7,10 +7,10 @@ import pytest
 import torch
 import warp as wp
 
-from mosa.physics import workspace
-from mosa.physics.collider_motion import Motion
-from mosa.physics.colliders import Collider, Sphere
-from mosa.physics.rollout import Simulator
+from mosa.physics.contact.colliders import Collider, Sphere
+from mosa.physics.contact.motion import Motion
+from mosa.physics.engine import workspace
+from mosa.physics.engine.simulator import Simulator
 from mosa.types import ParticleState
 
 
@@ -31,7 +31,7 @@ def test_captured_segments_are_those_launched_one_by_one(kept, tight, collides, 
         monkeypatch.setattr(workspace, "SPARE", 2**30)
         monkeypatch.setattr(workspace, "IDLE", 1)
         monkeypatch.setattr(workspace, "SMALL", 0)
-    monkeypatch.setattr("mosa.physics.memory.KEPT_ON_CPU", 2**29 if kept else 0)
+    monkeypatch.setattr("mosa.physics.engine.budget.KEPT_ON_CPU", 2**29 if kept else 0)
     replays, launches, dims, sizes = [], [], set(), set()
     replay, place, send = wp.capture_launch, workspace.Workspace.set_window, workspace.Workspace._launch
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mosa.physics.asking import AdapterOperator
-from mosa.physics.rollout import Simulator
+from mosa.physics.engine.adapter_interface import AdapterOperator
+from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState
 
 pytestmark = pytest.mark.gpu
@@ -59,8 +59,8 @@ def on(device, dtype, state):
 @pytest.mark.parametrize("kept", [True, False])
 def test_gradients_with_states_kept_and_run_again(dtype, substeps, tolerance, kept, make_block, monkeypatch):
     """An operator that is asked for once, as the default adapter is; three times: passes run eagerly, captured, replayed."""
-    monkeypatch.setattr("mosa.physics.memory.KEPT_SHARE", 0.25 if kept else 0.0)
-    monkeypatch.setattr("mosa.physics.memory.KEPT_ON_CPU", 0)
+    monkeypatch.setattr("mosa.physics.engine.budget.KEPT_SHARE", 0.25 if kept else 0.0)
+    monkeypatch.setattr("mosa.physics.engine.budget.KEPT_ON_CPU", 0)
     results = {}
     for device in ("cuda", "cpu"):
         state, volume = on(device, dtype, make_block(n=6))

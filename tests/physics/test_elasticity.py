@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError
-from mosa.physics.elasticity import lame, wave_modulus
-from mosa.physics.laws import law_named, law_names
+from mosa.physics.constitutive.elasticity import lame, wave_modulus
+from mosa.physics.constitutive.laws import law_named, law_names
+from mosa.physics.engine.simulator import Simulator
 from mosa.physics.reference import unvech
-from mosa.physics.rollout import Simulator
 
 MU, LAM, KAPPA = 3.0, 5.0, 7.0
 ELASTIC = {"mu": MU, "lam": LAM}

@@ -6,7 +6,7 @@ import pytest
 import torch
 import warp as wp
 
-from mosa.physics.kinematics import contract, hencky_material, hencky_spatial, rotation, rotation_of, svd
+from mosa.physics.constitutive.kinematics import contract, hencky_material, hencky_spatial, rotation, rotation_of, svd
 
 FUNCTIONS = ["rotation", "stretch", "hencky_spatial", "hencky_material", "contract"]
 

@@ -5,9 +5,9 @@ import torch
 import warp as wp
 
 from mosa.errors import ConfigError
-from mosa.physics.elasticity import neo_hookean
-from mosa.physics.laws import LawParameters, register_law
-from mosa.physics.rollout import Simulator
+from mosa.physics.constitutive.elasticity import neo_hookean
+from mosa.physics.constitutive.laws import LawParameters, register_law
+from mosa.physics.engine.simulator import Simulator
 
 
 @wp.func

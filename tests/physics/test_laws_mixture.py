@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError
-from mosa.physics.laws import law_named, law_names
-from mosa.physics.rollout import Simulator
+from mosa.physics.constitutive.laws import law_named, law_names
+from mosa.physics.engine.simulator import Simulator
 from mosa.types import ParticleState
 
 LAWS = ["corotated", "drucker_prager", "newtonian"]

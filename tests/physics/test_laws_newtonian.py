@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from mosa.physics.particle_operations import first_advance
+from mosa.physics.constitutive.material_operations import first_advance
+from mosa.physics.engine.simulator import Simulator
 from mosa.physics.reference import polar, unvech
-from mosa.physics.rollout import Simulator
 
 MU, KAPPA, DT = 0.4, 7.0, 1e-3
 EYE = torch.eye(3).double()

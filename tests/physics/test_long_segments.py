@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from mosa.errors import SimulationDiverged
-from mosa.physics.collider_motion import Motion
-from mosa.physics.colliders import Collider, Sphere
-from mosa.physics.rollout import Simulator
+from mosa.physics.contact.colliders import Collider, Sphere
+from mosa.physics.contact.motion import Motion
+from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground
 
 PARAMETERS = {"mu": 4e4, "lam": 5e4}
@@ -66,7 +66,7 @@ def test_divergence_in_a_long_segment_names_the_substep_of_the_short_one(make_bl
 
 def gradients(state, long, monkeypatch, *, kept=True, frames=9, stiffness=1.0, **options):
     """(gradients in positions, velocities, their affine part and modulus, lengths of the segments that had buffers)."""
-    monkeypatch.setattr("mosa.physics.memory.KEPT_ON_CPU", 2**30 if kept else 0)
+    monkeypatch.setattr("mosa.physics.engine.budget.KEPT_ON_CPU", 2**30 if kept else 0)
     modulus = torch.tensor(4e4 * stiffness, dtype=torch.float64)
     leaves = [t.clone().requires_grad_() for t in (state.x, state.v, state.C_affine, modulus)]
     start = replace(state, x=leaves[0], v=leaves[1], C_affine=leaves[2])

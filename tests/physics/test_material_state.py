@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mosa.physics.rollout import Simulator
+from mosa.physics.engine.simulator import Simulator
 
 
 @pytest.mark.parametrize("law", ["corotated", "von_mises"])

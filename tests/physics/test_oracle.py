@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from mosa.physics.boundary import Plane
-from mosa.physics.particle_operations import first_advance
+from mosa.physics.constitutive.material_operations import first_advance
+from mosa.physics.contact.planes import Plane
+from mosa.physics.engine.simulator import Simulator
 from mosa.physics.reference import unvech
-from mosa.physics.rollout import Simulator
 from mosa.types import Ground, ParticleState
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*det F <= 0")

@@ -7,9 +7,9 @@ import torch
 
 from mosa.errors import ConfigError
 from mosa.physics import reference
-from mosa.physics.particle_operations import first_advance
-from mosa.physics.plasticity import friction_alpha
-from mosa.physics.rollout import Simulator
+from mosa.physics.constitutive.material_operations import first_advance
+from mosa.physics.constitutive.plasticity import friction_alpha
+from mosa.physics.engine.simulator import Simulator
 
 MU, LAM = 3.0, 5.0
 RATE = {"mu": MU, "kappa": 7.0, "yield_stress": 0.8, "viscosity": 2e-3}  # viscosity/(2 mu dt) = 1/3

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from mosa.physics.particle_operations import first_advance
+from mosa.physics.constitutive.material_operations import first_advance
+from mosa.physics.engine.simulator import Simulator
 from mosa.physics.reference import deviator, hencky_material
-from mosa.physics.rollout import Simulator
 
 MU, KAPPA, YIELD, DT = 3.0, 7.0, 0.8, 1e-3
 LAWS = ["herschel_bulkley", "herschel_bulkley_hencky"]

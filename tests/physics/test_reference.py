@@ -7,9 +7,9 @@ import torch
 
 from mosa.errors import ConfigError
 from mosa.physics import reference
-from mosa.physics.asking import AdapterOperator
-from mosa.physics.boundary import Plane
-from mosa.physics.rollout import Simulator
+from mosa.physics.contact.planes import Plane
+from mosa.physics.engine.adapter_interface import AdapterOperator
+from mosa.physics.engine.simulator import Simulator
 from mosa.types import ParticleState
 
 MU, LAM, DENSITY, DX, DT = 4e4, 6e4, 1000.0, 0.04, 4e-4

@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError, SimulationDiverged
-from mosa.physics.asking import AdapterOperator, MaterialState
-from mosa.physics.colliders import Collider, Sphere
-from mosa.physics.elasticity import lame
-from mosa.physics.mpm import SegmentSolver, grid_window, substep_bytes
-from mosa.physics.rollout import Simulator
-from mosa.physics.window import GAINED, extent, fallen, window_of
-from mosa.physics.workspace import Workspace
+from mosa.physics.constitutive.elasticity import lame
+from mosa.physics.contact.colliders import Collider, Sphere
+from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState
+from mosa.physics.engine.segment import SegmentSolver, grid_window, substep_bytes
+from mosa.physics.engine.simulator import Simulator
+from mosa.physics.engine.workspace import Workspace
+from mosa.physics.grid.window import GAINED, extent, fallen, window_of
 from mosa.types import Ground, ParticleState
 
 DX, DENSITY, SPACING = 0.04, 1000.0, 0.02
@@ -130,8 +130,8 @@ def test_segments_recomputed_give_the_gradient_of_one_segment(law, make_block, m
     run_again, advance = [], Workspace.advance
     monkeypatch.setattr(Workspace, "advance", lambda work: (run_again.append(work.with_adjoint), advance(work)))
     for length, kept, expected in ((32, 0, 2), (32, 10_000, 0), (7, 36, 7), (7, 7, 8), (7, 0, 8), (1, 10_000, 0)):
-        monkeypatch.setattr("mosa.physics.stepping.SEGMENT", length)
-        monkeypatch.setattr("mosa.physics.memory.KEPT_ON_CPU", kept * each)
+        monkeypatch.setattr("mosa.physics.engine.stepping.SEGMENT", length)
+        monkeypatch.setattr("mosa.physics.engine.budget.KEPT_ON_CPU", kept * each)
         state = make_block()
         leaves = [t.clone().requires_grad_() for t in (state.x, state.v, state.C_affine, state.F)]
         mu = torch.full((len(state.x),), 4e4).double().requires_grad_()
@@ -290,7 +290,7 @@ def test_acceleration_within_a_segment_widens_the_window(make_block, monkeypatch
         margins.append(arguments[4])
         return grid_window(*arguments, **more)
 
-    monkeypatch.setattr("mosa.physics.mpm.grid_window", spy)
+    monkeypatch.setattr("mosa.physics.engine.segment.grid_window", spy)
     for stride in (32, 1):
         leaf = state.v.clone().requires_grad_()
         sim = Simulator("corotated", dx=DX, substeps=32, frame_dt=0.0128, gravity=(0, 0, 0), dtype=torch.float64,
@@ -381,7 +381,7 @@ def test_a_tape_of_many_more_nodes_than_particles_is_not_kept_beyond_its_room(ma
     monkeypatch.setattr(SegmentSolver, "advance", spied)
     gradients = []
     for room in (2**30, 2**20):
-        monkeypatch.setattr("mosa.physics.memory.KEPT_ON_CPU", room)
+        monkeypatch.setattr("mosa.physics.engine.budget.KEPT_ON_CPU", room)
         leaf = state.v.clone().requires_grad_()
         rollout = simulator().rollout(replace(state, v=leaf), TestErrors.PARAMETERS, volume_of(state), DENSITY, 4)
         gradients.append(torch.autograd.grad(rollout.x[-1].square().sum(), leaf)[0])
@@ -481,7 +481,7 @@ def test_a_rollout_that_is_dropped_frees_what_it_kept(make_block, monkeypatch):
         solvers.append(weakref.ref(solver))
         return solver
 
-    monkeypatch.setattr("mosa.physics.rollout.SegmentSolver", remembered)
+    monkeypatch.setattr("mosa.physics.engine.simulator.SegmentSolver", remembered)
     mu = torch.full((), 4e4).double().requires_grad_()
     gc.collect()
     gc.disable()

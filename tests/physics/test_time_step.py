@@ -7,8 +7,8 @@ import torch
 
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.modules.material import Material
-from mosa.physics.rollout import Simulator
-from mosa.physics.time_step import VISCOUS_NUMBER, courant_number, required_substeps, wave_speed
+from mosa.physics.engine.simulator import Simulator
+from mosa.physics.engine.time_step import VISCOUS_NUMBER, courant_number, required_substeps, wave_speed
 
 
 def test_bounds():

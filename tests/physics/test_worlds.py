@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError, SimulationDiverged
-from mosa.physics.adaptive import StepControl
-from mosa.physics.asking import AdapterOperator
-from mosa.physics.boundary import Plane
-from mosa.physics.collider_motion import Motion, Poses, sample_poses
-from mosa.physics.colliders import Collider, Sphere
-from mosa.physics.rollout import Simulator
+from mosa.physics.contact.colliders import Collider, Sphere
+from mosa.physics.contact.motion import Motion, Poses, sample_poses
+from mosa.physics.contact.planes import Plane
+from mosa.physics.engine.adapter_interface import AdapterOperator
+from mosa.physics.engine.adaptive_steps import StepControl
+from mosa.physics.engine.simulator import Simulator
 from mosa.types import ParticleState
 
 WORLDS, SUBSTEPS, FRAMES, DT = 4, 14, 4, 4e-4
@@ -122,7 +122,7 @@ def test_what_is_the_same_in_all_worlds_is_given_once(make_block):
 def test_segments_that_are_run_again_give_the_same_gradients(make_block, monkeypatch):
     starts = [make_block(seed=b) for b in range(WORLDS)]
     kept = batched(starts, "corotated", None)[1]
-    monkeypatch.setattr("mosa.physics.memory.KEPT_ON_CPU", 0)
+    monkeypatch.setattr("mosa.physics.engine.budget.KEPT_ON_CPU", 0)
     assert all(torch.equal(a, b) for a, b in zip(kept, batched(starts, "corotated", None)[1], strict=True))
 
 

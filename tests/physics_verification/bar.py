@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from bodies import lattice, resting
 
-from mosa.physics.boundary import Plane
-from mosa.physics.rollout import Simulator
+from mosa.physics.contact.planes import Plane
+from mosa.physics.engine.simulator import Simulator
 
 E, NU, BAR_DENSITY, GRAVITY, END = 1e6, 0.3, 1050.0, 1000.0, 0.25
 MU, LAM = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))

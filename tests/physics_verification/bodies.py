@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from mosa.modules.adapter import StressAdapter
-from mosa.physics.laws import law_named, law_names
+from mosa.physics.constitutive.laws import law_named, law_names
 from mosa.types import ParticleState
 
 E, NU = 8e4, 0.3

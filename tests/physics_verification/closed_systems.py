@@ -7,8 +7,8 @@ import warp as wp
 from bodies import DENSITY, LAM, MU, agitated, eyes, lattice, parameters_of, random_adapter, resting, uniform_volume
 from torch import Tensor
 
-from mosa.physics.laws import LawParameters, register_law
-from mosa.physics.rollout import Simulator
+from mosa.physics.constitutive.laws import LawParameters, register_law
+from mosa.physics.engine.simulator import Simulator
 from mosa.types import ParticleState
 
 DX, SPACING, DT = 0.04, 0.02, 2e-4

@@ -9,9 +9,9 @@ import torch
 from bodies import DENSITY, NU, eyes, lattice, parameters_of, resting, uniform_volume
 from torch import Tensor
 
-from mosa.physics.boundary import Plane
+from mosa.physics.contact.planes import Plane
+from mosa.physics.engine.simulator import Simulator
 from mosa.physics.reference import unvech
-from mosa.physics.rollout import Simulator
 from mosa.types import ParticleState
 
 GRAVITY = 9.8

@@ -9,8 +9,8 @@ import torch
 from bodies import DENSITY, NU, VALUES, E, agitated, is_fluid, parameters_of, random_adapter, uniform_volume
 from torch import Tensor
 
-from mosa.physics.elasticity import lame
-from mosa.physics.rollout import Simulator
+from mosa.physics.constitutive.elasticity import lame
+from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground
 
 DX, SPACING, DT = 0.04, 0.02, 2e-4

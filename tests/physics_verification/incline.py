@@ -8,8 +8,8 @@ import math
 import torch
 from bodies import DENSITY, LAM, MU, lattice, resting, uniform_volume
 
-from mosa.physics.boundary import Plane
-from mosa.physics.rollout import Simulator
+from mosa.physics.contact.planes import Plane
+from mosa.physics.engine.simulator import Simulator
 
 GRAVITY = 9.8
 

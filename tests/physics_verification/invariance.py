@@ -3,7 +3,7 @@
 import torch
 from bodies import DENSITY, agitated, parameters_of, random_adapter, uniform_volume
 
-from mosa.physics.rollout import Simulator
+from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState, Rollout
 
 DX, SPACING = 0.04, 0.02

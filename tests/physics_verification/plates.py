@@ -7,9 +7,9 @@ import math
 import torch
 from bodies import DENSITY, LAM, MU, resting
 
-from mosa.physics.collider_motion import Motion, exponential
-from mosa.physics.colliders import Collider, HalfSpace
-from mosa.physics.rollout import Simulator
+from mosa.physics.contact.colliders import Collider, HalfSpace
+from mosa.physics.contact.motion import Motion, exponential
+from mosa.physics.engine.simulator import Simulator
 
 HEIGHT, RADIUS, STROKE, RAMP, HOLD, FRAME = 0.2, 0.1, 0.3, 0.3, 0.1, 0.01
 

@@ -7,10 +7,10 @@ import warp as wp
 from bodies import NU, E, eyes, is_fluid, parameters_of, random_adapter, rotations
 from torch import Tensor
 
-from mosa.physics.laws import law_named
-from mosa.physics.material_kernels import field_types, kernels_of
-from mosa.physics.rollout import Simulator
-from mosa.physics.workspace import SCALARS
+from mosa.physics.constitutive.laws import law_named
+from mosa.physics.constitutive.material_kernels import field_types, kernels_of
+from mosa.physics.engine.simulator import Simulator
+from mosa.physics.engine.workspace import SCALARS
 
 
 def stress(law: str, F: Tensor, C: Tensor | None = None, operator=None, parameters: dict | None = None) -> Tensor:

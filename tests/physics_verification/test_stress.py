@@ -8,7 +8,7 @@ import torch
 from bodies import LAWS, PRECISIONS, E, eyes, is_fluid
 from stresses import adapted_stress, deformations, energy_error, frame_error, moduli, stress
 
-from mosa.physics.laws import law_named
+from mosa.physics.constitutive.laws import law_named
 
 
 @pytest.mark.parametrize("dtype", PRECISIONS)

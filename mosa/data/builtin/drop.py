@@ -10,8 +10,8 @@ import torch
 
 from mosa.data.builtin.hidden import Hidden
 from mosa.data.builtin.objects import BuiltinObject, Drop
-from mosa.physics.rollout import Simulator
-from mosa.physics.time_step import required_substeps
+from mosa.physics.engine.simulator import Simulator
+from mosa.physics.engine.time_step import required_substeps
 from mosa.types import Ground, ParticleState
 
 GRAVITY = (0.0, -9.8, 0.0)

@@ -8,9 +8,9 @@ from torch import Tensor
 from mosa.data.builtin.hidden import Hidden
 from mosa.data.builtin.objects import object_named
 from mosa.errors import ConfigError
-from mosa.physics.colliders import reach
-from mosa.physics.rollout import Simulator
-from mosa.physics.time_step import required_substeps
+from mosa.physics.contact.colliders import reach
+from mosa.physics.engine.simulator import Simulator
+from mosa.physics.engine.time_step import required_substeps
 from mosa.types import ParticleState, Scene
 
 

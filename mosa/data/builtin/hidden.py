@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.physics.elasticity import lame
+from mosa.physics.constitutive.elasticity import lame
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ import warp as wp
 from torch import Tensor
 
 from mosa.data.builtin.hidden import Hidden
-from mosa.physics.laws import LawParameters, register_law
+from mosa.physics.constitutive.laws import LawParameters, register_law
 
 LAW = "fibre_neo_hookean"
 

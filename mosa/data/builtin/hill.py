@@ -14,11 +14,11 @@ from torch import Tensor
 
 from mosa.data.builtin.axes import axes_parameter, axes_rotation
 from mosa.errors import ConfigError
-from mosa.physics.elasticity import lame, stvk
-from mosa.physics.energies import stvk_energy
-from mosa.physics.kinematics import growth, svd_value
-from mosa.physics.laws import LawParameters, register_law
-from mosa.physics.material_kernels import deviator
+from mosa.physics.constitutive.elasticity import lame, stvk
+from mosa.physics.constitutive.energies import stvk_energy
+from mosa.physics.constitutive.kinematics import growth, svd_value
+from mosa.physics.constitutive.laws import LawParameters, register_law
+from mosa.physics.constitutive.material_kernels import deviator
 
 HILL = "hill"
 COEFFICIENTS = ("f", "g", "h", "l", "m", "n")

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from mosa.data.builtin.axes import axes_matrix, axes_parameter, axes_rotation
 from mosa.errors import ConfigError
-from mosa.physics.kinematics import ROTATION_FLOOR, svd
-from mosa.physics.laws import LawParameters, register_law
+from mosa.physics.constitutive.kinematics import ROTATION_FLOOR, svd
+from mosa.physics.constitutive.laws import LawParameters, register_law
 from mosa.physics.reference import polar
 
 ORTHOTROPIC = "orthotropic_linear"

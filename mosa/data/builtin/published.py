@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mosa.physics.elasticity import wave_modulus
-from mosa.physics.laws import law_named
+from mosa.physics.constitutive.elasticity import wave_modulus
+from mosa.physics.constitutive.laws import law_named
 
 
 @dataclass(frozen=True, kw_only=True)

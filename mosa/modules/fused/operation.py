@@ -19,7 +19,7 @@ from mosa.modules.fused.half_kernel import operator_half
 from mosa.modules.fused.half_weights import packed
 from mosa.modules.fused.network_kernels import phi_forward, psi1_forward, psi2_forward, theta_forward
 from mosa.modules.fused.sum_kernels import weight_gradients
-from mosa.physics.activations import backward_at_hand, from_weights
+from mosa.physics.engine.network_evaluation import backward_at_hand, from_weights
 
 LANES = 128
 """Particles a program of the assembly; rows are padded to a multiple, so that arrays stored by column need no mask."""

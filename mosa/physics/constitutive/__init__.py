@@ -1,0 +1,5 @@
+"""What a particle's material does: laws, their energies, return mappings, kinematics, and the kernels that evaluate them.
+
+Importing it registers the built-in laws."""
+
+from mosa.physics.constitutive import elasticity, mixture, plasticity, viscosity  # noqa: F401  each registers its laws

@@ -1,0 +1,94 @@
+"""A particle's own numbers, loaded into float64 by the one thread that works on it, as functions for Warp kernels.
+
+The adjoint that Warp generates for `field[i]` adds to the gradient one number at a time, atomically: 36 for a stress operator, each
+in a transaction of its own on a GPU. Here nobody else adds to particle i, so its gradient is read, added to and written back, 16
+bytes at a time where the size of a particle's part allows it. Arrays must be contiguous and begin at a multiple of 16 bytes, see
+`aligned`.
+"""
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from types import SimpleNamespace
+
+import torch
+import warp as wp
+from torch import Tensor
+
+BYTES = 16
+APART = 32
+"""Numbers of which arrays in one buffer begin at multiples."""
+# a CPU's compiler would take the promise of alignment for faults rather than for speed
+PIECE = """
+#if defined(__CUDA_ARCH__)
+    struct alignas({width} * sizeof({scalar})) Piece {{ {scalar} part[{width}]; }};
+#else
+    struct Piece {{ {scalar} part[{width}]; }};
+#endif"""
+LOAD = """
+    const Piece* source = reinterpret_cast<const Piece*>(field.data + i);
+    {result} value;
+    double* target = reinterpret_cast<double*>(&value);
+#pragma unroll
+    for (int k = 0; k < {pieces}; ++k) {{
+        const Piece piece = source[k];
+#pragma unroll
+        for (int l = 0; l < {width}; ++l) target[{width} * k + l] = static_cast<double>(piece.part[l]);
+    }}
+    return value;"""
+ADD = """
+    if (!adj_field.data) return;
+    Piece* target = reinterpret_cast<Piece*>(adj_field.data + i);
+    const double* source = reinterpret_cast<const double*>(&adj_ret);
+#pragma unroll
+    for (int k = 0; k < {pieces}; ++k) {{
+        Piece piece = target[k];
+#pragma unroll
+        for (int l = 0; l < {width}; ++l) piece.part[l] += static_cast<{scalar}>(source[{width} * k + l]);
+        target[k] = piece;
+    }}"""
+
+
+def aligned(t: Tensor) -> Tensor:
+    """t, contiguous and where the kernels can read it in pieces; itself, if it is already."""
+    t = t.contiguous()
+    return t if t.data_ptr() % BYTES == 0 else t.clone()
+
+
+def zeros_in_one(shapes: Sequence[Sequence[int]], dtype: torch.dtype, device: torch.device) -> tuple[Tensor, list[Tensor]]:
+    """(buffer, its parts of these shapes), each part as `aligned` wants it: all are cleared in one launch."""
+    sizes = [-(-math.prod(shape) // APART) * APART for shape in shapes]
+    buffer = torch.zeros(sum(sizes), dtype=dtype, device=device)
+    return buffer, [part[: math.prod(shape)].view(*shape) for part, shape in zip(buffer.split(sizes), shapes)]
+
+
+@cache
+def particle_access(scalar, slots: int) -> SimpleNamespace:
+    """matrix33, vector6, matrix66 and parameters (vectors of `slots` numbers): f(field, i) -> the same in float64.
+
+    scalar: of the fields, wp.float32 or wp.float64. No other thread may work on particle i."""
+    name, size = {wp.float32: ("float", 4), wp.float64: ("double", 8)}[scalar]
+
+    def snippets(count: int, result: str) -> tuple[str, str]:
+        width = next(k for k in (BYTES // size, BYTES // 2 // size, 1) if count % k == 0)
+        parts = {"scalar": name, "width": width, "pieces": count // width, "result": result}
+        return (PIECE + LOAD).format(**parts), (PIECE + ADD).format(**parts)
+
+    field33, field66 = (wp.array(dtype=wp.types.matrix(shape=(k, k), dtype=scalar)) for k in (3, 6))
+    field6, fields = (wp.array(dtype=wp.types.vector(length=k, dtype=scalar)) for k in (6, slots))
+    mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float64)
+    vec6, vector = (wp.types.vector(length=k, dtype=wp.float64) for k in (6, slots))
+
+    @wp.func_native(*snippets(9, "wp::mat_t<3, 3, double>"))
+    def matrix33(field: field33, i: int) -> wp.mat33d: ...
+
+    @wp.func_native(*snippets(6, "wp::vec_t<6, double>"))
+    def vector6(field: field6, i: int) -> vec6: ...
+
+    @wp.func_native(*snippets(36, "wp::mat_t<6, 6, double>"))
+    def matrix66(field: field66, i: int) -> mat66: ...
+
+    @wp.func_native(*snippets(slots, f"wp::vec_t<{slots}, double>"))
+    def parameters(field: fields, i: int) -> vector: ...
+
+    return SimpleNamespace(matrix33=matrix33, vector6=vector6, matrix66=matrix66, parameters=parameters)

@@ -1,0 +1,80 @@
+"""Device buffers of the colliders of a segment: poses, reactions and their adjoints by substep, and the launches on them."""
+
+import weakref
+
+import warp as wp
+from torch import Tensor
+
+from mosa.physics.contact.collider_kernels import collider_kernels
+from mosa.physics.contact.colliders import PackedColliders
+
+
+class ColliderBuffers:
+    """K colliders over `substeps` substeps of the workspace `work`, which holds them and is not held by them.
+
+    poses, adj_poses: position (S, W K, 3), rotation (S, W K, 3, 3), linear, angular (S, W K, 3) of W worlds, one after another;
+    reaction: force [N] and torque [N m] about the collider's origin (S, W K, 3), as the body exerts them on the collider in
+    world axes.
+    """
+
+    def __init__(self, packed: PackedColliders, scalar, substeps: int, work, with_adjoint: bool) -> None:
+        self.count = len(packed)
+        self.kernels = collider_kernels(scalar)
+        self._scalar, self._work, self.with_adjoint = scalar, weakref.proxy(work), with_adjoint
+        self._packed = [
+            wp.from_torch(packed.shapes, dtype=scalar), wp.from_torch(packed.codes, dtype=wp.int32),
+            wp.from_torch(packed.fields, dtype=scalar),
+        ]  # fmt: skip
+        columns = work.worlds * self.count
+        vectors, matrices = (substeps, columns, 3), (substeps, columns, 3, 3)
+        vec3, mat33 = self.kernels.vec3, self.kernels.mat33
+        pose = ((vectors, vec3), (matrices, mat33), (vectors, vec3), (vectors, vec3))
+
+        def buffers(kinds):
+            made = [work.array(shape, kind) for shape, kind in kinds]
+            return [tensor for tensor, _ in made], [array for _, array in made]
+
+        self.poses, self._poses = buffers(pose)
+        self.reaction, self._reaction = buffers(pose[2:])
+        if with_adjoint:
+            self.adj_poses, self._adj_poses = buffers(pose)
+            self.adj_reaction, self._adj_reaction = buffers(pose[2:])
+
+    def set_nodes(self, nodes: int) -> None:
+        """Buffers for so many grid nodes, for the adjoint."""
+        if self.with_adjoint:
+            self.before, self.before_wp = self._work.array((nodes, 4), self.kernels.vec4)
+            self.adj_mass, self._adj_mass = self._work.array((nodes,), self._scalar)
+
+    def load(self, poses: tuple[Tensor, ...]) -> None:
+        """Copy the poses of a segment's substeps in."""
+        for target, value in zip(self.poses, poses, strict=True):
+            target.copy_(value)
+
+    def reset(self) -> None:
+        """Before a segment: no reaction yet."""
+        for array in self._reaction:
+            array.zero_()
+
+    def reset_adjoint(self) -> None:
+        for array in self._adj_poses:
+            array.zero_()
+
+    def _arguments(self, place: list, step: int, time: float) -> list:
+        return [*place, 1.0 / time, self.count, step, *self._packed, *self._poses]
+
+    def apply(self, step: int, place: list, time: float, velocity) -> None:
+        """Contact at substep `step`, on node velocities in place. place: grid, cutoff, dx; time [s]: for which the
+        substep's forces act."""
+        self._work.over_nodes(self.kernels.collide_nodes, [*self._arguments(place, step, time), velocity, *self._reaction])
+
+    def adjoint(self, step: int, place: list, time: float, adj_velocity) -> None:
+        """Turns the adjoint of node velocities after contact into that before it; `before` holds those velocities."""
+        self._work.over_nodes(self.kernels.adj_collide_nodes, [
+            *self._arguments(place, step, time), self.before_wp, *self._adj_reaction, adj_velocity, self._adj_mass,
+            *self._adj_poses,
+        ])  # fmt: skip
+
+    def add_mass(self, adj_grid) -> None:
+        """The reaction's part of the adjoint of node masses, after the grid's own."""
+        self._work.over_nodes(self.kernels.add_mass, [self._adj_mass, adj_grid])

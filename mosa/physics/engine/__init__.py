@@ -1,0 +1,1 @@
+"""What advances a body: the simulator, its differentiable operations, buffers, captured graphs and time steps."""

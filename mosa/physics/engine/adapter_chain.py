@@ -1,0 +1,334 @@
+"""Segments with an adapter's evaluations between them, as one torch operation and, on CUDA, one captured graph per pass.
+
+An adapter of the state is asked every few substeps. Done one by one, each answer costs some sixty launches and two transfers to
+the host, which take longer than the arithmetic of 100 000 particles. A chain of K segments looks at the host once. Its backward
+pass goes back through the states of all substeps: the adapter is asked again at the start of a segment, this time with a graph,
+and what the segment's adjoint leaves on its answer goes through that graph to the state and to the adapter's weights. Between the
+passes all states are kept where there is memory for them (`kept`), else only the chain's start, from which they are made again.
+That asks the adapter too: where there is memory for the graphs of all the chain's evaluations (`graphs`), they are kept beside the
+states and nothing is asked a third time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from mosa.physics.engine.adapter_interface import ANSWER
+from mosa.physics.engine.capture import ATTEMPTS, Captures
+from mosa.physics.engine.network_evaluation import at_hand, same_weights
+from mosa.physics.engine.segment import WIDENED, LeftWindow, SegmentSolver, wants_gradient
+from mosa.physics.engine.workspace import Numerics, Workspace, copies, warp_stream
+from mosa.physics.grid.transfer_kernels import NO_EVENT
+
+MARGIN = 4
+"""Nodes of a window beyond what the speeds at the start ask for."""
+
+
+class _Evaluation(NamedTuple):
+    """leaves: F, C, parameters and weights as the graph's ends, [] without a graph."""
+
+    leaves: list[Tensor]
+    answer: dict[str, Tensor | None]
+    statistics: tuple[Tensor, ...]
+
+
+class Learned(NamedTuple):
+    """Of an adapter: names and tensors of the weights that are learned, and the addresses of all parameters and buffers.
+
+    Looking for them takes as long as a substep: once a rollout, and once for each chain of the backward pass."""
+
+    names: tuple[str, ...]
+    weights: tuple[Tensor, ...]
+    addresses: tuple[int, ...]
+
+
+def addresses_of(adapter: nn.Module) -> tuple[int, ...]:
+    return tuple(t.data_ptr() for t in (*adapter.parameters(), *adapter.buffers()))
+
+
+def learned_of(adapter: nn.Module) -> Learned:
+    wanted = {name: p for name, p in adapter.named_parameters() if p.requires_grad}
+    return Learned(tuple(wanted), tuple(wanted.values()), addresses_of(adapter))
+
+
+class Chain:
+    """Buffers and captured graphs of K segments of `lengths` substeps for N particles and one adapter.
+
+    marks: numbers of segments after which the state is wanted too, besides the last; only without a gradient.
+    ask: (adapter, F, C_affine, packed parameters, into=None) -> its answer by name (`ANSWER`, None where it has none),
+    differentiable; into: as `material_state`.
+    collects: also return `adapter.statistics()`, a named tuple of tensors, of every evaluation.
+    graphs: where states are made again, keep the graphs of the evaluations with them.
+    An adapter that looks at the host cannot be captured: it is run uncaptured, with a warning.
+    """
+
+    def __init__(
+        self, numerics: Numerics, adapter: nn.Module, ask: Callable[..., dict[str, Tensor | None]], particles: int,
+        lengths: Sequence[int], *, marks: Sequence[int] = (), plastic_adapted: bool, collects: bool, graphs: bool = False,
+    ) -> None:  # fmt: skip
+        self.numerics, self.adapter, self.ask, self.lengths, self.collects = numerics, adapter, ask, tuple(lengths), collects
+        self.marks, self.marked = frozenset(marks), []
+        self.substeps = sum(lengths)
+        self.learned = learned_of(adapter)
+        self._shape = {"particles": particles, "substeps": self.substeps, "adapted": True, "plastic_adapted": plastic_adapted}
+        self.light: Workspace | None = None
+        self.full: Workspace | None = None
+        self.statistics: dict[bool, tuple[Tensor, ...]] = {}  # in light and in full buffers: each graph has its own
+        self.statistics_seeds: tuple[Tensor, ...] = ()
+        self._kind: type | None = None
+        self._captures = Captures(
+            f"{type(adapter).__name__} cannot be captured as a CUDA graph and runs uncaptured",
+            ATTEMPTS if numerics.device.type == "cuda" else 0,
+        )
+        self._warm: set[tuple] = set()
+        self._graphs: dict[tuple, torch.cuda.CUDAGraph] = {}
+        self._key: tuple = ()
+        self._passes: dict[tuple, Callable[[Chain], None]] = {}  # no methods: see `Simulator`
+        self.again = "graphs" if graphs else "states"
+        for full in (False, True):
+            self._passes["forward", full] = partial(Chain._forward, full=full)
+        for source in ("tape", self.again):
+            for penalised in (False, True):
+                self._passes["adjoint", source, penalised] = partial(Chain._adjoint, source=source, penalised=penalised)
+
+    @torch.no_grad()
+    def advance(
+        self, solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...], packed: Tensor, first: int, kept: bool = False,
+        full: bool = False,
+    ) -> tuple[list[tuple[Tensor, ...]], tuple[Tensor, ...], tuple[tuple, tuple], list[Tensor]]:  # fmt: skip
+        """(states at the marks and after the chain, statistics (K, ...) each, grid window used, what `adjoint` takes as `tape`).
+
+        learned: of the adapter as it is now; kept: leave all substeps on the tape, else nothing; full: in the buffers of the
+        backward pass, which kept needs and any rollout with one has anyway. Errors: as `SegmentSolver.advance`; LeftWindow of
+        chains that can be cut, with marks or of more than `WIDENED` substeps in several segments."""
+        dt, total = self.numerics.dt, self.substeps
+        work = self._full() if full else self._light()
+        for margin in (MARGIN, 3 + total // 2):
+            window = solver.windows(state, total * dt, margin, falls=True)
+            self._load(work, window, solver, learned, state, packed)
+            self._capture()
+            self._play(("forward", full))
+            final = work.final()
+            flags = solver.look(work.flags, final)
+            if not solver.left_window(flags, first, dt):
+                states = [*(work.whole(copies(state)) for state in self.marked), final]
+                return states, tuple(copies(self.statistics[full])), window, work.tape() if kept else []
+            if self.marks or (total > WIDENED and len(self.lengths) > 1):
+                raise LeftWindow  # shorter chains need less than the widest window, which is larger than any may be
+        raise solver.left_behind(flags, first, dt)
+
+    def adjoint(
+        self, solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...], packed: Tensor, window: tuple,
+        seeds: Sequence[Tensor | None], tape: Sequence[Tensor],
+    ) -> tuple[list[Tensor], Tensor, list[Tensor]]:  # fmt: skip
+        """Gradients of (state, parameters, weights). learned: with the names and weights of `advance`; seeds: adjoints of what it
+        returned: state, then statistics."""
+        work = self._full()
+        if not self.statistics_seeds:
+            self.statistics_seeds = tuple(torch.zeros_like(t) for t in self.statistics[True])
+        self._load(work, window, solver, learned, state, packed)  # another rollout may have gone forward since
+        if tape:
+            work.rewind(tape)
+        slot = self.substeps % 2
+        targets = self._targets(slot) + list(self.statistics_seeds)
+        for target, seed in zip(targets, seeds, strict=True):
+            target.zero_() if seed is None else target.copy_(seed)
+        penalised = any(seed is not None for seed in seeds[len(self._targets(slot)) :])
+        self._play(("adjoint", "tape" if tape else self.again, penalised))
+        found = copies([*self._targets(0), work.adj_held["parameters"], *self.adj_weights])
+        states = len(self._targets(0))
+        return found[:states], found[states], found[states + 1 :]
+
+    def named(self, statistics: Sequence[Tensor]) -> list:
+        """One named tuple per evaluation, of tensors (K, ...)."""
+        return [self._kind(*parts) for parts in zip(*statistics, strict=True)] if self._kind is not None else []
+
+    def _light(self) -> Workspace:
+        if self.light is None:
+            self.light = Workspace(self.numerics, **self._shape, with_adjoint=False, pointed=True)
+        return self.light
+
+    def _full(self) -> Workspace:
+        """The buffers of the backward pass, made when they are first needed."""
+        if self.full is None:
+            self.full = Workspace(self.numerics, **self._shape, with_adjoint=True, pointed=True)
+            self.adj_weights = [torch.zeros_like(w) for w in self.learned.weights]
+        return self.full
+
+    def _targets(self, slot: int) -> list[Tensor]:
+        work = self.full
+        targets = [work.adj_x, work.adj_v, work.adj_C, work.adj_F] + ([work.adj_A] if work.plastic else [])
+        return [t[slot] for t in targets]
+
+    def _ask(
+        self, F: Tensor, C: Tensor, packed: Tensor, collects: bool, weights: Sequence[Tensor] | None = None,
+        into: tuple[Tensor, Tensor, Tensor] | None = None,
+    ) -> tuple[dict[str, Tensor | None], tuple[Tensor, ...]]:  # fmt: skip
+        """weights: in place of the adapter's own."""
+        adapter = self.adapter
+        if weights is not None:
+            named = dict(zip(self.learned.names, weights, strict=True))
+
+            def adapter(state):
+                return functional_call(self.adapter, named, (state,))
+
+        answer = self.ask(adapter, F, C, packed, into=into)
+        if not collects:
+            return answer, ()
+        statistics = self.adapter.statistics()
+        self._kind = type(statistics)
+        return answer, tuple(statistics)
+
+    def _evaluate(self, step: int, collects: bool) -> _Evaluation:
+        """The adapter's answer to the state in slot `step`; its graph adds the state's gradient to the segment's adjoint."""
+        work, slot = self.full, step % 2
+        into = (work.adj_F[slot], work.adj_C[slot], work.adj_held["parameters"])
+        with torch.enable_grad(), at_hand():
+            inputs = (work.F[step], work.C[step], work.held["parameters"], *self.learned.weights)
+            # aliases: autograd ties a leaf to the stream it was first used on, which a capture on another one may not touch
+            leaves = [t.detach().requires_grad_() for t in inputs]
+            return _Evaluation(leaves, *self._ask(*leaves[:3], collects, leaves[3:], into))
+
+    @torch.no_grad()
+    def _answer(self, work: Workspace, collects: bool, step: int) -> _Evaluation:
+        """The same without a graph, in either workspace."""
+        slot = step % len(work.x)
+        return _Evaluation([], *self._ask(work.F[slot], work.C[slot], work.held["parameters"], collects))
+
+    @same_weights()
+    def _forward(self, full: bool) -> None:
+        work, collected, marked = self._full() if full else self._light(), [], []
+        for count, evaluation in enumerate(self._segments(work, partial(self._answer, work, self.collects)), 1):
+            collected.append(evaluation.statistics)
+            if count in self.marks:
+                marked.append(work.state(sum(self.lengths[:count])))
+        self.statistics[full] = tuple(torch.stack(parts) for parts in zip(*collected))
+        self.marked = marked
+
+    def _segments(self, work: Workspace, evaluate: Callable[[int], _Evaluation]) -> Iterator[_Evaluation]:
+        """Launches all segments, one after each answer of `evaluate` to the state at its start, and passes the answers on."""
+        work.flags.fill_(NO_EVENT)
+        step = 0
+        for length in self.lengths:
+            evaluation = evaluate(step)
+            work.point(evaluation.answer)
+            with warp_stream(self.numerics.device):
+                work.advance_steps(step, length)
+            step += length
+            yield evaluation
+
+    @same_weights()
+    def _adjoint(self, source: str, penalised: bool) -> None:
+        """source: of the states, tape | states | graphs: loaded, or made again, without or with the evaluations' graphs."""
+        work, step, made = self.full, self.substeps, []
+        if source == "graphs":
+            made = list(self._segments(work, partial(self._evaluate, collects=penalised)))
+        elif source == "states":
+            for _ in self._segments(work, partial(self._answer, work, False)):
+                pass
+        work.adj_held["parameters"].zero_()
+        if self.adj_weights:
+            torch._foreach_zero_(self.adj_weights)
+        for index in reversed(range(len(self.lengths))):
+            step -= self.lengths[index]
+            leaves, answer, statistics = made.pop() if made else self._evaluate(step, penalised)
+            work.point(answer)
+            with warp_stream(self.numerics.device):
+                work.adjoint_steps(step, self.lengths[index], more=True)
+            pairs = [(answer[name], work.adj_held[name]) for name in ANSWER if answer[name] is not None]
+            pairs += [(t, all_seeds[index]) for t, all_seeds in zip(statistics, self.statistics_seeds)]
+            pairs = [(output, seed) for output, seed in pairs if output.requires_grad]
+            if not pairs:
+                continue
+            outputs, seeds = zip(*pairs)
+            # the first three leaves get theirs in place, see `_evaluate`
+            found = torch.autograd.grad(outputs, leaves, seeds, allow_unused=True)[3:]
+            sums = [(total, part) for total, part in zip(self.adj_weights, found, strict=True) if part is not None]
+            if sums:
+                torch._foreach_add_(*zip(*sums))
+
+    def _load(
+        self, work: Workspace, window: tuple, solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...],
+        packed: Tensor,
+    ) -> None:  # fmt: skip
+        """Place the chain's start in `work`. Forget captured graphs where what they have by value or address is another one."""
+        work.set_window(*window)
+        for each in (self.light, self.full):
+            if each is not None:  # this rollout uses one, the other may have had the cutoff of an earlier one
+                each.cutoff = solver.cutoff
+        work.load(state, {"parameters": packed}, solver.volume, solver.mass, solver.cutoff)
+        self.learned = learned
+        # not their sizes: buffers may come back to an earlier one
+        buffers = tuple(each.allocations if each is not None else 0 for each in (self.light, self.full))
+        key = (buffers, solver.cutoff, learned.addresses, tuple(w.data_ptr() for w in learned.weights))
+        if key != self._key:
+            self._key, self.marked = key, []
+            self._graphs.clear()
+
+    def _play(self, name: tuple) -> None:
+        graph = self._graphs.get(name)
+        if graph is not None:
+            graph.replay()
+        else:
+            self._passes[name](self)  # the first time this also compiles and loads the kernels, which a capture must not do
+            self._warm.add(name)
+
+    def _capture(self) -> None:
+        """Capture every pass that has run once. Here for both: the backward pass runs in a thread of autograd's own."""
+        if not self._captures.attempts:
+            return
+        missing = [name for name in self._passes if name in self._warm and name not in self._graphs]
+        if not missing:
+            return
+        for name in missing:
+            graph = torch.cuda.CUDAGraph()
+            capture = torch.cuda.graph(graph, capture_error_mode="thread_local")
+            if not self._captures.succeeds(capture, partial(self._passes[name], self)):
+                torch.cuda.synchronize()
+                return
+            self._graphs[name] = graph
+
+
+class _Chained(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, chain: Chain, solver: SegmentSolver, learned: Learned, first: int, kept: bool, *inputs):
+        """inputs: state (5), packed parameters, the adapter's weights."""
+        state, packed = tuple(t.detach().contiguous() for t in inputs[:5]), inputs[5].detach().contiguous()
+        ctx.set_materialize_grads(False)
+        (result,), statistics, window, tape = chain.advance(solver, learned, state, packed, first, kept, full=True)
+        ctx.chain, ctx.solver, ctx.window, ctx.tape = chain, solver, window, tape
+        ctx.states, ctx.names = 5 if solver.numerics.law.plastic else 4, learned.names
+        ctx.save_for_backward(*state, packed, *inputs[6:])  # weights too: autograd tells if one is changed before the backward pass
+        return *result[: ctx.states], *statistics
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, *seeds):
+        state, packed, weights = ctx.saved_tensors[:5], ctx.saved_tensors[5], ctx.saved_tensors[6:]
+        learned = Learned(ctx.names, weights, addresses_of(ctx.chain.adapter))
+        tape, ctx.tape = ctx.tape, []  # free it as soon as it is used
+        found, adj_packed, adj_weights = ctx.chain.adjoint(ctx.solver, learned, state, packed, ctx.window, seeds, tape)
+        return *[None] * 5, *found, *[None] * (5 - ctx.states), adj_packed, *adj_weights
+
+
+def advance_chain(
+    chain: Chain, solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...], packed: Tensor, first: int,
+    kept: bool = False,
+) -> tuple[list[tuple[Tensor, ...]], list]:  # fmt: skip
+    """([(x, v, C_affine, F, F_tot) at the chain's marks and after it], statistics of each evaluation), differentiable in state,
+    parameters and the adapter's weights. learned: of the adapter as it is now; first: number of the first substep, for messages;
+    kept: keep the states of all substeps for the backward pass. Errors: SimulationDiverged; LeftWindow."""
+    if not wants_gradient((*state, packed, *learned.weights)):
+        state = tuple(t.detach().contiguous() for t in state)
+        states, statistics, *_ = chain.advance(solver, learned, state, packed.detach(), first)
+        return states, chain.named(statistics)
+    result = _Chained.apply(chain, solver, learned, first, kept, *state, packed, *learned.weights)
+    count = 5 if solver.numerics.law.plastic else 4
+    final = result[:count] if count == 5 else (*result[:4], result[3])
+    return [final], chain.named(result[count:])

@@ -1,0 +1,73 @@
+"""What an adapter is asked, what it may answer, and the check of its answer."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from mosa.errors import ConfigError
+from mosa.physics.constitutive.laws import Law
+from mosa.physics.constitutive.material_operations import material_state
+
+ANSWER = ("G", "h", "plastic_G", "plastic_h")
+
+
+class MaterialState(NamedTuple):
+    """What an adapter reads, in the material frame. w: (N, 6) vech(W - I); stress: (N, 6) vech(R^T tau R) [Pa] of the prior;
+    plastic_strain: (N, 6) vech(dev log W), None for laws that do not yield. vech order: xx, yy, zz, yz, zx, xy."""
+
+    w: Tensor
+    stress: Tensor
+    plastic_strain: Tensor | None = None
+
+
+class AdapterOperator(NamedTuple):
+    """What an adapter answers, held in the material frame until it is asked again.
+
+    G: (N, 6, 6), h: (N, 6) [Pa]: tau_hat = tau + R mat(G vech(R^T tau R) + h) R^T. plastic_G: (N, 6, 6), plastic_h: (N, 6), both or
+    neither: the yield function takes |dev(mat((I + plastic_G) vech(E) + plastic_h))| for |E|.
+    """
+
+    G: Tensor
+    h: Tensor
+    plastic_G: Tensor | None = None
+    plastic_h: Tensor | None = None
+
+
+class Several:
+    """An adapter for each of several worlds, asked as one: the particles of the worlds come one after another.
+
+    Errors: ConfigError for another number of adapters than worlds."""
+
+    def __init__(self, adapters: Sequence[Callable[[MaterialState], AdapterOperator]], worlds: int) -> None:
+        if len(adapters) != worlds:
+            raise ConfigError(f"adapter: expected one, or one for each of {worlds} worlds, found {len(adapters)}")
+        self.adapters = tuple(adapters)
+
+    def __call__(self, state: MaterialState) -> AdapterOperator:
+        count = len(self.adapters)
+        parts = zip(*((None,) * count if t is None else t.chunk(count) for t in state))
+        answers = [AdapterOperator(*adapter(MaterialState(*part))) for adapter, part in zip(self.adapters, parts)]
+        return AdapterOperator(*(None if own[0] is None else torch.cat(own) for own in zip(*answers)))
+
+
+def ask(
+    law: Law, dtype: torch.dtype, adapter: Callable, F: Tensor, C: Tensor, packed: Tensor, collect: Callable | None = None,
+    into: tuple[Tensor, Tensor, Tensor] | None = None,
+) -> dict[str, Tensor | None]:  # fmt: skip
+    """The adapter's answer by name, checked. into: as `material_state`."""
+    n = len(F)
+    answer = AdapterOperator(*adapter(MaterialState(*material_state(law, F, C, packed, into))))
+    plastic = (answer.plastic_G, answer.plastic_h) if law.plastic else (None, None)
+    result = dict(zip(ANSWER, (answer.G, answer.h, *plastic)))
+    for name, value in result.items():
+        if name.startswith("plastic") and all(part is None for part in plastic):
+            continue
+        shape = (n, 6, 6) if name.endswith("G") else (n, 6)
+        if value is None or tuple(value.shape) != shape or value.dtype != dtype:
+            found = "none" if value is None else f"{tuple(value.shape)} of {value.dtype}"
+            raise ConfigError(f"adapter output {name}: expected shape {shape} of {dtype}, found {found}")
+    if collect is not None:
+        collect(adapter.statistics())
+    return result

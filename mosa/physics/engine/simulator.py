@@ -1,0 +1,494 @@
+"""The simulator: frames of MLS-MPM from a start, a law and its parameters, with or without an adapter.
+
+State convention: after n substeps a state holds (x^n, v^n, C_affine^n, F^{n+1}, F_tot^{n+1}); F is advanced right after its
+C_affine is known, so that F belongs to x and is known when a substep starts. One substep is then stress(F) -> P2G -> grid ->
+G2P -> x += dt v -> F <- map((I + dt C_affine) F), and a rollout starts with one advance of F by the initial C_affine. This is
+the usual order, F first in a substep, cut at another place (docs/decisions.md, "Order of a substep").
+"""
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from mosa.errors import ConfigError
+from mosa.physics.constitutive.laws import SLOTS, law_named
+from mosa.physics.constitutive.material_operations import material_state
+from mosa.physics.constitutive.plasticity import yield_factor
+from mosa.physics.constitutive.strain import STRAINS
+from mosa.physics.contact.colliders import Collider, pack_colliders, reach
+from mosa.physics.contact.motion import Motion, Trajectory, sample_frame, sample_poses
+from mosa.physics.contact.planes import Plane, ground_plane, pack_planes
+from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState, Several, ask
+from mosa.physics.engine.adaptive_steps import StepChooser, StepControl, check_counts
+from mosa.physics.engine.chain_schedule import Chains
+from mosa.physics.engine.segment import Lanes, SegmentSolver, wants_gradient
+from mosa.physics.engine.stepping import STATE, Moment, Prepared, Stepper, flat, mean_force, segments
+from mosa.physics.engine.workspace import SCALARS, Numerics, Steps
+from mosa.types import Ground, ParticleState, Rollout
+
+_UNBOUNDED = 1e30
+
+
+class Simulator:
+    """MLS-MPM of one law on one grid and time step. Rollouts are differentiable in state, parameters and adapter outputs.
+
+    dx: grid spacing [m]; substeps per frame of frame_dt [s]; gravity (3,) [m/s^2]; ground: plane below `up` ((3,), against
+    gravity by default), then `planes` in order, then the moving `colliders`; box: (2, 3) [m] corners a particle may not leave,
+    None for no limit.
+    mass_cutoff: node mass [kg] above which a node has a velocity (None: 0 in float64, 1e-12 of a particle's in float32).
+    init_affine: `spin` takes the state's C_affine, `zero` replaces it by 0. norm_eps: under the root of yield norms.
+    yield_convention: paper | sqrt23. rebuild: write U S V^T back also where nothing yielded (PAC-NeRF does).
+    on_inversion: warn | ignore | error for det F <= 0 where the law has a value there; it is an error where it has none.
+    chained: whether the evaluations of an adapter that is a torch module and the segments between them run as chains;
+    None: on CUDA, where a chain is one captured graph. Not with colliders or adaptive substeps, which are cut in segments.
+    Gradients through a chain reach the adapter's parameters, not other tensors that it may use.
+    strain: hencky | biot | green: what adapters answer is a stiffness G in units of 2 mu, of the energy mu E : G : E that is added
+    to 1 + h[0] times the prior's; None: an operator on the prior's stress.
+    Errors: ConfigError naming the argument. Not safe for use by two threads: buffers are shared between rollouts.
+    """
+
+    def __init__(
+        self,
+        law: str,
+        *,
+        dx: float,
+        substeps: int,
+        frame_dt: float,
+        gravity: Sequence[float] | Tensor = (0.0, -9.8, 0.0),
+        ground: Ground | None = None,
+        up: Sequence[float] | Tensor | None = None,
+        planes: Sequence[Plane] = (),
+        colliders: Sequence[Collider] = (),
+        box: Tensor | None = None,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+        mass_cutoff: float | None = None,
+        init_affine: str = "spin",
+        norm_eps: float = 0.0,
+        yield_convention: str = "paper",
+        rebuild: bool = False,
+        on_inversion: str = "warn",
+        chained: bool | None = None,
+        strain: str | None = None,
+    ) -> None:
+        self.law = law_named(law)
+        for name, value in (("dx", dx), ("frame_dt", frame_dt), ("substeps", substeps)):
+            if not (math.isfinite(value) and value > 0):
+                raise ConfigError(f"{name}: expected a positive number, found {value}")
+        if strain is not None and (strain not in STRAINS or "mu" not in self.law.offsets or self.law.viscosity is not None):
+            if strain not in STRAINS:
+                raise ConfigError(f"strain: expected one of {', '.join(STRAINS)} or None, found {strain!r}")
+            raise ConfigError(f"strain: expected a law with a shear modulus mu, found {law!r}: stiffness is in units of 2 mu")
+        if dtype not in SCALARS:
+            raise ConfigError(f"dtype: expected torch.float32 or torch.float64, found {dtype}")
+        if init_affine not in ("spin", "zero"):
+            raise ConfigError(f"init_affine: expected spin or zero, found {init_affine!r}")
+        if on_inversion not in ("warn", "ignore", "error"):
+            raise ConfigError(f"on_inversion: expected warn, ignore or error, found {on_inversion!r}")
+        self.substeps, self.frame_dt, self.dt = int(substeps), float(frame_dt), float(frame_dt) / int(substeps)
+        self.dtype, self.device = dtype, torch.device(device)
+        self.init_affine, self.on_inversion, self.mass_cutoff = init_affine, on_inversion, mass_cutoff
+        self.yield_factor = yield_factor(yield_convention)
+        gravity = torch.as_tensor(gravity, dtype=torch.float64).cpu()
+        if up is None:
+            up = -gravity / gravity.norm() if gravity.norm() > 0 else torch.tensor([0.0, 1.0, 0.0])
+        all_planes = ([ground_plane(ground, up)] if ground is not None else []) + list(planes)
+        values, modes = pack_planes(all_planes, dtype, self.device, float(dx))
+        self.colliders = tuple(colliders)
+        packed_colliders = pack_colliders(self.colliders, dtype, self.device, float(dx)) if self.colliders else None
+        if box is None:
+            low, high = (-_UNBOUNDED,) * 3, (_UNBOUNDED,) * 3
+        else:
+            low, high = (tuple(corner) for corner in torch.as_tensor(box).double().tolist())
+            if not all(a < b for a, b in zip(low, high)):
+                raise ConfigError(f"box: expected min < max on every axis, found {low} and {high}")
+        self.numerics = Numerics(
+            law=self.law, dtype=dtype, device=self.device, dx=float(dx), dt=self.dt, gravity=tuple(gravity.tolist()),
+            planes=values, modes=modes, plane_count=len(all_planes), low=low, high=high, norm_eps=float(norm_eps),
+            rebuild=rebuild, check_J=self.law.needs_positive_J or on_inversion == "error",
+            colliders=packed_colliders, strain=strain,
+        )  # fmt: skip
+        self._workspaces: dict = {}
+        self._buffers, self._warm = [self._workspaces], set()  # see `Lanes`
+        self._long = self.device.type == "cuda"  # a CPU gains nothing
+        self.chained = self.device.type == "cuda" if chained is None else chained
+        # no method: the cycle would keep a dropped simulator's buffers until the garbage collector looks
+        self._ask = partial(ask, self.law, dtype)
+        self._chains = Chains(self.numerics, self._ask)
+
+    def pack(
+        self, parameters: dict[str, Tensor], particles: int, rotation: Tensor | None = None, worlds: int | None = None
+    ) -> Tensor:
+        """(N, SLOTS) parameters in the law's order. Values: numbers, (N,), () or, for vectors of k numbers, (N, k) or (k,).
+
+        rotation: (N, 3, 3), fills the law's reference rotation. worlds: (W N, SLOTS), one world's after the other's; values may
+        then also be (W, N) or (W, 1), vectors (W, N, k) or (W, 1, k). Errors: ConfigError naming a missing, unknown or misshapen
+        one.
+        """
+        shape = (particles,) if worlds is None else (worlds, particles)
+        expected = [name for name in self.law.parameters if name != self.law.reference]
+        if missing := [name for name in expected if name not in parameters]:
+            raise ConfigError(f"law {self.law.name!r} needs {', '.join(expected)}; missing: {', '.join(missing)}")
+        if unknown := [name for name in parameters if name not in expected]:
+            raise ConfigError(f"law {self.law.name!r} takes {', '.join(expected)}; unknown: {', '.join(unknown)}")
+        columns = []
+        for name, size in self.law.parameters.items():
+            if name == self.law.reference:
+                columns.append(rotation.detach().reshape(*shape, 9))
+                continue
+            value = parameters[name]
+            if isinstance(value, int | float):
+                value = torch.full((), value, dtype=self.dtype, device=self.device)  # a copy from the host would wait for CUDA
+            value = torch.as_tensor(value, dtype=self.dtype, device=self.device)
+            if name == "yield_stress" and "von_mises" in self.law.name.split("+"):
+                value = value * self.yield_factor  # the other laws that yield have their radius fixed
+            try:
+                columns.append((value[..., None] if size == 1 else value).expand(*shape, size))
+            except RuntimeError:
+                each, last = "" if worlds is None else f", ({worlds}, 1%s) or ({worlds}, {particles}%s)", f", {size}" * (size > 1)
+                raise ConfigError(
+                    f"parameter {name!r}: expected shape {'()' if size == 1 else f'({size},)'} or ({particles}"
+                    f"{last or ','}){each.replace('%s', last)}, found {tuple(value.shape)}"
+                ) from None
+        used = sum(self.law.parameters.values())
+        columns.append(torch.zeros(*shape, SLOTS - used, dtype=self.dtype, device=self.device))
+        return torch.cat(columns, -1).flatten(0, -2)
+
+    def rollout(
+        self,
+        state: ParticleState,
+        parameters: dict[str, Tensor],
+        volume: Tensor,
+        density: float | Tensor,
+        frames: int,
+        adapter: Callable[[MaterialState], AdapterOperator] | None = None,
+        stride: int | None = 1,
+        progress: Callable[[int], None] | None = None,
+        started: bool = False,
+        motions: Sequence[Motion | Trajectory] | None = None,
+        start_time: float = 0.0,
+        control: StepControl | None = None,
+        counts: Sequence[int] | None = None,
+        lag: float | None = None,
+        collect: Callable[[Any], None] | None = None,
+    ) -> Rollout:
+        """`frames` frames, the start being frame 0 (so frames - 1 intervals are simulated).
+
+        state: particles at frame 0, its F and F_tot not yet advanced by C_affine, unless `started` (the `final` of an earlier
+        rollout). parameters: physical values the law names, per particle (N,) or scalar; volume: (N,) [m^3]; density
+        [kg/m^3]: number or (N,).
+        adapter: asked every `stride` substeps from the start of each frame; None: once, at the start of the rollout (an operator
+        that does not depend on the state). collect: called with `adapter.statistics()`, a named tuple of tensors, of every
+        evaluation. progress: called with the number of each frame. An adapter that has `flow` is no part of a chain; before it is
+        asked, F becomes flow(F (N, 3, 3), time until it is asked again [s]): plastic flow that a network has learned.
+        motions: of the colliders, instead of their own; start_time [s]: time of frame 0 in these motions.
+        control: choose the substeps of each frame from the state at its start (see `adaptive_steps`) instead of taking `substeps`;
+        counts: of the frames - 1 intervals, instead of choosing: a replay, in which differences hold the substeps fixed.
+        lag [s]: with either, the start's velocities are those lag/2 before its positions: 0 for velocities at frame 0 itself,
+        frame_dt/counts[-1] of an earlier rollout that this one goes on from, None: the first substep's dt, as with a fixed step.
+        Frame 0 of the result holds the state as given. Errors: SimulationDiverged naming substep and particle; ConfigError.
+        """
+        prepared = self._prepare(state, parameters, volume, density, adapter, stride, collect, frames)
+        motions, variable = self._motions(motions), control is not None or counts is not None
+        given = None if counts is None else check_counts(counts, frames)
+        chooser = self._chooser(control, prepared, parameters, density, motions) if variable and given is None else None
+        poses = () if variable else self._poses(motions, frames, start_time)
+        current = (state.x, state.v, self._affine(state, started), state.F, state.F_tot if self.law.plastic else state.F)
+        recorded = {"x": [state.x], "v": [state.v], "F": [current[3]], "F_tot": [current[4]]}
+
+        def substeps_of(frame: int, v: Tensor, C: Tensor, F: Tensor) -> int:
+            if not variable:
+                return self.substeps
+            return given[frame - 1] if given is not None else chooser.choose(frame, v, C, F)
+
+        taken = [substeps_of(1, *current[1:4])] if frames > 1 else []
+        if not started:
+            current = prepared.first_advance(current, self.frame_dt / taken[0] if taken else self.dt)
+        prepared.settle(current)
+        chained = self.chained and isinstance(prepared.adapter, nn.Module) and not variable and not self.colliders
+        chained = chained and getattr(prepared.adapter, "chained", True)
+        if chained:
+            solver, lengths = prepared.lanes.solvers[0], segments(self.substeps, stride)
+            states = self._chains.frames(solver, adapter, current, prepared.packed, frames - 1, lengths, collect)
+        wanted, total = wants_gradient((*current, *prepared.held.values(), *poses)), (frames - 1) * self.substeps
+        if not chained:
+            prepared.give_memory(total, wanted)
+        prepared.choose_lengths(total, wanted, variable)
+        reactions = []
+        for frame in range(1, frames):
+            if frame > 1:
+                taken.append(substeps_of(frame, *current[1:4]))
+            count, first = taken[-1], sum(taken[:-1])
+            dt = self.frame_dt / count
+            if variable:
+                steps = Steps(dt if lag is None else 0.5 * (lag + dt), dt)
+                along = self._poses_of_frame(motions, frames, taken, start_time, given is not None)
+            else:
+                steps, along = None, tuple(part[first : first + count] for part in poses)
+            if chained:
+                current, forces = next(states), None
+            else:
+                current, forces = prepared.frame(current, prepared.lengths(count, variable), first, along, steps)
+            lag = dt
+            if forces is not None:
+                reactions.append(mean_force(forces, steps) if variable else forces)
+            for name, value in zip(recorded, (current[0], current[1], current[3], current[4])):
+                recorded[name].append(value)
+            if progress is not None:
+                progress(frame)
+        return self._recorded(recorded, current, reactions, taken)
+
+    def rollout_worlds(
+        self,
+        state: ParticleState,
+        parameters: dict[str, Tensor],
+        volume: Tensor,
+        density: float | Tensor,
+        frames: int,
+        adapter: Callable | Sequence[Callable] | None = None,
+        stride: int | None = 1,
+        progress: Callable[[int], None] | None = None,
+        started: bool = False,
+        motions: Sequence | None = None,
+        start_time: float = 0.0,
+        gravity: Tensor | Sequence | None = None,
+        together: int | None = None,
+    ) -> Rollout:
+        """B rollouts of the same body at once, as `rollout` with the fixed time step: a leading dimension for the worlds.
+
+        state: x (B, N, 3) and so on; parameters: as in `rollout`, where they are the same in all worlds, or (B, 1) or (B, N),
+        vectors (B, 1, k) or (B, N, k). adapter: one for all worlds, which is asked for all particles, (B N, ...), or one for each.
+        motions: of the colliders in every world, B sequences, or one sequence of K for all. gravity: (B, 3) [m/s^2], where it is
+        not the simulator's in all worlds. volume (N,), density, frames, stride, progress, started, start_time: as `rollout`.
+        together: worlds that go through the same launches: all of them on a CUDA device, where they fill it, and one on a CPU,
+        where as many worlds as there are cores advance at a time; it divides B.
+        Returns a `Rollout` with x (T, B, N, 3) and so on, reactions (T - 1, substeps, B, K, 6): `Rollout.worlds` parts it. On a
+        CPU each world has the bits of its own `rollout`, where gradients of what worlds share are summed over them.
+        Errors: as `rollout`; SimulationDiverged names the world: none of the others is returned.
+        """
+        worlds = self._check_worlds(state, together)
+        gravities = self._gravities(gravity, worlds)
+        prepared = self._prepare(state, parameters, volume, density, adapter, stride, None, frames, worlds, gravities, together)
+        each = self._motions_of_worlds(motions, worlds)
+        poses = [self._poses(own, frames, start_time) for own in each]
+        poses = tuple(torch.cat(parts, 1) for parts in zip(*poses))
+        C = self._affine(state, started)
+        current = flat(replace(state, C_affine=C, F_tot=state.F_tot if self.law.plastic else state.F))
+        recorded = {name: [value] for name, value in zip(("x", "v", "F", "F_tot"), (*current[:2], *current[3:]))}
+        if not started:
+            current = prepared.first_advance(current, self.dt)
+        prepared.settle(current)
+        wanted, total = wants_gradient((*current, *prepared.held.values(), *poses)), (frames - 1) * self.substeps
+        prepared.give_memory(total, wanted)
+        prepared.choose_lengths(total, wanted, False)
+        lengths, reactions = prepared.lengths(self.substeps, False), []
+        for frame in range(1, frames):
+            first = (frame - 1) * self.substeps
+            along = tuple(part[first : first + self.substeps] for part in poses)
+            current, forces = prepared.frame(current, lengths, first, along, None)
+            reactions += [] if forces is None else [forces]
+            for name, value in zip(recorded, (current[0], current[1], current[3], current[4])):
+                recorded[name].append(value)
+            if progress is not None:
+                progress(frame)
+        found = self._recorded(recorded, current, reactions, [self.substeps] * (frames - 1))
+        apart = {name: getattr(found, name).unflatten(1, (worlds, -1)) for name in ("x", "v", "F", "F_tot")}
+        final = ParticleState(*(getattr(found.final, name).unflatten(0, (worlds, -1)) for name in STATE))
+        forces = None if found.reactions is None else found.reactions.unflatten(2, (worlds, -1))
+        return replace(found, **apart, final=final, reactions=forces)
+
+    def stepper(
+        self,
+        state: ParticleState,
+        parameters: dict[str, Tensor],
+        volume: Tensor,
+        density: float | Tensor,
+        adapter: Callable | Sequence[Callable] | None = None,
+        stride: int | None = 1,
+        *,
+        started: bool = False,
+        motions: Sequence | None = None,
+        gravity: Tensor | Sequence | None = None,
+        together: int | None = None,
+        control: StepControl | None = None,
+        steps: int = 30,
+    ) -> tuple[Stepper, Moment]:
+        """(what advances a body, or B of them, frame by frame, the moment to start from); arguments as `rollout` and
+        `rollout_worlds`.
+
+        state: x (N, 3), or (B, N, 3) of B worlds. control: choose the substeps of every frame (one world only). steps: for which
+        there shall be memory to keep all states, where a gradient is wanted; there may be more. Every step gives the bits of the
+        same frame of a rollout. Errors: ConfigError.
+        """
+        worlds = None if state.x.ndim == 2 else self._check_worlds(state, together)
+        if worlds is not None and control is not None:
+            raise ConfigError("control: expected None with many worlds, which take the same substeps")
+        if worlds is None and (gravity is not None or together is not None):
+            raise ConfigError("gravity and together: expected None without worlds; gravity is the simulator's")
+        gravities = None if worlds is None else self._gravities(gravity, worlds)
+        prepared = self._prepare(state, parameters, volume, density, adapter, stride, None, 1, worlds, gravities, together)
+        each = [self._motions(motions)] if worlds is None else self._motions_of_worlds(motions, worlds)
+        each = [[m.timed(None, self.frame_dt) if isinstance(m, Motion) else m for m in own] for own in each]
+        chooser = None
+        if control is not None:
+            chooser = self._chooser(control, prepared, parameters, density, each[0])
+        current = replace(state, C_affine=self._affine(state, started), F_tot=state.F_tot if self.law.plastic else state.F)
+        parts = tuple(getattr(current, name) for name in STATE) if worlds is None else flat(current)
+        prepared.settle(parts)
+        prepared.give_memory(steps * self.substeps, torch.is_grad_enabled())
+        stepper = Stepper(prepared, worlds, self.substeps, self.frame_dt, chooser, each, self.dtype)
+        return stepper, Moment(current, self.substeps if started else 0)
+
+    def _prepare(
+        self, state: ParticleState, parameters: dict[str, Tensor], volume: Tensor, density: float | Tensor, adapter, stride,
+        collect, frames: int, worlds: int | None = None, gravities: Sequence[tuple] | None = None, together: int | None = None,
+    ) -> Prepared:  # fmt: skip
+        """What a rollout needs besides its state. Errors: ConfigError."""
+        if frames < 1 or (stride is not None and stride < 1):
+            raise ConfigError(f"frames and stride: expected at least 1, found {frames} and {stride}")
+        self._check(state, volume)
+        volume, n, count = volume.detach().contiguous(), len(volume), worlds or 1
+        density, mean_mass = self._density(density, volume)
+        F = state.F if worlds is None else state.F.flatten(0, 1)
+        packed = self.pack(parameters, n, _polar(F) if self.law.reference is not None else None, worlds)
+        cutoff = self.mass_cutoff
+        if cutoff is None:
+            cutoff = 0.0 if self.dtype == torch.float64 else 1e-12 * mean_mass
+        if worlds is None:
+            solvers = [SegmentSolver(self.numerics, volume, density, cutoff, self._workspaces)]
+        else:
+            size = together or (worlds if self.device.type == "cuda" else 1)
+            volume, density = (t.repeat(size) if isinstance(t, Tensor) else t for t in (volume, density))
+            solvers = [
+                SegmentSolver(self.numerics, volume, density, cutoff, self._workspaces, 0.0, gravities[i : i + size], i)
+                for i in range(0, worlds, size)
+            ]
+        if isinstance(adapter, Sequence):
+            adapter = Several(adapter, count)
+        lanes = Lanes(solvers, self._buffers, self._warm)
+        return Prepared(self.numerics, self._ask, lanes, packed, adapter, stride, collect, self._long)
+
+    def _affine(self, state: ParticleState, started: bool) -> Tensor:
+        return state.C_affine if started or self.init_affine == "spin" else torch.zeros_like(state.C_affine)
+
+    def _chooser(
+        self, control: StepControl, prepared: Prepared, parameters: dict[str, Tensor], density: float | Tensor, motions
+    ) -> StepChooser:
+        solids = max((m.max_speed(reach(c.shape)) for m, c in zip(motions, self.colliders)), default=0.0)
+        density = density if isinstance(density, Tensor) and density.ndim else float(density)
+        return StepChooser(control, self.numerics, parameters, prepared.packed, density, self.frame_dt, solids)
+
+    def _recorded(
+        self, recorded: dict[str, list[Tensor]], current: tuple[Tensor, ...], reactions: list[Tensor], taken: list[int]
+    ) -> Rollout:
+        stacked = {name: torch.stack(values) for name, values in recorded.items() if name != "F_tot"}
+        stacked["F_tot"] = torch.stack(recorded["F_tot"]) if self.law.plastic else stacked["F"]
+        frames = len(recorded["x"])
+        times = self.frame_dt * torch.arange(frames, dtype=self.dtype, device=self.device)
+        inverted = int((_determinant(stacked["F"].detach()) <= 0).sum())
+        if inverted and self.on_inversion == "warn":
+            warnings.warn(f"{inverted} particle states with det F <= 0 in {frames} frames", stacklevel=3)
+        per_frame = torch.stack(reactions) if reactions else None
+        return Rollout(
+            **stacked, times=times, final=ParticleState(*current), inverted=inverted, reactions=per_frame, counts=tuple(taken)
+        )
+
+    def _check_worlds(self, state: ParticleState, together: int | None) -> int:
+        """The number of worlds. Errors: ConfigError."""
+        if state.x.ndim != 3:
+            raise ConfigError(f"x: expected shape (worlds, particles, 3), found {tuple(state.x.shape)}")
+        worlds = len(state.x)
+        if together is not None and (together < 1 or worlds % together):
+            raise ConfigError(f"together: expected a divisor of the {worlds} worlds, found {together}")
+        return worlds
+
+    def _gravities(self, gravity: Tensor | Sequence | None, worlds: int) -> tuple[tuple[float, float, float], ...]:
+        if gravity is None:
+            return (self.numerics.gravity,) * worlds
+        gravity = torch.as_tensor(gravity, dtype=torch.float64)
+        if tuple(gravity.shape) != (worlds, 3) or not bool(torch.isfinite(gravity).all()):
+            raise ConfigError(f"gravity: expected finite numbers of shape ({worlds}, 3), found shape {tuple(gravity.shape)}")
+        return tuple(map(tuple, gravity.tolist()))
+
+    def _motions_of_worlds(self, motions: Sequence | None, worlds: int) -> list[Sequence[Motion | Trajectory]]:
+        if motions is None or not any(isinstance(own, Sequence) for own in motions):
+            return [self._motions(motions)] * worlds
+        if len(motions) != worlds:
+            raise ConfigError(f"motions: expected one sequence for each of {worlds} worlds, found {len(motions)}")
+        return [self._motions(own) for own in motions]
+
+    def _motions(self, motions: Sequence[Motion | Trajectory] | None) -> Sequence[Motion | Trajectory]:
+        motions = [collider.motion for collider in self.colliders] if motions is None else motions
+        if len(motions) != len(self.colliders):
+            raise ConfigError(f"motions: expected one for each of {len(self.colliders)} colliders, found {len(motions)}")
+        return motions
+
+    def _poses(self, motions: Sequence[Motion | Trajectory], frames: int, start_time: float) -> tuple[Tensor, ...]:
+        if not self.colliders:
+            return ()
+        return sample_poses(motions, frames - 1, self.substeps, self.dt, start_time, self.dtype, self.device)
+
+    def _poses_of_frame(
+        self, motions: Sequence[Motion | Trajectory], frames: int, counts: list[int], start_time: float, replayed: bool
+    ) -> tuple[Tensor, ...]:
+        if not self.colliders:
+            return ()
+        last = len(counts) - 1
+        return sample_frame(motions, last, frames - 1, counts, self.frame_dt, start_time, self.dtype, self.device, replayed)
+
+    def material_state(self, F: Tensor, C_affine: Tensor, parameters: dict[str, Tensor]) -> MaterialState:
+        """What an adapter would read at deformation gradients F (N, 3, 3); differentiable. For analysis and tests."""
+        rotation = torch.eye(3, dtype=self.dtype, device=self.device).expand(len(F), 3, 3)
+        return MaterialState(*material_state(self.law, F, C_affine, self.pack(parameters, len(F), rotation)))
+
+    def _check(self, state: ParticleState, volume: Tensor) -> None:
+        *worlds, n = state.x.shape[:-1]
+        shapes = {name: (*worlds, n, 3) if name in ("x", "v") else (*worlds, n, 3, 3) for name in STATE}
+        values = {name: (getattr(state, name), shape) for name, shape in shapes.items()} | {"volume": (volume, (n,))}
+        for name, (value, shape) in values.items():
+            if tuple(value.shape) != shape or value.dtype != self.dtype or value.device.type != self.device.type:
+                raise ConfigError(
+                    f"{name}: expected shape {shape} of {self.dtype} on {self.device}, found {tuple(value.shape)} of "
+                    f"{value.dtype} on {value.device}"
+                )
+
+    def _density(self, density: float | Tensor, volume: Tensor) -> tuple[float | Tensor, float]:
+        """(density, mean mass of a particle [kg]), also checks the volumes: one look at the host for all.
+
+        A number stays one: arithmetic, and so every bit, is that of a body of one material."""
+        if not isinstance(density, Tensor) or density.ndim == 0:
+            density = float(density)
+            if not (math.isfinite(density) and density > 0):
+                raise ConfigError(f"density: expected a positive number [kg/m^3], found {density}")
+            valid = torch.ones((), dtype=torch.bool, device=volume.device)
+        else:
+            if density.shape != volume.shape:
+                raise ConfigError(f"density: expected a number or shape {tuple(volume.shape)}, found {tuple(density.shape)}")
+            density = density.detach().to(volume)
+            valid = (torch.isfinite(density) & (density > 0)).all()
+        numbers = [(volume > 0).all(), valid, (density * volume).mean()]
+        volumes, densities, mass = torch.stack([n.double() for n in numbers]).tolist()
+        if not volumes:
+            raise ConfigError("volume: expected positive numbers [m^3] for all particles")
+        if not densities:
+            raise ConfigError("density: expected positive numbers [kg/m^3] for all particles")
+        return density, mass
+
+
+def _determinant(F: Tensor) -> Tensor:
+    """Of (..., 3, 3), as a triple product: a factorisation of each matrix takes CUDA longer than a substep."""
+    return (F[..., 0, :] * torch.linalg.cross(F[..., 1, :], F[..., 2, :])).sum(-1)
+
+
+def _polar(F: Tensor) -> Tensor:
+    """Polar rotation of F (N, 3, 3), without gradient."""
+    U, S, Vh = torch.linalg.svd(F.detach().double())
+    sign = torch.ones_like(S)
+    sign[..., 2] = torch.linalg.det(U @ Vh)
+    return ((U * sign[..., None, :]) @ Vh).to(F.dtype)

@@ -1,0 +1,214 @@
+"""A body that is ready to be advanced, and the frame, or control step, by which it is: state in, state out.
+
+A rollout is a loop over frames; a `Stepper` leaves the loop to the caller, who may drive the colliders from one step to the next.
+Both go through `Prepared.frame`, so that steps give the bits that a rollout gives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from mosa.errors import ConfigError
+from mosa.physics.constitutive.material_operations import first_advance
+from mosa.physics.contact.motion import Motion, Poses, Trajectory, sample_poses
+from mosa.physics.engine.adapter_interface import ANSWER, AdapterOperator, MaterialState
+from mosa.physics.engine.adaptive_steps import StepChooser
+from mosa.physics.engine.budget import room
+from mosa.physics.engine.chain_schedule import SEGMENT
+from mosa.physics.engine.segment import LONGEST, LONGEST_KEPT, Lanes, advance_segment, substep_bytes, wants_gradient
+from mosa.physics.engine.workspace import Numerics, Steps
+from mosa.types import ParticleState
+
+STATE = ("x", "v", "C_affine", "F", "F_tot")
+
+
+@dataclass
+class Prepared:
+    """The bodies of one rollout: the parameters of their law, packed, what an adapter answered last, and what advances them.
+
+    ask: (adapter, F, C_affine, packed, collect) -> its answer by name. long: whether segments may be long (CUDA)."""
+
+    numerics: Numerics
+    ask: Callable[..., dict[str, Tensor | None]]
+    lanes: Lanes
+    packed: Tensor
+    adapter: Callable[[MaterialState], AdapterOperator] | None
+    stride: int | None
+    collect: Callable[[Any], None] | None
+    long: bool
+    held: dict[str, Tensor | None] = None
+    most_alone: int = SEGMENT
+
+    def __post_init__(self) -> None:
+        self.held = {"parameters": self.packed, **dict.fromkeys(ANSWER)}
+
+    def first_advance(self, state: tuple[Tensor, ...], dt: float) -> tuple[Tensor, ...]:
+        """The advance of F by dt [s] with which a motion begins. state: (x, v, C_affine, F, F_tot)."""
+        x, v, C, F, F_tot = state
+        numerics = replace(self.numerics, dt=dt)
+        if not numerics.law.plastic:
+            F = first_advance(numerics, F, C, self.packed)
+            return x, v, C, F, F
+        operator = self.ask(self.adapter, F, C, self.packed, self.collect) if self.adapter is not None else self.held
+        mapped = first_advance(numerics, F, C, self.packed, operator["plastic_G"], operator["plastic_h"])
+        return x, v, C, mapped, F_tot + dt * (C @ F_tot)
+
+    def settle(self, state: tuple[Tensor, ...]) -> None:
+        """Ask an adapter whose operator is the same in every state, once and for all: nothing cuts the segments then."""
+        if self.adapter is not None and self.stride is None:
+            self.held.update(self.ask(self.adapter, state[3], state[2], self.packed, self.collect))
+            self.adapter = None
+
+    def give_memory(self, substeps: int, wanted: bool) -> None:
+        """Memory for the states of `substeps` substeps, where a gradient is `wanted` or an adapter may want one."""
+        if wanted or (self.adapter is not None and torch.is_grad_enabled()):
+            each = substep_bytes(self.numerics, len(self.packed))
+            self.lanes.give(room(self.numerics.device, substeps * each, self.lanes.worlds))
+
+    def choose_lengths(self, substeps: int, wanted: bool, variable: bool) -> None:
+        """How long segments may be that nothing cuts, in a motion of `substeps` substeps."""
+        self.most_alone = SEGMENT
+        if self.long and not variable and not wanted:
+            self.most_alone = LONGEST
+        elif self.long and not variable and self.lanes.room:
+            self.most_alone = max(SEGMENT, min(LONGEST_KEPT, substeps // 8))
+
+    def lengths(self, count: int, variable: bool) -> list[int]:
+        """Of the segments of a frame of `count` substeps; variable: sizes that many counts share."""
+        if variable:
+            return segments(count, SEGMENT if self.adapter is None else self.stride)
+        return segments(count, None if self.adapter is None else self.stride, self.most_alone)
+
+    def frame(
+        self, state: tuple[Tensor, ...], lengths: Sequence[int], first: int, poses: tuple[Tensor, ...], steps: Steps | None
+    ) -> tuple[tuple[Tensor, ...], Tensor | None]:
+        """(state after the segments of a frame, reactions (substeps, W K, 6) or None). first: number of its first substep; poses:
+        of W worlds with K colliders at its substeps, () where there are none; steps: None for the numerics' dt."""
+        forces, done = [], 0
+        flow = getattr(self.adapter, "flow", None)
+        for length in lengths:
+            if flow is not None:
+                x, v, C, F, F_tot = state
+                state = (x, v, C, flow(F, length * (self.numerics.dt if steps is None else steps.dt)), F_tot)
+            if self.adapter is not None:
+                self.held.update(self.ask(self.adapter, state[3], state[2], self.packed, self.collect))
+            along = tuple(part[done : done + length] for part in poses)
+            state, reaction = advance_segment(self.lanes, state, self.held, length, first + done, along, steps)
+            forces += [torch.cat(reaction, -1)] if reaction else []
+            steps = None if steps is None else Steps(steps.dt, steps.dt)
+            done += length
+        return state, torch.cat(forces) if forces else None
+
+
+def segments(substeps: int, stride: int | None, most: int = 0) -> list[int]:
+    """Lengths of a frame's segments: `stride` each (the last may be shorter), or nearly equal ones of at most `most`."""
+    if stride is None:
+        count = -(-substeps // most)
+        return [substeps // count + (i < substeps % count) for i in range(count)]
+    return [min(stride, substeps - i) for i in range(0, substeps, stride)]
+
+
+def mean_force(forces: Tensor, steps: Steps) -> Tensor:
+    """(1, K, 6) of (S, K, 6): the impulse over the time in which it acted, the first substep's being its kick."""
+    longer = steps.kick / steps.dt - 1
+    return (longer * forces[:1] + forces.sum(0, keepdim=True)) / (len(forces) + longer)
+
+
+def flat(state: ParticleState) -> tuple[Tensor, ...]:
+    """(x, v, C_affine, F, F_tot) of all worlds' particles, one world's after the other's."""
+    return tuple(getattr(state, name).flatten(0, 1) for name in STATE)
+
+
+class Moment(NamedTuple):
+    """Where a motion is that is advanced step by step. state: (N, ...) or, of B worlds, (B, N, ...); substeps: done since its
+    start, in how many frames; lag [s]: the last substep's dt, 0 before the first, for steps whose substeps are chosen."""
+
+    state: ParticleState
+    substeps: int = 0
+    frames: int = 0
+    lag: float = 0.0
+
+
+class Step(NamedTuple):
+    """moment: after the step; reactions: (substeps, K, 6), (substeps, B, K, 6) of B worlds, as in a `Rollout`, None without
+    colliders, (1, ...) where substeps are chosen; count: substeps taken."""
+
+    moment: Moment
+    reactions: Tensor | None
+    count: int
+
+
+class Stepper:
+    """Advances bodies by one frame at a time, with colliders where the caller puts them. Made by `Simulator.stepper`.
+
+    prepared: with what is the same in all steps; worlds: None for one body without a leading dimension; count: substeps of a
+    step; chooser: where they are chosen instead; motions: of the colliders, of every world.
+    """
+
+    def __init__(
+        self, prepared: Prepared, worlds: int | None, count: int, frame_dt: float, chooser: StepChooser | None,
+        motions: Sequence[Sequence[Motion | Trajectory]], dtype: torch.dtype,
+    ) -> None:  # fmt: skip
+        self.prepared, self.worlds, self.count, self.frame_dt, self.chooser = prepared, worlds, count, frame_dt, chooser
+        self.motions, self.dtype = motions, dtype
+
+    @property
+    def dt(self) -> float:
+        """[s] of a substep where their count is fixed."""
+        return self.frame_dt / self.count
+
+    def step(
+        self, moment: Moment, poses: Poses | Callable[[int, float], Poses] | None = None, speed: float | None = None
+    ) -> Step:
+        """One step on from `moment`, which is left as it is; differentiable in it, in poses, and in what `Simulator.stepper` got.
+
+        poses: of K colliders at the step's S substeps, (S, K, ...) or, of B worlds, (S, B, K, ...), or a function of S and their
+        dt [s]; None: of their own motions. speed: bound of the colliders' speeds [m/s] for substeps that are chosen, None for
+        that of their own motions. Errors: SimulationDiverged naming substep and particle; ConfigError.
+        """
+        prepared, variable = self.prepared, self.chooser is not None
+        state = flat(moment.state) if self.worlds is not None else tuple(getattr(moment.state, name) for name in STATE)
+        if not prepared.numerics.law.plastic:
+            state = (*state[:4], state[3])
+        count = self.chooser.choose(moment.frames + 1, *state[1:4], speed) if variable else self.count
+        dt = self.frame_dt / count
+        if moment.substeps == 0:
+            state = prepared.first_advance(state, dt)
+        steps = Steps(0.5 * (moment.lag + dt), dt) if variable else None
+        along = self._poses(moment, count, dt, poses)
+        prepared.choose_lengths(count, wants_gradient((*state, *prepared.held.values(), *along)), variable)
+        state, forces = prepared.frame(state, prepared.lengths(count, variable), moment.substeps, along, steps)
+        if forces is not None:
+            forces = mean_force(forces, steps) if variable else forces
+            forces = forces.unflatten(1, (self.worlds, -1)) if self.worlds is not None else forces
+        if self.worlds is not None:
+            state = tuple(t.unflatten(0, (self.worlds, -1)) for t in state)
+        after = Moment(ParticleState(*state), moment.substeps + count, moment.frames + 1, dt)
+        return Step(after, forces, count)
+
+    def _poses(self, moment: Moment, count: int, dt: float, poses: Poses | Callable | None) -> tuple[Tensor, ...]:
+        """(S, W K, ...) each, in the simulator's type."""
+        colliders, device = len(self.motions[0]), self.prepared.numerics.device
+        if not colliders:
+            return ()
+        if poses is None:
+            each = [self.sample(moment, count, dt, motions) for motions in self.motions]
+            return tuple(torch.cat(parts, 1).to(self.dtype).to(device) for parts in zip(*each))
+        poses = poses(count, dt) if callable(poses) else poses
+        leading = (count, colliders) if self.worlds is None else (count, self.worlds, colliders)
+        for name, part, shape in zip(Poses._fields, poses, ((3,), (3, 3), (3,), (3,)), strict=True):
+            if tuple(part.shape) != (*leading, *shape):
+                raise ConfigError(f"poses: {name}: expected shape {(*leading, *shape)}, found {tuple(part.shape)}")
+        poses = [part.to(dtype=self.dtype, device=device) for part in poses]
+        return tuple(poses if self.worlds is None else (part.flatten(1, 2) for part in poses))
+
+    def sample(self, moment: Moment, count: int, dt: float, motions: Sequence[Motion | Trajectory], after: int = 0) -> Poses:
+        """Poses (S, K, ...) float64 of colliders with these motions at `count` substeps of dt [s] from `after` substeps after
+        `moment`, at the times at which a rollout takes them."""
+        first, start = (moment.substeps, 0.0) if self.chooser is None else (0, moment.frames * self.frame_dt)
+        return sample_poses(motions, 1, count, dt, start, torch.float64, torch.device("cpu"), first + after)

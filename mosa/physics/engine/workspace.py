@@ -1,0 +1,413 @@
+"""Device buffers of a segment of substeps, and the launches that advance it and run its adjoint.
+
+Everything is allocated once per (particles, slots); nothing allocates inside the substep loop. The launches of a segment are
+captured as one graph the second time they are asked for with the same time step: on CUDA that saves the waits between them, on a
+CPU the 10 us that Python takes for each. The grid's window is read from memory by the kernels, and the nodes' arrays are longer
+than it: a body that moves or speeds up goes through the same graphs.
+"""
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import warp as wp
+from torch import Tensor
+
+from mosa.physics.constitutive.laws import SLOTS, Law
+from mosa.physics.constitutive.material_kernels import kernels_of
+from mosa.physics.constitutive.particle_access import aligned, zeros_in_one
+from mosa.physics.contact.collider_buffers import ColliderBuffers
+from mosa.physics.contact.colliders import PackedColliders
+from mosa.physics.engine.capture import ON_CPU, Captures
+from mosa.physics.grid.transfer_kernels import NO_EVENT, transfer_kernels
+from mosa.physics.grid.window import SMALL
+
+SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
+
+
+@dataclass(frozen=True)
+class Numerics:
+    """What is constant over a rollout and the same in all worlds, but for gravity where each has its own. dx [m], dt [s] where the
+    step is fixed, gravity (3,) [m/s^2], planes (P, 6) and modes (P,) from `pack_planes`, low and high (3,) [m] corners of the
+    admissible domain, norm_eps under the root of yield norms, colliders None where there are none, strain: measure of an operator
+    that is a stiffness (`stress_kernel`), None for one that acts on the stress."""
+
+    law: Law
+    dtype: torch.dtype
+    device: torch.device
+    dx: float
+    dt: float
+    gravity: tuple[float, float, float]
+    planes: Tensor
+    modes: Tensor
+    plane_count: int
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    norm_eps: float
+    rebuild: bool
+    check_J: bool
+    colliders: PackedColliders | None = None
+    strain: str | None = None
+
+
+class Steps(NamedTuple):
+    """Times [s] of a segment's substeps: each moves particles by `dt`; the first one's forces act for `kick`, the others' for dt.
+
+    Velocities lie between positions, half a substep back. Where dt changes, the way from the middle of the last substep to that
+    of the next is the mean of the two: with that kick the scheme stays the leapfrog that it is at a constant dt.
+    """
+
+    kick: float
+    dt: float
+
+
+MAX_GRAPHS = 64
+"""Captured graphs a workspace keeps: one per pass and time step."""
+SPARE = 8
+"""Room for larger windows: half as many nodes again, at most `window.SMALL`, or one in so many where that is more. A window that
+finds none costs new buffers and captures."""
+IDLE = 8
+"""Times the window's nodes that stay (`window.SMALL` in any case) for when it grows again: idle ones cost memory and, on CUDA,
+threads that end at once."""
+BLOCK = 64
+"""Threads of a CUDA block: small ones, so that ten thousand particles are spread over all multiprocessors."""
+
+
+def launch(kernel, dim: int, inputs: list, device, adj_inputs: list | None = None) -> None:
+    """On Warp's current stream. adj_inputs: launch the adjoint."""
+    block = BLOCK if device.is_cuda else None
+    with nullcontext() if device.is_cuda else ON_CPU.launching():
+        if adj_inputs is None:
+            wp.launch(kernel, dim, inputs=inputs, device=device, block_dim=block)
+        else:
+            wp.launch(kernel, dim, inputs=inputs, adj_inputs=adj_inputs, adjoint=True, device=device, block_dim=block)
+
+
+def warp_stream(device: torch.device):
+    """Context in which Warp launches on torch's current stream."""
+    if device.type != "cuda":
+        return wp.ScopedDevice("cpu")
+    # without waiting for Warp's own stream: nothing is left on it, and a stream that is being captured could not
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
+
+
+def copies(tensors: Sequence[Tensor]) -> list[Tensor]:
+    """Contiguous copies, in one launch on CUDA."""
+    made = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in tensors]
+    if made:
+        torch._foreach_copy_(made, list(tensors))
+    return made
+
+
+class Workspace:
+    """Buffers for N particles and `slots` stored substeps (2 states and 1 grid when nothing is stored).
+
+    worlds: among which the particles are shared in equal parts, one world's after the other's; adapted, plastic_adapted: whether a
+    stress operator and a plastic operator act; with_adjoint: also buffers for the adjoint; pointed: no buffers for the operators,
+    which only `point` gives.
+    """
+
+    @torch.inference_mode(False)
+    def __init__(
+        self, numerics: Numerics, particles: int, substeps: int, *, adapted: bool, plastic_adapted: bool, with_adjoint: bool,
+        pointed: bool = False, worlds: int = 1,
+    ) -> None:  # fmt: skip
+        self.worlds, self.size = worlds, particles // worlds
+        self.numerics, self.particles, self.substeps, self.with_adjoint = numerics, particles, substeps, with_adjoint
+        self.scalar = SCALARS[numerics.dtype]
+        self.kernels = transfer_kernels(self.scalar)
+        self.stress, self.mapping = kernels_of(numerics.law, self.scalar, adapted, plastic_adapted, numerics.strain)
+        self.plastic = numerics.law.plastic
+        n = particles
+        states = substeps + 1 if with_adjoint else 2
+        self.x, self.x_wp = self._per_slot(states, (n, 3), self.kernels.vec3)
+        self.v, self.v_wp = self._per_slot(states, (n, 3), self.kernels.vec3)
+        self.C, self.C_wp = self._per_slot(states, (n, 3, 3), self.kernels.mat33)
+        self.F, self.F_wp = self._per_slot(states, (n, 3, 3), self.kernels.mat33)
+        # the deformation gradient that is never mapped: F itself where the law does not yield
+        self.A, self.A_wp = self._per_slot(states, (n, 3, 3), self.kernels.mat33) if self.plastic else (self.F, self.F_wp)
+        self.tau, self.tau_wp = self._per_slot(substeps if with_adjoint else 1, (n, 3, 3), self.kernels.mat33)
+        self.mass, self.mass_wp = self.array((n,), self.scalar)
+        self.volume, self.volume_wp = self.array((n,), self.scalar)
+        vec6, mat66 = wp.types.vector(6, self.scalar), wp.types.matrix((6, 6), self.scalar)
+        shapes = {
+            "parameters": ((n, SLOTS), wp.types.vector(SLOTS, self.scalar)),
+            "G": ((n if adapted else 1, 6, 6), mat66), "h": ((n if adapted else 1, 6), vec6),
+            "plastic_G": ((n if plastic_adapted else 1, 6, 6), mat66), "plastic_h": ((n if plastic_adapted else 1, 6), vec6),
+        }  # fmt: skip
+        self.held, self.held_wp = {}, {}
+        for name, (shape, kind) in shapes.items():
+            size = shape if name == "parameters" or not pointed else (1, *shape[1:])
+            self.held[name], self.held_wp[name] = self.array(size, kind)
+        if with_adjoint:
+            self.adj_x, self.adj_x_wp = self._per_slot(2, (n, 3), self.kernels.vec3)
+            self.adj_v, self.adj_v_wp = self._per_slot(2, (n, 3), self.kernels.vec3)
+            self.adj_C, self.adj_C_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
+            self.adj_F, self.adj_F_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
+            self.adj_A, self.adj_A_wp = self.adj_F, self.adj_F_wp
+            if self.plastic:
+                self.adj_A, self.adj_A_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
+            self.adj_tau, self.adj_tau_wp = self.array((n, 3, 3), self.kernels.mat33)
+            buffer, parts = zeros_in_one([shape for shape, _ in shapes.values()], numerics.dtype, numerics.device)
+            self.adj_held = dict(zip(shapes, parts))
+            self.adj_held_wp = {name: wp.from_torch(part, dtype=shapes[name][1]) for name, part in self.adj_held.items()}
+            # to clear in one launch: all of it, and all but the parameters' part, which comes first
+            self.all_adj_wp = wp.from_torch(buffer, dtype=self.scalar)
+            self.adj_operator_wp = wp.from_torch(buffer[parts[1].storage_offset() :], dtype=self.scalar)
+        self.flags, self.flags_wp = self.array((4,), wp.int64, torch.int64)
+        self.window, self.window_wp = self.array((3 * worlds, 3), wp.vec3i, torch.int32)
+        # what gravity adds to node velocities in the first substep of a segment and in the others
+        self.impulses, self.impulses_wp = self._per_slot(2, (worlds, 3), self.kernels.vec3)
+        self.planes_wp = wp.from_torch(numerics.planes, dtype=self.scalar)
+        self.modes_wp = wp.from_torch(numerics.modes, dtype=wp.int32)
+        self.colliders = None
+        if numerics.colliders is not None:
+            self.colliders = ColliderBuffers(numerics.colliders, self.scalar, substeps, self, with_adjoint)
+        self.cutoff = 0.0
+        self.nodes = self.capacity = self.allocations = 0
+        self._placed: np.ndarray | None = None
+        self._pulled: tuple | None = None
+        self.steps = Steps(numerics.dt, numerics.dt)
+        self._graphs: dict[tuple, object] = {}
+        self._captures = Captures("substeps cannot be captured as a graph and are launched one by one")
+
+    def array(self, shape: tuple[int, ...], kind, dtype: torch.dtype | None = None) -> tuple[Tensor, wp.array]:
+        """Zeros of `shape`, and the same memory as Warp's array of `kind`."""
+        tensor = torch.zeros(shape, dtype=dtype or self.numerics.dtype, device=self.numerics.device)
+        return tensor, wp.from_torch(tensor, dtype=kind)
+
+    def _per_slot(self, slots: int, shape: tuple[int, ...], kind):
+        tensor = torch.zeros((slots, *shape), dtype=self.numerics.dtype, device=self.numerics.device)
+        return list(tensor), [wp.from_torch(t, dtype=kind) for t in tensor]
+
+    def tape(self) -> list[Tensor]:
+        """Copies of all that the adjoint reads of a forward pass, one tensor of slots each, the grid's last."""
+        return [*copies(self._particle_slots()), self.grid_slots().clone(memory_format=torch.contiguous_format)]
+
+    def rewind(self, tape: Sequence[Tensor]) -> None:
+        """As if the forward pass that left `tape`, in the window that is set, had just run."""
+        torch._foreach_copy_(self._particle_slots(), list(tape[:-1]))
+        self.grid_slots().copy_(tape[-1])
+
+    def _particle_slots(self) -> list[Tensor]:
+        parts = [self.x, self.v, self.C, self.F, self.tau] + ([self.A] if self.plastic else [])
+        return [part[0]._base for part in parts]
+
+    def grid_slots(self) -> Tensor:
+        """(2, slots, nodes of the windows, 4): momentum and mass, velocity."""
+        return self.fields[:, :, : self.nodes]
+
+    def set_window(self, origins: np.ndarray, dims: np.ndarray) -> None:
+        """Place the grids: lowest node and number of nodes per axis, (W, 3), or (3,) for all worlds. Buffers and graphs are new
+        where there is no room for them."""
+        rows = np.zeros((self.worlds, 3, 3), dtype=np.int32)
+        rows[:, 0], rows[:, 1] = origins, dims
+        ends = rows[:, 1].prod(-1, dtype=np.int64).cumsum()
+        rows[1:, 2, 0], nodes = ends[:-1], int(ends[-1])
+        if not nodes <= self.capacity <= max(IDLE * nodes, SMALL):
+            self._allocate_nodes(nodes + max(nodes // SPARE, min(nodes // 2, SMALL)))
+        if self._placed is None or not np.array_equal(rows, self._placed):
+            self.window.copy_(torch.from_numpy(rows).flatten(0, 1), non_blocking=True)  # CUDA stages it before it returns
+            self._placed, self.nodes = rows, nodes
+
+    @torch.inference_mode(False)  # another rollout may want gradients
+    def _allocate_nodes(self, count: int) -> None:
+        self._graphs, self.allocations = {}, self.allocations + 1
+        self.capacity = 0  # until all is there: memory may run out
+        self.fields = self.grid_wp = self.velocity_wp = None  # freed before there are others
+        self.adj_grid = self.adj_grid_wp = self.adj_velocity = self.adj_velocity_wp = None
+        grids, vec4 = self.substeps if self.with_adjoint else 1, self.kernels.vec4
+        self.fields = torch.zeros((2, grids, count, 4), dtype=self.numerics.dtype, device=self.numerics.device)
+        self.grid_wp, self.velocity_wp = ([wp.from_torch(t, dtype=vec4) for t in slots] for slots in self.fields)
+        if self.colliders is not None:
+            self.colliders.set_nodes(count)
+        if self.with_adjoint:
+            self.adj_grid, self.adj_grid_wp = self.array((count, 4), vec4)
+            self.adj_velocity, self.adj_velocity_wp = self.array((count, 4), vec4)
+        self.capacity = count
+
+    def load(
+        self, state: tuple[Tensor, ...], held: dict[str, Tensor | None], volume: Tensor, mass: Tensor, cutoff: float,
+        poses: tuple[Tensor, ...] | None = None, steps: Steps | None = None,
+        gravities: tuple[tuple[float, float, float], ...] | None = None,
+    ) -> None:  # fmt: skip
+        """Copy the start of a segment in: (x, v, C_affine, F, F_tot), the parameters, the adapter's operator, colliders' poses.
+
+        steps: the numerics' dt by default; gravities: of every world [m/s^2], the numerics' by default."""
+        self.steps = steps or Steps(self.numerics.dt, self.numerics.dt)
+        pulled = (*self.steps, gravities or (self.numerics.gravity,) * self.worlds)
+        if pulled != self._pulled:
+            rows = [[[time * g for g in gravity] for gravity in pulled[2]] for time in self.steps]
+            rows = torch.tensor(rows, dtype=torch.float64)
+            self.impulses[0]._base.copy_(rows.to(self.numerics.dtype), non_blocking=True)
+            self._pulled = pulled
+        if self.colliders is not None:
+            self.colliders.load(poses)
+        slots = (self.x, self.v, self.C, self.F) + ((self.A,) if self.plastic else ())
+        targets = [*(slot[0] for slot in slots), self.volume, self.mass]
+        torch._foreach_copy_(targets, [*state[: len(slots)], volume, mass])
+        self.hold(held)
+        if cutoff != self.cutoff:
+            self.cutoff = cutoff
+            self._graphs.clear()
+
+    def hold(self, held: dict[str, Tensor | None]) -> None:
+        """Copy parameters and the adapter's operator in, those that are given."""
+        given = {name: value for name, value in held.items() if value is not None}
+        torch._foreach_copy_([self.held[name] for name in given], list(given.values()))
+
+    def point(self, held: dict[str, Tensor | None]) -> None:
+        """As `hold`, without a copy or a graph: the next launches read these tensors. The caller keeps them."""
+        for name, value in held.items():
+            if value is not None:
+                self.held_wp[name] = wp.from_torch(aligned(value.detach()), dtype=self.held_wp[name].dtype)
+
+    def final(self) -> tuple[Tensor, ...]:
+        """Copies of (x, v, C_affine, F, F_tot) after the segment; F_tot is F itself where the law does not yield."""
+        return self.whole(self.state(self.substeps))
+
+    def state(self, step: int) -> list[Tensor]:
+        """Copies of (x, v, C_affine, F), where the law yields of F_tot too, after `step` substeps: the last ones, or any of those
+        whose states are kept."""
+        slot = step % len(self.x)
+        return copies([part[slot] for part in (self.x, self.v, self.C, self.F, *((self.A,) if self.plastic else ()))])
+
+    def whole(self, parts: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """(x, v, C_affine, F, F_tot) from `state`."""
+        return tuple(parts) if self.plastic else (*parts, parts[3])
+
+    def advance(self) -> None:
+        """All substeps of the segment; events are left in `flags` for the caller to read."""
+        self.flags.fill_(NO_EVENT)
+        self._launch("advance", lambda: self.advance_steps(0, self.substeps))
+
+    def adjoint(self) -> None:
+        """Adjoint of all substeps, last to first, after `advance`. Seeds: adj_* slot `substeps` % 2, results: slot 0."""
+        self._launch("adjoint", lambda: self.adjoint_steps(0, self.substeps))
+
+    def _launch(self, name: str, body) -> None:
+        cuda = self.numerics.device.type == "cuda"
+        stream = wp.stream_from_torch(torch.cuda.current_stream(self.numerics.device)) if cuda else None
+        key = (name, *self.steps)
+        graph = self._graphs.get(key)
+        if len(self._graphs) > MAX_GRAPHS:
+            self._graphs.clear()
+        if graph == "loaded":
+            # on Warp's own stream: torch's default one cannot be captured
+            capture = wp.ScopedCapture(device=self.flags_wp.device, force_module_load=False)
+            graph = None
+            with nullcontext() if cuda else ON_CPU.capturing():
+                if self._captures.succeeds(capture, body):
+                    graph = self._graphs[key] = capture.graph
+        if graph is None:
+            with wp.ScopedStream(stream) if cuda else nullcontext():
+                body()  # the first pass compiles and loads the kernels, which a capture must not do
+            self._graphs[key] = "loaded"
+        else:
+            with nullcontext() if cuda else ON_CPU.launching():
+                wp.capture_launch(graph, stream=stream)
+
+    def _run(self, kernel, dim: int, inputs: list, adj_inputs: list | None = None) -> None:
+        launch(kernel, dim, inputs, self.flags_wp.device, adj_inputs)
+
+    def over_nodes(self, kernel, inputs: list) -> None:
+        """Launch for all nodes of the windows. Graphs hold the number of threads: one for all nodes of a world on a CPU, on a CUDA
+        device one for each that there is room for, shared among the worlds in equal parts."""
+        threads = -(-self.capacity // self.worlds) if self.flags_wp.device.is_cuda else 1
+        self._run(kernel, threads * self.worlds, [self.window_wp, threads, *inputs])
+
+    def _geometry(self, dt: float) -> list:
+        return [self.window_wp, self.size, self.numerics.dx, 1.0 / self.numerics.dx, dt]
+
+    def _kick(self, step: int) -> float:
+        """For how long [s] the forces of a substep act."""
+        return self.steps.kick if step == 0 else self.steps.dt
+
+    def _grid_arguments(self, slot: int, step: int) -> list:
+        numerics = self.numerics
+        return [
+            self.grid_wp[slot], self.impulses_wp[min(step, 1)], self.cutoff, numerics.dx, self.planes_wp, self.modes_wp,
+            numerics.plane_count,
+        ]  # fmt: skip
+
+    def _collider_place(self, slot: int) -> list:
+        return [self.grid_wp[slot], self.cutoff, self.numerics.dx]
+
+    def _stress_arguments(self, state: int, slot: int) -> list:
+        held = self.held_wp
+        return [self.F_wp[state], self.C_wp[state], held["parameters"], held["G"], held["h"], self.tau_wp[slot]]
+
+    def _mapping_arguments(self, state: int, new: int) -> list:
+        held, numerics = self.held_wp, self.numerics
+        return [
+            self.F_wp[state], self.C_wp[new], held["parameters"], held["plastic_G"], held["plastic_h"], self.steps.dt,
+            numerics.norm_eps, int(numerics.rebuild), self.F_wp[new],
+        ]  # fmt: skip
+
+    def advance_steps(self, first: int, count: int) -> None:
+        """Launch substeps `first` to `first + count` of the segment, from the states in slot `first`."""
+        kernels, numerics, n = self.kernels, self.numerics, self.particles
+        states, grids = len(self.x), len(self.grid_wp)
+        geometry, kicked = self._geometry(self.steps.dt), self._geometry(self.steps.kick)
+        low, high = kernels.vec3(*numerics.low), kernels.vec3(*numerics.high)
+        if self.colliders is not None and first == 0:
+            self.colliders.reset()
+        for step in range(first, first + count):
+            a, b, g = step % states, (step + 1) % states, step % grids
+            self.over_nodes(kernels.clear, [self.grid_wp[g]])
+            self._run(self.stress, n, self._stress_arguments(a, g))
+            self._run(kernels.p2g, n, [
+                self.x_wp[a], self.v_wp[a], self.C_wp[a], self.F_wp[a], self.tau_wp[g], self.mass_wp, self.volume_wp,
+                *(geometry if step else kicked), int(numerics.check_J), step, self.flags_wp, self.grid_wp[g],
+            ])  # fmt: skip
+            self.over_nodes(kernels.grid_update, [*self._grid_arguments(g, step), self.velocity_wp[g]])
+            if self.colliders is not None:
+                self.colliders.apply(step, self._collider_place(g), self._kick(step), self.velocity_wp[g])
+            self._run(kernels.g2p, n, [
+                self.x_wp[a], self.A_wp[a], self.velocity_wp[g], *geometry, low, high, step, self.flags_wp,
+                self.x_wp[b], self.v_wp[b], self.C_wp[b], self.A_wp[b],
+            ])  # fmt: skip
+            if self.plastic:
+                self._run(self.mapping, n, self._mapping_arguments(a, b))
+
+    def adjoint_steps(self, first: int, count: int, more: bool = False) -> None:
+        """Launch the adjoint of `advance_steps`: from the seeds in slot (first + count) % 2 to slot first % 2.
+
+        adj_held is of these substeps alone; more: but the parameters' part is added to what is there."""
+        kernels, n, held = self.kernels, self.particles, self.adj_held_wp
+        geometry, kicked = self._geometry(self.steps.dt), self._geometry(self.steps.kick)
+        (self.adj_operator_wp if more else self.all_adj_wp).zero_()
+        if self.colliders is not None and first + count == self.substeps:
+            self.colliders.reset_adjoint()
+        for step in reversed(range(first, first + count)):
+            a, b = step % 2, (step + 1) % 2  # adjoint slots; the states of all substeps are stored
+            if self.plastic:
+                self.adj_F_wp[a].zero_()
+                self._run(self.mapping, n, self._mapping_arguments(step, step + 1), [
+                    self.adj_F_wp[a], self.adj_C_wp[b], held["parameters"], held["plastic_G"], held["plastic_h"], 0.0, 0.0, 0,
+                    self.adj_F_wp[b],
+                ])  # fmt: skip
+            self.over_nodes(kernels.clear, [self.adj_velocity_wp])
+            self._run(kernels.adj_g2p, n, [
+                self.x_wp[step], self.A_wp[step], self.velocity_wp[step], self.C_wp[step + 1], *geometry,
+                self.adj_x_wp[b], self.adj_v_wp[b], self.adj_C_wp[b], self.adj_A_wp[b],
+                self.adj_x_wp[a], self.adj_A_wp[a], self.adj_velocity_wp,
+            ])  # fmt: skip
+            if self.colliders is not None:
+                # the velocities that the colliders found are cheaper to compute again than to keep
+                self.over_nodes(kernels.grid_update, [*self._grid_arguments(step, step), self.colliders.before_wp])
+                self.colliders.adjoint(step, self._collider_place(step), self._kick(step), self.adj_velocity_wp)
+            self.over_nodes(kernels.adj_grid, [*self._grid_arguments(step, step), self.adj_velocity_wp, self.adj_grid_wp])
+            if self.colliders is not None:
+                self.colliders.add_mass(self.adj_grid_wp)
+            self._run(kernels.adj_p2g, n, [
+                self.x_wp[step], self.v_wp[step], self.C_wp[step], self.tau_wp[step], self.mass_wp, self.volume_wp,
+                *(geometry if step else kicked), self.adj_grid_wp, self.adj_x_wp[a], self.adj_v_wp[a], self.adj_C_wp[a],
+                self.adj_tau_wp,
+            ])  # fmt: skip
+            self._run(self.stress, n, self._stress_arguments(step, step), [
+                self.adj_F_wp[a], self.adj_C_wp[a], held["parameters"], held["G"], held["h"], self.adj_tau_wp,
+            ])  # fmt: skip

@@ -1,0 +1,68 @@
+"""Whole 4-vectors in memory: against plain indexing, on the CPU and on a GPU, and what the transfers compile to for one."""
+
+import re
+
+import pytest
+import torch
+import warp as wp
+
+from mosa.physics.grid.node_access import node_access
+from mosa.physics.grid.transfer_kernels import transfer_kernels
+
+GPU = pytest.param("cuda", marks=pytest.mark.gpu)
+KINDS = {torch.float32: (wp.float32, wp.vec4f), torch.float64: (wp.float64, wp.vec4d)}
+
+
+def kernel_of(dtype):
+    scalar, vec4 = KINDS[dtype]
+    memory = node_access(scalar)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def kernel(
+        source: wp.array(dtype=vec4), index: wp.array(dtype=int), stored4: wp.array(dtype=vec4),
+        stored3: wp.array(dtype=vec4), added4: wp.array(dtype=vec4), added3: wp.array(dtype=vec4),
+    ):  # fmt: skip
+        i = wp.tid()
+        memory.store4(stored4, i, memory.load4(source, i))
+        memory.store3(stored3, i, memory.load3(source, i))
+        memory.add4(added4, index[i], memory.load4(source, i))
+        memory.add3(added3, index[i], memory.load3(source, i))
+
+    return kernel
+
+
+@pytest.mark.parametrize("device", ["cpu", GPU])
+@pytest.mark.parametrize("dtype", KINDS)
+def test_loads_stores_and_sums_are_those_of_plain_indexing(dtype, device):
+    """Whole numbers, so that sums are exact in any order; some 16 threads meet at each target."""
+    n, g = 1000, torch.Generator().manual_seed(0)
+    source = torch.randint(-99, 99, (n, 4), generator=g).to(device=device, dtype=dtype)
+    index = torch.randint(0, 60, (n,), generator=g).to(device=device)
+    results = [torch.full((count, 4), 7.0, device=device, dtype=dtype) for count in (n, n, 60, 60)]
+    vec4 = KINDS[dtype][1]
+    arrays = [wp.from_torch(source, dtype=vec4), wp.from_torch(index.int()), *(wp.from_torch(t, dtype=vec4) for t in results)]
+    wp.launch(kernel_of(dtype), n, inputs=arrays, device=arrays[0].device)
+    wp.synchronize_device(arrays[0].device)
+    three = source.clone()
+    three[:, 3] = 0
+    expected = [source, three, *(torch.full_like(results[2], 7.0).index_add_(0, index, values) for values in (source, three))]
+    for found, value in zip(results, expected):
+        assert torch.equal(found, value)
+
+
+@pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="this Warp has no compiler for GPUs")
+@pytest.mark.parametrize(
+    "dtype, add, load, per_node", [(torch.float32, "add.v4.f32", "v4.f32", 1), (torch.float64, "add.f64", "v2.f64", 4)]
+)
+def test_the_scatter_and_gather_of_a_node_are_vector_instructions(dtype, add, load, per_node, tmp_path):
+    """The transfers, compiled for compute capability 9.0 without a GPU: 27 nodes, no atomic that returns a value."""
+    kernels = transfer_kernels(KINDS[dtype][0])
+    wp.compile_aot_module(kernels.p2g.module, arch=90, module_dir=tmp_path, use_ptx=True)
+    (file,) = tmp_path.glob("*.ptx")
+    entries = {re.match(r"\w+__(\w+?)_[0-9a-f]+_", part)[1]: part for part in file.read_text().split(".visible .entry ")[1:]}
+    adds = {name: text.count(f"red.relaxed.gpu.global.{add}") for name, text in entries.items()}
+    loads = {name: len(re.findall(rf"ld\.global\.nc\.(?:L\w+::\w+\.)*{re.escape(load)}", text)) for name, text in entries.items()}
+    assert adds["p2g"] == 27 * per_node and adds["adj_g2p"] == 27 * min(per_node, 3)
+    for name in ("g2p", "adj_g2p", "adj_p2g"):
+        assert loads[name] >= 27, loads
+    assert "atom.global.add.f" not in file.read_text() and "atom.add.f" not in file.read_text()

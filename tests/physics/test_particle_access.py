@@ -1,0 +1,82 @@
+"""A particle's own numbers: values and gradients against plain indexing, and what their adjoints compile to for a GPU."""
+
+import re
+
+import pytest
+import torch
+import warp as wp
+
+from mosa.physics.constitutive.laws import SLOTS, law_named
+from mosa.physics.constitutive.material_kernels import state_kernel, stress_kernel
+from mosa.physics.constitutive.particle_access import aligned, particle_access
+
+GPU = pytest.param("cuda", marks=pytest.mark.gpu)
+SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
+SHAPES = {"matrix33": (3, 3), "vector6": (6,), "matrix66": (6, 6), "parameters": (SLOTS,)}
+
+
+def kernel_of(name: str, scalar, own: bool):
+    """out[i] = sum of the squares of the numbers that particle i has."""
+    shape = SHAPES[name]
+    make = wp.types.matrix if len(shape) == 2 else wp.types.vector
+    size = {"shape": shape} if len(shape) == 2 else {"length": shape[0]}
+    field, double = make(dtype=scalar, **size), make(dtype=wp.float64, **size)
+    load = getattr(particle_access(scalar, SLOTS), name)
+
+    @wp.kernel(module="unique")
+    def kernel(numbers: wp.array(dtype=field), out: wp.array(dtype=wp.float64)):
+        i = wp.tid()
+        if wp.static(own):
+            value = load(numbers, i)
+        else:
+            value = double(numbers[i])
+        out[i] = wp.ddot(value, value) if wp.static(len(shape) == 2) else wp.dot(value, value)
+
+    return kernel, field
+
+
+@pytest.mark.parametrize("device", ["cpu", GPU])
+@pytest.mark.parametrize("dtype", SCALARS)
+@pytest.mark.parametrize("name", SHAPES)
+def test_values_and_gradients_are_those_of_plain_indexing(name, dtype, device):
+    """The gradient is added to what is there: an adjoint's target is rarely empty."""
+    generator = torch.Generator().manual_seed(0)
+    numbers, there = (torch.randn(77, *SHAPES[name], generator=generator, dtype=torch.float64).to(device, dtype) for _ in range(2))
+    seed = torch.randn(77, generator=generator, dtype=torch.float64).to(device)
+    found = []
+    for own in (False, True):
+        kernel, field = kernel_of(name, SCALARS[dtype], own)
+        out, gradient = torch.zeros(77, dtype=torch.float64, device=device), there.clone()
+        arrays = [wp.from_torch(numbers, dtype=field), wp.from_torch(out)]
+        wp.launch(kernel, 77, inputs=arrays, device=arrays[0].device)
+        adjoints = [wp.from_torch(gradient, dtype=field), wp.from_torch(seed.clone())]
+        wp.launch(kernel, 77, inputs=arrays, adj_inputs=adjoints, adjoint=True, device=arrays[0].device)
+        wp.synchronize_device(arrays[0].device)
+        found.append((out, gradient))
+    for a, b in zip(*found):
+        assert torch.equal(a, b)
+    assert not torch.equal(found[1][1], there)
+
+
+def test_what_the_kernels_read_is_aligned():
+    flat = torch.arange(101.0)
+    view = flat[1:97].view(8, 12)
+    assert view.data_ptr() % 16 and aligned(view).data_ptr() % 16 == 0
+    assert torch.equal(aligned(view), view)
+    assert aligned(flat) is flat
+
+
+@pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="this Warp has no compiler for GPUs")
+@pytest.mark.parametrize("make", [stress_kernel, state_kernel])
+def test_the_adjoints_have_no_atomics(make, tmp_path):
+    """Of the stress with an operator and of the adapter's input, compiled for compute capability 9.0 without a GPU."""
+    law = law_named("corotated")
+    kernel = make(law.stress, law.uses_rotation, wp.float32, make is stress_kernel)
+    wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=True)
+    ptx = "\n".join(path.read_text() for path in tmp_path.glob("*.ptx"))
+    bodies = re.split(r"\.entry ", ptx)[1:]
+    backward = [body for body in bodies if "backward" in body.split("(")[0]]
+    assert len(backward) == 1
+    assert not re.search(r"\b(atom|red)\.", backward[0])
+    if make is stress_kernel:
+        assert len(re.findall(r"st\.global(\.wt)?\.v4\.f32", backward[0])) >= 9  # the operator's 36 numbers
