@@ -46,7 +46,7 @@ from substep import body
 
 from mosa.config import build_adapter
 from mosa.modules.body import SimulationSettings
-from mosa.physics.engine import workspace
+from mosa.physics import launching
 from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState
 
@@ -299,7 +299,7 @@ def main() -> None:
     parser.add_argument("--substeps", type=int, default=40)
     parser.add_argument("--frames", type=int, help="intervals of a rollout; 5 on CUDA, 1 on a CPU where not given")
     parser.add_argument("--forward-only", action="store_true", help="no backward pass")
-    parser.add_argument("--block", type=int, default=workspace.BLOCK, help="threads of a CUDA block in the substeps")
+    parser.add_argument("--block", type=int, default=launching.BLOCK, help="threads of a CUDA block in the substeps")
     parser.add_argument("--order", choices=ORDERS, default=ORDERS[0], help="of the particles in memory")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--store-activations", action="store_true", help="no recomputation of the networks")
@@ -311,7 +311,7 @@ def main() -> None:
         parser.error("--device cuda: torch finds no CUDA device on this machine; use --device cpu")
     wp.config.quiet = True
     torch.set_num_threads(1)
-    workspace.BLOCK = options.block
+    launching.BLOCK = options.block
     print(versions())
     if options.store:
         found = {name: round(value, 3) for name, value in Check().measure(3 * CHECK["rounds"]).items()}

@@ -16,8 +16,8 @@ import time
 
 import torch
 
-from mosa.physics.engine.segment import SegmentSolver, grid_window
 from mosa.physics.engine.simulator import Simulator
+from mosa.physics.engine.solver import SegmentSolver, grid_window
 from mosa.types import Ground
 
 
@@ -52,7 +52,7 @@ def measure(dtype: torch.dtype, particles: int, grid: int | None, substeps: int,
     sim = Simulator(law or "corotated", dx=dx, substeps=substeps, frame_dt=substeps * 1e-4, ground=Ground(2 * dx), dtype=dtype)
     state = body(particles, dx, dtype)
     volume = torch.full((particles,), (dx / 2) ** 3, dtype=dtype)
-    solver = SegmentSolver(sim.numerics, volume, 1000.0, 0.0, {})
+    solver = SegmentSolver(sim.numerics, volume, 1000.0, 0.0)
     held = {"parameters": sim.pack({"mu": 4e4, "lam": 6e4}, particles), "G": None, "h": None, "plastic_G": None, "plastic_h": None}
     window = grid_window(state[0], state[1], dx, substeps * sim.dt, 2) if grid is None else ((0, 0, 0), (grid,) * 3)
     results = []

@@ -19,7 +19,8 @@ from mosa.modules.body import Body, Ready, Start, World
 from mosa.modules.identification import each_law
 from mosa.physics.contact.colliders import reach
 from mosa.physics.contact.motion import Poses, exponential, rotation_matrices, rotation_vector
-from mosa.physics.engine.stepping import STATE, Moment, flat
+from mosa.physics.engine.numerics import State, flat
+from mosa.physics.engine.stepping import Moment
 from mosa.types import ParticleState
 
 TWISTS, TARGETS = ("velocity", "angular_velocity"), ("position", "rotation")
@@ -125,7 +126,7 @@ class Episode:
         numbers = {"frames": moment.frames, "substeps": moment.substeps}
         times = {"time": moment.frames * self.frame_dt, "lag": moment.lag}
         return TwinState(
-            *(getattr(moment.state, name) for name in STATE), self._lifts, *self._poses, self._driven,
+            *(getattr(moment.state, name) for name in State._fields), self._lifts, *self._poses, self._driven,
             **{k: torch.tensor(v) for k, v in numbers.items()},
             **{k: torch.tensor(v, dtype=torch.float64) for k, v in times.items()},
         )  # fmt: skip
@@ -138,7 +139,7 @@ class Episode:
             if not isinstance(found, Tensor) or found.shape != known.shape or found.dtype != known.dtype:
                 what = f"{found.dtype} {tuple(found.shape)}" if isinstance(found, Tensor) else repr(found)
                 raise ConfigError(f"state.{f.name}: expected a tensor {known.dtype} {tuple(known.shape)}, found {what}")
-        particles = ParticleState(*(getattr(state, name).to(now.x.device) for name in STATE))
+        particles = ParticleState(*(getattr(state, name).to(now.x.device) for name in State._fields))
         self._moment = Moment(particles, int(state.substeps), int(state.frames), float(state.lag))
         self._driven, self._poses = state.driven.cpu(), (state.position.cpu(), state.rotation.cpu())
 
@@ -179,7 +180,7 @@ class Episode:
             if moment.substeps:  # F goes before its velocities by one advance
                 parts = self._stepper.prepared.first_advance(flat(fresh), self._stepper.dt)
                 fresh = ParticleState(*(t.unflatten(0, (self.worlds, -1)) for t in parts))
-            state = ParticleState(*(_where(chosen, getattr(fresh, n), getattr(moment.state, n)) for n in STATE))
+            state = ParticleState(*(_where(chosen, getattr(fresh, n), getattr(moment.state, n)) for n in State._fields))
             back = [_where(chosen, first, now) for first, now in zip(self._first, self._poses)]
             at = self._driven.view(1, -1)
             self._poses = tuple(
@@ -349,7 +350,7 @@ def _worlds(
     def begin(b: int, start: Start) -> ParticleState:
         state = body.initial_state(start, simulator.dt, pulls[b])
         state = replace(state, x=state.x + found[b % len(found)].lift)
-        return ParticleState(*(getattr(state, name).to(simulator.dtype) for name in STATE))
+        return ParticleState(*(getattr(state, name).to(simulator.dtype) for name in State._fields))
 
     ready, states = found[0] if laws is None else Ready.stack(found), [begin(b, start) for b, start in enumerate(starts)]
     return replace(ready, simulator=simulator, state=ParticleState.stack(states)), begin

@@ -2,7 +2,7 @@
 
 import torch
 
-from mosa.physics.constitutive.material_operations import first_advance
+from mosa.physics.engine.material_operations import first_advance
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.reference import polar, unvech
 

@@ -8,7 +8,6 @@ import pytest
 import torch
 import warp as wp
 
-from mosa.physics.engine import workspace
 from mosa.physics.engine.capture import ATTEMPTS, uninterrupted
 from mosa.physics.engine.simulator import Simulator
 
@@ -49,7 +48,7 @@ def test_a_broken_capture_costs_time_and_nothing_else(broken, make_block, monkey
 
     volume = torch.full((len(state.x),), 8e-6, dtype=torch.float64)
     for capture in (wp.ScopedCapture, Breaking):
-        monkeypatch.setattr(workspace.wp, "ScopedCapture", capture)
+        monkeypatch.setattr(wp, "ScopedCapture", capture)
         sim = Simulator("corotated", dx=0.04, substeps=8, frame_dt=3.2e-3, dtype=torch.float64)
         mu = torch.tensor(8e3, dtype=torch.float64, requires_grad=True)
         with warnings.catch_warnings(record=True) as said:

@@ -10,7 +10,7 @@ from torch.func import functional_call
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.modules.adapter import StressAdapter, pool
 from mosa.physics.engine import chain_schedule as chains_module
-from mosa.physics.engine import segment as mpm_module
+from mosa.physics.engine import solver as solver_module
 from mosa.physics.engine.adapter_interface import AdapterOperator
 from mosa.physics.engine.capture import ATTEMPTS
 from mosa.physics.engine.chain_schedule import SEGMENT, Plan, chain_length, grouped
@@ -177,7 +177,7 @@ def test_two_rollouts_before_their_backward_passes(device, make_block):
 def test_frames_in_one_chain_are_the_frames_one_by_one(device, law, plastic, pull, foreseen, make_block, monkeypatch):
     """Without a gradient a chain goes over several frames. A pull that is not foreseen takes the body out of their window."""
     if not foreseen:
-        for module in (mpm_module, chains_module):
+        for module in (solver_module, chains_module):
             monkeypatch.setattr(module, "fallen", lambda bounds, *_: bounds)
     adapter, state = adapter_of(device, torch.float64, plastic), make_block(n=5, velocity=(0.3, -1.0, 0.2))
     state = ParticleState(*(getattr(state, name).to(device) for name in ("x", "v", "C_affine", "F", "F_tot")))
@@ -199,7 +199,7 @@ def test_frames_in_one_chain_are_the_frames_one_by_one(device, law, plastic, pul
             found.setdefault(chained, []).append([t.cpu() for t in values])
     for values in found[True]:
         assert_same(values, found[False][0], 1e-9 if device == "cuda" else 1e-11)
-    marks = [chain.marks for chain in sim._chains.chains.values()]
+    marks = [chain.marks for chain in sim.buffers.chains.values()]
     assert {6, 12} in marks and (({6} in marks) == foreseen)
 
 
@@ -330,7 +330,7 @@ def test_a_window_that_grows_between_the_passes_does_not_change_the_gradient(mak
 
         loss = end(near)
         if disturbed:
-            (chain,) = sim._chains.chains.values()
+            (chain,) = sim.buffers.chains.values()
             before = chain.full.capacity
             end(replace(far, v=30 * far.v))
             assert chain.full.capacity > 2 * before
@@ -350,8 +350,8 @@ def test_buffers_that_could_not_be_made_are_made_later(make_block, monkeypatch):
         return sim.rollout(start, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 2, adapter=adapter, stride=2).x
 
     expected, zeros = run(1), torch.zeros
-    (chain,) = sim._chains.chains.values()
-    capacity, chain._graphs["captured"] = chain.full.capacity, None
+    (chain,) = sim.buffers.chains.values()
+    capacity, chain._graphs._replays["captured"] = chain.full.capacity, None
 
     def full(shape, *rest, **options):
         if isinstance(shape, tuple) and len(shape) == 4:
@@ -365,7 +365,7 @@ def test_buffers_that_could_not_be_made_are_made_later(make_block, monkeypatch):
     chain.full.set_window((0, 0, 0), (60, 60, 60))
     assert chain.full.fields.shape[2] >= 60**3
     chain.full.set_window((0, 0, 0), (6, 6, 6))  # not needed any more
-    assert torch.equal(run(1), expected) and chain.full.capacity == capacity and not chain._graphs
+    assert torch.equal(run(1), expected) and chain.full.capacity == capacity and not len(chain._graphs)
 
 
 def test_a_chain_whose_widest_window_would_be_too_large_is_cut(make_block):
@@ -383,7 +383,7 @@ def test_a_chain_whose_widest_window_would_be_too_large_is_cut(make_block):
                                   collect=collected.append)  # fmt: skip
         assert len(collected) == 12
         found.append([rollout.x, rollout.v])
-    assert {sum(chain.lengths) for chain in sim._chains.chains.values()} == {192, 32}
+    assert {sum(chain.lengths) for chain in sim.buffers.chains.values()} == {192, 32}
     assert float(rollout.v[-1, :, 1].min()) > 20
     assert_same(*found[::-1], 1e-11)
 

@@ -90,7 +90,7 @@ def test_long_segments_without_gradients(dtype, tolerance, make_block):
         for _ in range(3 if device == "cuda" else 1):
             results[device] = sim.rollout(state, {"mu": 4e4, "lam": 5e4}, volume, 1000.0, frames)
         if device == "cuda":
-            assert {key[1] for key in sim._workspaces} == {70}
+            assert {work.substeps for work in sim.buffers} == {70}
             torch.cuda.set_sync_debug_mode("warn")
             try:
                 with warnings.catch_warnings(record=True) as caught:

@@ -21,7 +21,7 @@ def run(state, long, *, substeps=70, dt=2e-4, parameters=PARAMETERS, frames=3, *
     sim = Simulator("corotated", dx=0.04, substeps=substeps, frame_dt=substeps * dt, **options)
     sim._long = long
     volume = torch.full((len(state.x),), 8e-6, dtype=torch.float64)
-    return sim.rollout(state, parameters, volume, 1000.0, frames), {key[1] for key in sim._workspaces}
+    return sim.rollout(state, parameters, volume, 1000.0, frames), {work.substeps for work in sim.buffers}
 
 
 def assert_same(found, expected):

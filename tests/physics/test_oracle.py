@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from mosa.physics.constitutive.material_operations import first_advance
 from mosa.physics.contact.planes import Plane
+from mosa.physics.engine.material_operations import first_advance
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.reference import unvech
 from mosa.types import Ground, ParticleState

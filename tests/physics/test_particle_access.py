@@ -8,7 +8,8 @@ import warp as wp
 
 from mosa.physics.constitutive.laws import SLOTS, law_named
 from mosa.physics.constitutive.material_kernels import state_kernel, stress_kernel
-from mosa.physics.constitutive.particle_access import aligned, particle_access
+from mosa.physics.constitutive.particle_access import particle_access
+from mosa.physics.launching import aligned
 
 GPU = pytest.param("cuda", marks=pytest.mark.gpu)
 SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}

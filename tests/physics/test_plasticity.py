@@ -7,8 +7,8 @@ import torch
 
 from mosa.errors import ConfigError
 from mosa.physics import reference
-from mosa.physics.constitutive.material_operations import first_advance
 from mosa.physics.constitutive.plasticity import friction_alpha
+from mosa.physics.engine.material_operations import first_advance
 from mosa.physics.engine.simulator import Simulator
 
 MU, LAM = 3.0, 5.0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from mosa.physics.constitutive.material_operations import first_advance
+from mosa.physics.engine.material_operations import first_advance
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.reference import deviator, hencky_material
 

@@ -13,8 +13,8 @@ from mosa.errors import ConfigError, SimulationDiverged
 from mosa.physics.constitutive.elasticity import lame
 from mosa.physics.contact.colliders import Collider, Sphere
 from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState
-from mosa.physics.engine.segment import SegmentSolver, grid_window, substep_bytes
 from mosa.physics.engine.simulator import Simulator
+from mosa.physics.engine.solver import SegmentSolver, grid_window, substep_bytes
 from mosa.physics.engine.workspace import Workspace
 from mosa.physics.grid.window import GAINED, extent, fallen, window_of
 from mosa.types import Ground, ParticleState
@@ -290,7 +290,7 @@ def test_acceleration_within_a_segment_widens_the_window(make_block, monkeypatch
         margins.append(arguments[4])
         return grid_window(*arguments, **more)
 
-    monkeypatch.setattr("mosa.physics.engine.segment.grid_window", spy)
+    monkeypatch.setattr("mosa.physics.engine.solver.grid_window", spy)
     for stride in (32, 1):
         leaf = state.v.clone().requires_grad_()
         sim = Simulator("corotated", dx=DX, substeps=32, frame_dt=0.0128, gravity=(0, 0, 0), dtype=torch.float64,
@@ -348,10 +348,9 @@ def test_a_dropped_simulator_frees_its_buffers_at_once(kind, make_block):
                               stride=5).x[-1]  # fmt: skip
             if differentiated:
                 torch.autograd.grad(end.sum(), leaf)
-        chains = list(sim._chains.chains.values())
-        held = [weakref.ref(work) for work in (*sim._workspaces.values(), *(c.full for c in chains), *(c.light for c in chains))]
-        held += [weakref.ref(sim), *map(weakref.ref, chains)]
-        assert len(held) >= 3 and (kind == "chained") == bool(chains)
+        chains = list(sim.buffers.chains.values())
+        held = [weakref.ref(each) for each in (sim, sim.buffers, *sim.buffers, *chains)]
+        assert len(held) >= 4 and (kind == "chained") == bool(chains)
         del sim, chains, end, leaf
         assert [ref() for ref in held] == [None] * len(held)
     finally:
@@ -470,6 +469,20 @@ class TestErrors:
             simulator().rollout(state, self.PARAMETERS, volume_of(state), DENSITY, 2, adapter=lambda _: operator)
         with pytest.raises(ConfigError, match="volume"):
             simulator().rollout(state, self.PARAMETERS, 0 * volume_of(state), DENSITY, 2)
+
+
+@pytest.mark.parametrize("kind", ["segments", "chain"])
+def test_a_gradient_can_be_taken_twice(kind, make_block):
+    """The states that were kept go with the first backward pass; the second makes them again."""
+    state, mu = make_block(), torch.full((), 4e4).double().requires_grad_()
+    zero = AdapterOperator(torch.zeros(len(state.x), 6, 6).double(), torch.zeros(len(state.x), 6).double())
+    adapter = Answering(zero) if kind == "chain" else None
+    rollout = simulator(chained=kind == "chain").rollout(
+        state, {"mu": mu, "lam": 5e4}, volume_of(state), DENSITY, 3, adapter=adapter, stride=5
+    )
+    loss = rollout.x[-1].square().sum()
+    first, second = (torch.autograd.grad(loss, mu, retain_graph=True)[0] for _ in range(2))
+    assert torch.equal(first, second) and float(first.abs()) > 0
 
 
 def test_a_rollout_that_is_dropped_frees_what_it_kept(make_block, monkeypatch):

@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from mosa.physics.engine.capture import Turns
+from mosa.physics.launching import Turns
 
 LONG = 30.0
 """Seconds after which a wait has failed: nothing here takes time."""

@@ -46,7 +46,7 @@ def conservation(law: str, dtype: torch.dtype, *, adapted: bool = True, interval
             state = sim.rollout(state, parameters or parameters_of(law), volume, DENSITY, 2, adapter=adapter, stride=10,
                                 started=i > 0).final  # fmt: skip
             # the grid of the last substep is still in the buffers that the rollout used
-            grids = [float(work.grid_slots()[0, -1, :, 3].double().sum()) for work in sim._workspaces.values()]
+            grids = [float(work.grid_slots()[0, -1, :, 3].double().sum()) for work in sim.buffers]
             total = float(mass.double().sum())
             worst["mass"] = max(worst["mass"], *(abs(g - total) / total for g in grids))
             for name, before, now, scale in zip(("linear", "angular"), start, momenta(state, mass, DX), scales):

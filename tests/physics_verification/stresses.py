@@ -10,7 +10,7 @@ from torch import Tensor
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.constitutive.material_kernels import field_types, kernels_of
 from mosa.physics.engine.simulator import Simulator
-from mosa.physics.engine.workspace import SCALARS
+from mosa.physics.launching import SCALARS
 
 
 def stress(law: str, F: Tensor, C: Tensor | None = None, operator=None, parameters: dict | None = None) -> Tensor:

@@ -14,7 +14,7 @@ from mosa.errors import ConfigError
 from mosa.modules.adapter import StressAdapter
 from mosa.physics import reference
 from mosa.physics.constitutive.laws import law_named
-from mosa.physics.constitutive.material_operations import first_advance
+from mosa.physics.engine.material_operations import first_advance
 from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState
 

@@ -3,21 +3,16 @@
 The adjoint that Warp generates for `field[i]` adds to the gradient one number at a time, atomically: 36 for a stress operator, each
 in a transaction of its own on a GPU. Here nobody else adds to particle i, so its gradient is read, added to and written back, 16
 bytes at a time where the size of a particle's part allows it. Arrays must be contiguous and begin at a multiple of 16 bytes, see
-`aligned`.
+`launching.aligned`.
 """
 
-import math
-from collections.abc import Sequence
 from functools import cache
 from types import SimpleNamespace
 
-import torch
 import warp as wp
-from torch import Tensor
 
-BYTES = 16
-APART = 32
-"""Numbers of which arrays in one buffer begin at multiples."""
+from mosa.physics.launching import BYTES
+
 # a CPU's compiler would take the promise of alignment for faults rather than for speed
 PIECE = """
 #if defined(__CUDA_ARCH__)
@@ -47,19 +42,6 @@ ADD = """
         for (int l = 0; l < {width}; ++l) piece.part[l] += static_cast<{scalar}>(source[{width} * k + l]);
         target[k] = piece;
     }}"""
-
-
-def aligned(t: Tensor) -> Tensor:
-    """t, contiguous and where the kernels can read it in pieces; itself, if it is already."""
-    t = t.contiguous()
-    return t if t.data_ptr() % BYTES == 0 else t.clone()
-
-
-def zeros_in_one(shapes: Sequence[Sequence[int]], dtype: torch.dtype, device: torch.device) -> tuple[Tensor, list[Tensor]]:
-    """(buffer, its parts of these shapes), each part as `aligned` wants it: all are cleared in one launch."""
-    sizes = [-(-math.prod(shape) // APART) * APART for shape in shapes]
-    buffer = torch.zeros(sum(sizes), dtype=dtype, device=device)
-    return buffer, [part[: math.prod(shape)].view(*shape) for part, shape in zip(buffer.split(sizes), shapes)]
 
 
 @cache

@@ -9,7 +9,7 @@ import warp as wp
 from torch import Tensor
 
 from mosa.physics.constitutive.kinematics import svd
-from mosa.physics.engine.workspace import launch
+from mosa.physics.launching import launch
 
 _MATRIX = {torch.float32: wp.mat33f, torch.float64: wp.mat33d}
 _VECTOR = {torch.float32: wp.vec3f, torch.float64: wp.vec3d}

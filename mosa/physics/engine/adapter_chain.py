@@ -12,6 +12,7 @@ states and nothing is asked a third time.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -20,11 +21,14 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from mosa.physics.engine.adapter_interface import ANSWER
-from mosa.physics.engine.capture import ATTEMPTS, Captures
+from mosa.physics.engine.capture import ATTEMPTS, Graphs, TorchCapture
 from mosa.physics.engine.network_evaluation import at_hand, same_weights
-from mosa.physics.engine.segment import WIDENED, LeftWindow, SegmentSolver, wants_gradient
-from mosa.physics.engine.workspace import Numerics, Workspace, copies, warp_stream
+from mosa.physics.engine.numerics import Numerics, State
+from mosa.physics.engine.operation import Kept, Stretch, advance
+from mosa.physics.engine.solver import WIDENED, LeftWindow, SegmentSolver
+from mosa.physics.engine.workspace import Workspace
 from mosa.physics.grid.transfer_kernels import NO_EVENT
+from mosa.physics.launching import copies, same_memory, warp_stream
 
 MARGIN = 4
 """Nodes of a window beyond what the speeds at the start ask for."""
@@ -39,22 +43,22 @@ class _Evaluation(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """Of an adapter: names and tensors of the weights that are learned, and the addresses of all parameters and buffers.
+    """Of an adapter: names and tensors of the weights that are learned, and all its parameters and buffers.
 
     Looking for them takes as long as a substep: once a rollout, and once for each chain of the backward pass."""
 
     names: tuple[str, ...]
     weights: tuple[Tensor, ...]
-    addresses: tuple[int, ...]
+    tensors: tuple[Tensor, ...]
 
 
-def addresses_of(adapter: nn.Module) -> tuple[int, ...]:
-    return tuple(t.data_ptr() for t in (*adapter.parameters(), *adapter.buffers()))
+def tensors_of(adapter: nn.Module) -> tuple[Tensor, ...]:
+    return (*adapter.parameters(), *adapter.buffers())
 
 
 def learned_of(adapter: nn.Module) -> Learned:
     wanted = {name: p for name, p in adapter.named_parameters() if p.requires_grad}
-    return Learned(tuple(wanted), tuple(wanted.values()), addresses_of(adapter))
+    return Learned(tuple(wanted), tuple(wanted.values()), tensors_of(adapter))
 
 
 class Chain:
@@ -82,13 +86,10 @@ class Chain:
         self.statistics: dict[bool, tuple[Tensor, ...]] = {}  # in light and in full buffers: each graph has its own
         self.statistics_seeds: tuple[Tensor, ...] = ()
         self._kind: type | None = None
-        self._captures = Captures(
-            f"{type(adapter).__name__} cannot be captured as a CUDA graph and runs uncaptured",
-            ATTEMPTS if numerics.device.type == "cuda" else 0,
-        )
-        self._warm: set[tuple] = set()
-        self._graphs: dict[tuple, torch.cuda.CUDAGraph] = {}
-        self._key: tuple = ()
+        failing = f"{type(adapter).__name__} cannot be captured as a CUDA graph and runs uncaptured"
+        self._graphs = Graphs(TorchCapture(), failing, ATTEMPTS if numerics.device.type == "cuda" else 0)
+        self._held: tuple = ()  # what graphs have by value,
+        self._read: Sequence[Tensor] = ()  # and by address
         self._passes: dict[tuple, Callable[[Chain], None]] = {}  # no methods: see `Simulator`
         self.again = "graphs" if graphs else "states"
         for full in (False, True):
@@ -99,9 +100,9 @@ class Chain:
 
     @torch.no_grad()
     def advance(
-        self, solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...], packed: Tensor, first: int, kept: bool = False,
+        self, solver: SegmentSolver, learned: Learned, state: State, packed: Tensor, first: int, kept: bool = False,
         full: bool = False,
-    ) -> tuple[list[tuple[Tensor, ...]], tuple[Tensor, ...], tuple[tuple, tuple], list[Tensor]]:  # fmt: skip
+    ) -> tuple[list[State], tuple[Tensor, ...], tuple[tuple, tuple], list[Tensor]]:  # fmt: skip
         """(states at the marks and after the chain, statistics (K, ...) each, grid window used, what `adjoint` takes as `tape`).
 
         learned: of the adapter as it is now; kept: leave all substeps on the tape, else nothing; full: in the buffers of the
@@ -117,14 +118,14 @@ class Chain:
             final = work.final()
             flags = solver.look(work.flags, final)
             if not solver.left_window(flags, first, dt):
-                states = [*(work.whole(copies(state)) for state in self.marked), final]
+                states = [*(State.whole(copies(state)) for state in self.marked), final]
                 return states, tuple(copies(self.statistics[full])), window, work.tape() if kept else []
             if self.marks or (total > WIDENED and len(self.lengths) > 1):
                 raise LeftWindow  # shorter chains need less than the widest window, which is larger than any may be
         raise solver.left_behind(flags, first, dt)
 
     def adjoint(
-        self, solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...], packed: Tensor, window: tuple,
+        self, solver: SegmentSolver, learned: Learned, state: State, packed: Tensor, window: tuple,
         seeds: Sequence[Tensor | None], tape: Sequence[Tensor],
     ) -> tuple[list[Tensor], Tensor, list[Tensor]]:  # fmt: skip
         """Gradients of (state, parameters, weights). learned: with the names and weights of `advance`; seeds: adjoints of what it
@@ -135,14 +136,13 @@ class Chain:
         self._load(work, window, solver, learned, state, packed)  # another rollout may have gone forward since
         if tape:
             work.rewind(tape)
-        slot = self.substeps % 2
-        targets = self._targets(slot) + list(self.statistics_seeds)
-        for target, seed in zip(targets, seeds, strict=True):
+        slots, slot = work.adjoint_slots(), self.substeps % 2
+        states = len(slots)
+        for target, seed in zip([*(t[slot] for t in slots), *self.statistics_seeds], seeds, strict=True):
             target.zero_() if seed is None else target.copy_(seed)
-        penalised = any(seed is not None for seed in seeds[len(self._targets(slot)) :])
+        penalised = any(seed is not None for seed in seeds[states:])
         self._play(("adjoint", "tape" if tape else self.again, penalised))
-        found = copies([*self._targets(0), work.adj_held["parameters"], *self.adj_weights])
-        states = len(self._targets(0))
+        found = copies([*(t[0] for t in slots), work.adj_held["parameters"], *self.adj_weights])
         return found[:states], found[states], found[states + 1 :]
 
     def named(self, statistics: Sequence[Tensor]) -> list:
@@ -160,11 +160,6 @@ class Chain:
             self.full = Workspace(self.numerics, **self._shape, with_adjoint=True, pointed=True)
             self.adj_weights = [torch.zeros_like(w) for w in self.learned.weights]
         return self.full
-
-    def _targets(self, slot: int) -> list[Tensor]:
-        work = self.full
-        targets = [work.adj_x, work.adj_v, work.adj_C, work.adj_F] + ([work.adj_A] if work.plastic else [])
-        return [t[slot] for t in targets]
 
     def _ask(
         self, F: Tensor, C: Tensor, packed: Tensor, collects: bool, weights: Sequence[Tensor] | None = None,
@@ -254,7 +249,7 @@ class Chain:
                 torch._foreach_add_(*zip(*sums))
 
     def _load(
-        self, work: Workspace, window: tuple, solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...],
+        self, work: Workspace, window: tuple, solver: SegmentSolver, learned: Learned, state: State,
         packed: Tensor,
     ) -> None:  # fmt: skip
         """Place the chain's start in `work`. Forget captured graphs where what they have by value or address is another one."""
@@ -266,69 +261,68 @@ class Chain:
         self.learned = learned
         # not their sizes: buffers may come back to an earlier one
         buffers = tuple(each.allocations if each is not None else 0 for each in (self.light, self.full))
-        key = (buffers, solver.cutoff, learned.addresses, tuple(w.data_ptr() for w in learned.weights))
-        if key != self._key:
-            self._key, self.marked = key, []
-            self._graphs.clear()
+        held, read = (buffers, solver.cutoff), (*learned.tensors, *learned.weights)
+        if held != self._held or not same_memory(self._read, read):
+            self._held, self._read, self.marked = held, [t.detach() for t in read], []  # aliases, which belong to no graph
+            self._graphs.drop()
 
     def _play(self, name: tuple) -> None:
-        graph = self._graphs.get(name)
-        if graph is not None:
-            graph.replay()
-        else:
-            self._passes[name](self)  # the first time this also compiles and loads the kernels, which a capture must not do
-            self._warm.add(name)
+        self._graphs.play(name, partial(self._passes[name], self))
 
     def _capture(self) -> None:
         """Capture every pass that has run once. Here for both: the backward pass runs in a thread of autograd's own."""
-        if not self._captures.attempts:
-            return
-        missing = [name for name in self._passes if name in self._warm and name not in self._graphs]
-        if not missing:
-            return
-        for name in missing:
-            graph = torch.cuda.CUDAGraph()
-            capture = torch.cuda.graph(graph, capture_error_mode="thread_local")
-            if not self._captures.succeeds(capture, partial(self._passes[name], self)):
+        for name in filter(self._graphs.waits, self._passes):
+            if not self._graphs.capture(name, partial(self._passes[name], self)):
                 torch.cuda.synchronize()
                 return
-            self._graphs[name] = graph
 
 
-class _Chained(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, chain: Chain, solver: SegmentSolver, learned: Learned, first: int, kept: bool, *inputs):
-        """inputs: state (5), packed parameters, the adapter's weights."""
-        state, packed = tuple(t.detach().contiguous() for t in inputs[:5]), inputs[5].detach().contiguous()
-        ctx.set_materialize_grads(False)
-        (result,), statistics, window, tape = chain.advance(solver, learned, state, packed, first, kept, full=True)
-        ctx.chain, ctx.solver, ctx.window, ctx.tape = chain, solver, window, tape
-        ctx.states, ctx.names = 5 if solver.numerics.law.plastic else 4, learned.names
-        ctx.save_for_backward(*state, packed, *inputs[6:])  # weights too: autograd tells if one is changed before the backward pass
-        return *result[: ctx.states], *statistics
+@dataclass
+class ChainOfSegments(Stretch):
+    """Segments with an adapter's evaluations between them. others: packed parameters, the adapter's weights. It leaves the
+    statistics of each evaluation.
 
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, *seeds):
-        state, packed, weights = ctx.saved_tensors[:5], ctx.saved_tensors[5], ctx.saved_tensors[6:]
-        learned = Learned(ctx.names, weights, addresses_of(ctx.chain.adapter))
-        tape, ctx.tape = ctx.tape, []  # free it as soon as it is used
-        found, adj_packed, adj_weights = ctx.chain.adjoint(ctx.solver, learned, state, packed, ctx.window, seeds, tape)
-        return *[None] * 5, *found, *[None] * (5 - ctx.states), adj_packed, *adj_weights
+    learned: of the adapter as it is now; first: number of the first substep, for messages; kept: keep the states of all substeps
+    for the backward pass."""
+
+    chain: Chain
+    solver: SegmentSolver
+    learned: Learned
+    first: int
+    kept: bool
+
+    @property
+    def plastic(self) -> bool:
+        return self.solver.numerics.law.plastic
+
+    def forward(self, state: State, others: Sequence[Tensor], differentiated: bool) -> tuple[State, Sequence[Tensor], Kept]:
+        packed, kept = others[0].detach(), differentiated and self.kept
+        (final,), statistics, window, tape = self.chain.advance(
+            self.solver, self.learned, state, packed, self.first, kept, full=differentiated
+        )
+        return final, statistics, Kept(window, tape)
+
+    def backward(
+        self, state: State, others: Sequence[Tensor], kept: Kept, seeds: Sequence[Tensor | None],
+        other_seeds: Sequence[Tensor | None],
+    ) -> tuple[list[Tensor], list[Tensor]]:  # fmt: skip
+        packed, *weights = others
+        learned = Learned(self.learned.names, tuple(weights), tensors_of(self.chain.adapter))
+        found, adj_packed, adj_weights = self.chain.adjoint(
+            self.solver, learned, state, packed, kept.windows, (*seeds, *other_seeds), kept.take()
+        )
+        return found, [adj_packed, *adj_weights]
 
 
 def advance_chain(
-    chain: Chain, solver: SegmentSolver, learned: Learned, state: tuple[Tensor, ...], packed: Tensor, first: int,
-    kept: bool = False,
-) -> tuple[list[tuple[Tensor, ...]], list]:  # fmt: skip
-    """([(x, v, C_affine, F, F_tot) at the chain's marks and after it], statistics of each evaluation), differentiable in state,
-    parameters and the adapter's weights. learned: of the adapter as it is now; first: number of the first substep, for messages;
-    kept: keep the states of all substeps for the backward pass. Errors: SimulationDiverged; LeftWindow."""
-    if not wants_gradient((*state, packed, *learned.weights)):
-        state = tuple(t.detach().contiguous() for t in state)
+    chain: Chain, solver: SegmentSolver, learned: Learned, state: State, packed: Tensor, first: int, kept: bool = False
+) -> tuple[list[State], list]:
+    """([the states at the chain's marks and after it], statistics of each evaluation), differentiable in state, parameters and the
+    adapter's weights, where there are no marks. Arguments: as `ChainOfSegments`. Errors: SimulationDiverged; LeftWindow."""
+    if chain.marks:
+        state = State(*(t.detach().contiguous() for t in state))
         states, statistics, *_ = chain.advance(solver, learned, state, packed.detach(), first)
         return states, chain.named(statistics)
-    result = _Chained.apply(chain, solver, learned, first, kept, *state, packed, *learned.weights)
-    count = 5 if solver.numerics.law.plastic else 4
-    final = result[:count] if count == 5 else (*result[:4], result[3])
-    return [final], chain.named(result[count:])
+    stretch = ChainOfSegments(chain, solver, learned, first, kept)
+    final, statistics = advance(stretch, state, (packed, *learned.weights))
+    return [final], chain.named(statistics)

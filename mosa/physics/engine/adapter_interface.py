@@ -8,7 +8,7 @@ from torch import Tensor
 
 from mosa.errors import ConfigError
 from mosa.physics.constitutive.laws import Law
-from mosa.physics.constitutive.material_operations import material_state
+from mosa.physics.engine.material_operations import material_state
 
 ANSWER = ("G", "h", "plastic_G", "plastic_h")
 

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.physics.constitutive.laws import Law
-from mosa.physics.constitutive.material_operations import kirchhoff_stress
+from mosa.physics.engine.material_operations import kirchhoff_stress
+from mosa.physics.engine.numerics import Numerics, State
 from mosa.physics.engine.time_step import VISCOUS_NUMBER, step_rate
-from mosa.physics.engine.workspace import Numerics
 
 STRETCH = 1e-3
 """Relative stretch of the differences that measure the stiffness: exact to 1e-6 of it in float64, 1e-4 in float32."""
@@ -92,14 +92,13 @@ class StepChooser:
         self.fall, self.collider_speed = math.hypot(*numerics.gravity) * self.frame_dt, collider_speed
 
     @torch.no_grad()
-    def choose(self, frame: int, v: Tensor, C_affine: Tensor, F: Tensor, collider_speed: float | None = None) -> int:
-        """Substeps from frame - 1 to `frame`. v: (N, 3) [m/s]; C_affine, F: (N, 3, 3); collider_speed: in this frame, None for
-        the bound in any.
+    def choose(self, frame: int, state: State, collider_speed: float | None = None) -> int:
+        """Substeps from frame - 1 to `frame`. state: at frame - 1; collider_speed [m/s]: in this frame, None for the bound in any.
 
         A law that softens in compression is not followed below its stiffness at rest: it may be back there within the frame.
         Errors: SimulationDiverged for a state that is not finite; ConfigError where more than the maximum would be needed.
         """
-        control, dx = self.control, self.numerics.dx
+        control, dx, (_, v, C_affine, F, _) = self.control, self.numerics.dx, state
         finite = torch.isfinite(F).all(-1).all(-1) & torch.isfinite(C_affine).all(-1).all(-1) & torch.isfinite(v).all(-1)
         if not bool(finite.all()):
             bad = int((~finite).nonzero()[0])

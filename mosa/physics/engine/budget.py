@@ -3,11 +3,18 @@
 import torch
 
 from mosa.limits import machine_memory
+from mosa.physics.engine.numerics import Numerics
 
 KEPT_SHARE = 0.25
 """Of a GPU's free memory, for the states of all substeps of a rollout, where that is enough for them."""
 KEPT_ON_CPU = 2**30
 """Bytes, for the same on a CPU: 4000 particles in 20 000 nodes over 900 substeps."""
+
+
+def substep_bytes(numerics: Numerics, particles: int) -> int:
+    """What the backward pass reads of a substep: 33 numbers a particle (42 where the law yields) and 8 a node, of which there is
+    about one a particle."""
+    return particles * (50 if numerics.law.plastic else 41) * torch.finfo(numerics.dtype).bits // 8
 
 
 def free_memory(device: torch.device) -> int:

@@ -1,54 +1,22 @@
-"""Capturing launches as a graph, which anything else that the thread does meanwhile may break."""
+"""Passes that are captured as graphs once they have run. Anything else that the thread does meanwhile may break a capture."""
 
 import gc
-import threading
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager, nullcontext
+
+import torch
+import warp as wp
+
+from mosa.physics.launching import ON_CPU
 
 ATTEMPTS = 3
 """Captures in a row that may fail before there are no more: a library that sets itself up when it is first captured spoils one."""
+MAX_GRAPHS = 64
+"""Graphs, and passes that wait to become one, of one owner: one for each pass and time step."""
 
-
-class Turns:
-    """Many threads launch at once, or one captures alone: Warp's capture on a CPU records every thread's launches."""
-
-    def __init__(self) -> None:
-        self._changed = threading.Condition()
-        self._launching, self._capturing = 0, None
-
-    @contextmanager
-    def launching(self) -> Iterator[None]:
-        """Beside other launches; within this thread's own capture too."""
-        if self._capturing == threading.get_ident():
-            yield
-            return
-        with self._changed:
-            self._changed.wait_for(lambda: self._capturing is None)
-            self._launching += 1
-        try:
-            yield
-        finally:
-            with self._changed:
-                self._launching -= 1
-                self._changed.notify_all()
-
-    @contextmanager
-    def capturing(self) -> Iterator[None]:
-        """When no other thread launches, and until it ends none begins to."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._capturing is None and self._launching == 0)
-            self._capturing = threading.get_ident()
-        try:
-            yield
-        finally:
-            with self._changed:
-                self._capturing = None
-                self._changed.notify_all()
-
-
-ON_CPU = Turns()
-"""Of this process."""
+Body = Callable[[], None]
 
 
 @contextmanager
@@ -63,19 +31,96 @@ def uninterrupted() -> Iterator[None]:
             gc.enable()
 
 
-class Captures:
-    """Tries captures until too many failed in a row. failing: what the warning then says, before the last error."""
+class Strategy(ABC):
+    """How passes are run, and how they are captured."""
 
-    def __init__(self, failing: str, attempts: int = ATTEMPTS) -> None:
-        self.failing, self.attempts = failing, attempts
+    @abstractmethod
+    def run(self, body: Body) -> None:
+        """The launches of `body`, one by one."""
 
-    def succeeds(self, capture: AbstractContextManager, body: Callable[[], None]) -> bool:
-        """Whether the launches of `body` were captured; a failure says nothing of the launches themselves."""
-        if not self.attempts:
-            return False
+    @abstractmethod
+    def capture(self, body: Body) -> Body:
+        """What launches them all at once. Errors: RuntimeError where they cannot be captured."""
+
+
+class WarpCapture(Strategy):
+    """Of Warp's launches alone, on a CPU too. device: torch's; of_warp: the same as Warp's."""
+
+    def __init__(self, device: torch.device, of_warp) -> None:
+        self.device, self.of_warp = device, of_warp
+
+    def _stream(self):
+        """torch's current one."""
+        cuda = self.device.type == "cuda"
+        return wp.stream_from_torch(torch.cuda.current_stream(self.device)) if cuda else None
+
+    def run(self, body: Body) -> None:
+        stream = self._stream()
+        with nullcontext() if stream is None else wp.ScopedStream(stream):
+            body()
+
+    def capture(self, body: Body) -> Body:
+        cuda = self.device.type == "cuda"
+        # on Warp's own stream: torch's default one cannot be captured
+        captured = wp.ScopedCapture(device=self.of_warp, force_module_load=False)
+        with nullcontext() if cuda else ON_CPU.capturing(), uninterrupted(), captured:
+            body()
+
+        graph = captured.graph
+
+        def replay() -> None:
+            with nullcontext() if cuda else ON_CPU.launching():
+                wp.capture_launch(graph, stream=self._stream())
+
+        return replay
+
+
+class TorchCapture(Strategy):
+    """Of everything that torch and Warp do on torch's current CUDA stream."""
+
+    def run(self, body: Body) -> None:
+        body()
+
+    def capture(self, body: Body) -> Body:
+        graph = torch.cuda.CUDAGraph()
+        with uninterrupted(), torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            body()
+        return graph.replay
+
+
+class Graphs:
+    """The passes of one owner, which belong to its buffers and are dropped with them.
+
+    failing: what the warning says, before the last error, when too many captures in a row have failed; attempts: so many, 0 for
+    none at all."""
+
+    def __init__(self, strategy: Strategy, failing: str, attempts: int = ATTEMPTS) -> None:
+        self.strategy, self.failing, self.attempts = strategy, failing, attempts
+        self._replays: dict[Hashable, Body] = {}
+        self._warm: set[Hashable] = set()
+
+    def __len__(self) -> int:
+        return len(self._replays)
+
+    def play(self, name: Hashable, body: Body) -> None:
+        """The launches of `body`. The first time this also compiles and loads the kernels, which a capture must not do."""
+        replay = self._replays.get(name)
+        if replay is not None:
+            replay()
+            return
+        self.strategy.run(body)
+        if len(self._warm) > MAX_GRAPHS:
+            self.forget()
+        self._warm.add(name)
+
+    def waits(self, name: Hashable) -> bool:
+        """Whether a pass has run and is no graph yet, but may be."""
+        return self.attempts > 0 and name in self._warm and name not in self._replays
+
+    def capture(self, name: Hashable, body: Body) -> bool:
+        """Whether `body` is now a graph; a failure says nothing of its launches themselves."""
         try:
-            with uninterrupted(), capture:
-                body()
+            self._replays[name] = self.strategy.capture(body)
         except RuntimeError as error:
             self.attempts -= 1
             if not self.attempts:
@@ -83,3 +128,12 @@ class Captures:
             return False
         self.attempts = ATTEMPTS
         return True
+
+    def drop(self) -> None:
+        """Drop the graphs, which hold something that is another now; the passes may be captured again at once."""
+        self._replays.clear()
+
+    def forget(self) -> None:
+        """Drop the graphs; each pass has to run again first."""
+        self._replays.clear()
+        self._warm.clear()

@@ -13,10 +13,12 @@ from torch import Tensor, nn
 
 from mosa.errors import SimulationDiverged
 from mosa.physics.engine.adapter_chain import MARGIN, Chain, Learned, advance_chain, learned_of
-from mosa.physics.engine.budget import free_memory, room
+from mosa.physics.engine.budget import free_memory, room, substep_bytes
+from mosa.physics.engine.buffers import Buffers
 from mosa.physics.engine.network_evaluation import at_hand
-from mosa.physics.engine.segment import LeftWindow, SegmentSolver, substep_bytes, wants_gradient
-from mosa.physics.engine.workspace import Numerics
+from mosa.physics.engine.numerics import Numerics, State
+from mosa.physics.engine.operation import wants_gradient
+from mosa.physics.engine.solver import LeftWindow, SegmentSolver
 from mosa.physics.grid.window import MAX_NODES, SMALL, fallen, window_of
 
 SEGMENT = 32
@@ -39,15 +41,14 @@ class Plan(NamedTuple):
 
 
 class Chains:
-    """The chains of one simulator. ask: as `Chain`."""
+    """The chains of one simulator, among its buffers. ask: as `Chain`."""
 
-    def __init__(self, numerics: Numerics, ask: Callable[..., dict[str, Tensor | None]]) -> None:
-        self.numerics, self.ask = numerics, ask
-        self.chains: dict[tuple, Chain] = {}
-        self._probes: dict[tuple, tuple[nn.Module, bool, int]] = {}
+    def __init__(self, numerics: Numerics, ask: Callable[..., dict[str, Tensor | None]], buffers: Buffers) -> None:
+        self.numerics, self.ask, self.chains = numerics, ask, buffers.chains
+        self._probes: dict[tuple[nn.Module, int], tuple[bool, int]] = {}
 
     def plan(
-        self, adapter: nn.Module, learned: Learned, state: tuple[Tensor, ...], packed: Tensor, substeps: int, stride: int
+        self, adapter: nn.Module, learned: Learned, state: State, packed: Tensor, substeps: int, stride: int
     ) -> Plan:
         """How to run a rollout of `substeps` substeps, by memory."""
         device = self.numerics.device
@@ -59,15 +60,15 @@ class Chains:
         if room(device, substeps * each) > 0:
             return Plan(SEGMENT, kept=True)
         start = sum(t.numel() * t.element_size() for t in state[: 5 if self.numerics.law.plastic else 4])
-        graph = self._probe(adapter, state, packed)[2] // stride
+        graph = self._probe(adapter, state, packed)[1] // stride
         limit, needed = chain_length(substeps, start, each + graph)
         graphs = needed <= CHAIN_SHARE * free_memory(device)
         return Plan(limit if graphs else chain_length(substeps, start, each)[0], kept=False, graphs=graphs)
 
     def frames(
-        self, solver: SegmentSolver, adapter: nn.Module, state: tuple[Tensor, ...], packed: Tensor, frames: int,
+        self, solver: SegmentSolver, adapter: nn.Module, state: State, packed: Tensor, frames: int,
         lengths: Sequence[int], collect: Callable | None,
-    ) -> Iterator[tuple[Tensor, ...]]:  # fmt: skip
+    ) -> Iterator[State]:  # fmt: skip
         """The states after each of `frames` frames, each of segments of `lengths` substeps. collect: as `Simulator.rollout`.
 
         Where a chain goes over several frames, they arrive together; if it fails, what can be had one by one still does, and a
@@ -76,7 +77,7 @@ class Chains:
         plan = self.plan(adapter, learned, state, packed, frames * substeps, max(lengths))
         most = plan.limit // substeps if plan.several else 1
 
-        def advanced(group: tuple[int, ...], first: int, marks: tuple[int, ...] = ()) -> list[tuple[Tensor, ...]]:
+        def advanced(group: tuple[int, ...], first: int, marks: tuple[int, ...] = ()) -> list[State]:
             chain = self.chain(adapter, learned, group, state, packed, collect is not None, plan.graphs, marks)
             states, statistics = advance_chain(chain, solver, learned, state, packed, first, plan.kept)
             for each in statistics:
@@ -108,7 +109,7 @@ class Chains:
                 yield state
             done += count
 
-    def _together(self, solver: SegmentSolver, state: tuple[Tensor, ...], count: int, substeps: int) -> int:
+    def _together(self, solver: SegmentSolver, state: State, count: int, substeps: int) -> int:
         """How many frames, `count` at most, the next chain goes over: as many as keep its window not much larger than one frame's,
         and as there is room for the states of."""
         bounds, size = solver.bounds(state), sum(t.nbytes for t in state)
@@ -126,38 +127,37 @@ class Chains:
         return count
 
     def chain(
-        self, adapter: nn.Module, learned: Learned, lengths: tuple[int, ...], state: tuple[Tensor, ...], packed: Tensor,
+        self, adapter: nn.Module, learned: Learned, lengths: tuple[int, ...], state: State, packed: Tensor,
         collects: bool, graphs: bool = False, marks: tuple[int, ...] = (),
     ) -> Chain:  # fmt: skip
-        # the chain holds the adapter: its id stays its own
-        key = (id(adapter), len(packed), lengths, marks, collects, graphs, learned.names)
+        key = (adapter, len(packed), lengths, marks, collects, graphs, learned.names)
         chain = self.chains.pop(key, None)
         if chain is None:
             while len(self.chains) >= MAX_CHAINS:
                 self.chains.pop(next(iter(self.chains)))
             chain = Chain(
                 self.numerics, adapter, self.ask, len(packed), lengths, marks=marks, collects=collects, graphs=graphs,
-                plastic_adapted=self._probe(adapter, state, packed)[1],
+                plastic_adapted=self._probe(adapter, state, packed)[0],
             )  # fmt: skip
         self.chains[key] = chain  # last: the first is the one that was not used for longest
         return chain
 
-    def _probe(self, adapter: nn.Module, state: tuple[Tensor, ...], packed: Tensor) -> tuple[nn.Module, bool, int]:
-        """(the adapter, whether it corrects the yield function, bytes that an evaluation's graph holds), from one evaluation."""
+    def _probe(self, adapter: nn.Module, state: State, packed: Tensor) -> tuple[bool, int]:
+        """(whether the adapter corrects the yield function, bytes that an evaluation's graph holds), from one evaluation."""
         device = self.numerics.device
-        key = (id(adapter), len(packed))
+        key = (adapter, len(packed))
         if key not in self._probes:
             if len(self._probes) >= MAX_CHAINS:
                 self._probes.clear()
             with torch.enable_grad(), at_hand():
-                leaves = [t.detach().requires_grad_() for t in (state[3], state[2], packed)]
+                leaves = [t.detach().requires_grad_() for t in (state.F, state.C_affine, packed)]
                 answer, held = self.ask(adapter, *leaves), 0
                 if device.type == "cuda":  # the second one's: an adapter may hold its last graph, and frees it with the next
                     held = torch.cuda.memory_allocated(device)
                     second = self.ask(adapter, *leaves)
                     held = torch.cuda.memory_allocated(device) - held
                     del second
-            self._probes[key] = adapter, answer["plastic_G"] is not None, held
+            self._probes[key] = answer["plastic_G"] is not None, held
         return self._probes[key]
 
 

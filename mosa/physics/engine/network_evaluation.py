@@ -7,9 +7,11 @@ from typing import TypeVar
 
 from torch import Tensor
 
+from mosa.physics.launching import same_memory
+
 Made = TypeVar("Made")
 _AT_HAND = ContextVar("at_hand", default=False)
-_FROM_WEIGHTS: ContextVar[dict | None] = ContextVar("from_weights", default=None)
+_FROM_WEIGHTS: ContextVar[list | None] = ContextVar("from_weights", default=None)
 
 
 @contextmanager
@@ -29,7 +31,7 @@ def backward_at_hand() -> bool:
 @contextmanager
 def same_weights() -> Iterator[None]:
     """No weight changes between the evaluations inside. A pass that is captured opens its own: a replay may find others."""
-    token = _FROM_WEIGHTS.set({})
+    token = _FROM_WEIGHTS.set([])
     try:
         yield
     finally:
@@ -41,7 +43,8 @@ def from_weights(make: Callable[[], Made], weights: Sequence[Tensor], *key: Hash
     known = _FROM_WEIGHTS.get()
     if known is None:
         return make()
-    key += tuple(p.data_ptr() for p in weights)
-    if key not in known:
-        known[key] = make(), weights  # which are held, so that their addresses stay their own
-    return known[key][0]
+    for own, of_weights, made in known:
+        if own == key and same_memory(of_weights, weights):
+            return made
+    known.append((key, tuple(weights), make()))
+    return known[-1][2]

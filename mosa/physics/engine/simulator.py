@@ -18,7 +18,6 @@ from torch import Tensor, nn
 
 from mosa.errors import ConfigError
 from mosa.physics.constitutive.laws import SLOTS, law_named
-from mosa.physics.constitutive.material_operations import material_state
 from mosa.physics.constitutive.plasticity import yield_factor
 from mosa.physics.constitutive.strain import STRAINS
 from mosa.physics.contact.colliders import Collider, pack_colliders, reach
@@ -26,13 +25,20 @@ from mosa.physics.contact.motion import Motion, Trajectory, sample_frame, sample
 from mosa.physics.contact.planes import Plane, ground_plane, pack_planes
 from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState, Several, ask
 from mosa.physics.engine.adaptive_steps import StepChooser, StepControl, check_counts
+from mosa.physics.engine.buffers import Buffers
 from mosa.physics.engine.chain_schedule import Chains
-from mosa.physics.engine.segment import Lanes, SegmentSolver, wants_gradient
-from mosa.physics.engine.stepping import STATE, Moment, Prepared, Stepper, flat, mean_force, segments
-from mosa.physics.engine.workspace import SCALARS, Numerics, Steps
+from mosa.physics.engine.lanes import Lanes
+from mosa.physics.engine.material_operations import material_state
+from mosa.physics.engine.numerics import Numerics, State, Steps, flat
+from mosa.physics.engine.operation import wants_gradient
+from mosa.physics.engine.solver import SegmentSolver
+from mosa.physics.engine.stepping import Moment, Prepared, Stepper, mean_force, segments
+from mosa.physics.launching import SCALARS
 from mosa.types import Ground, ParticleState, Rollout
 
 _UNBOUNDED = 1e30
+RECORDED = ("x", "v", "F", "F_tot")
+"""What a `Rollout` holds of every frame."""
 
 
 class Simulator:
@@ -114,13 +120,12 @@ class Simulator:
             rebuild=rebuild, check_J=self.law.needs_positive_J or on_inversion == "error",
             colliders=packed_colliders, strain=strain,
         )  # fmt: skip
-        self._workspaces: dict = {}
-        self._buffers, self._warm = [self._workspaces], set()  # see `Lanes`
+        self.buffers = Buffers()
         self._long = self.device.type == "cuda"  # a CPU gains nothing
         self.chained = self.device.type == "cuda" if chained is None else chained
         # no method: the cycle would keep a dropped simulator's buffers until the garbage collector looks
         self._ask = partial(ask, self.law, dtype)
-        self._chains = Chains(self.numerics, self._ask)
+        self._chains = Chains(self.numerics, self._ask, self.buffers)
 
     def pack(
         self, parameters: dict[str, Tensor], particles: int, rotation: Tensor | None = None, worlds: int | None = None
@@ -199,15 +204,15 @@ class Simulator:
         given = None if counts is None else check_counts(counts, frames)
         chooser = self._chooser(control, prepared, parameters, density, motions) if variable and given is None else None
         poses = () if variable else self._poses(motions, frames, start_time)
-        current = (state.x, state.v, self._affine(state, started), state.F, state.F_tot if self.law.plastic else state.F)
-        recorded = {"x": [state.x], "v": [state.v], "F": [current[3]], "F_tot": [current[4]]}
+        current = State.of(self._begun(state, started))
+        recorded = {name: [getattr(current, name)] for name in RECORDED}
 
-        def substeps_of(frame: int, v: Tensor, C: Tensor, F: Tensor) -> int:
+        def substeps_of(frame: int, current: State) -> int:
             if not variable:
                 return self.substeps
-            return given[frame - 1] if given is not None else chooser.choose(frame, v, C, F)
+            return given[frame - 1] if given is not None else chooser.choose(frame, current)
 
-        taken = [substeps_of(1, *current[1:4])] if frames > 1 else []
+        taken = [substeps_of(1, current)] if frames > 1 else []
         if not started:
             current = prepared.first_advance(current, self.frame_dt / taken[0] if taken else self.dt)
         prepared.settle(current)
@@ -223,7 +228,7 @@ class Simulator:
         reactions = []
         for frame in range(1, frames):
             if frame > 1:
-                taken.append(substeps_of(frame, *current[1:4]))
+                taken.append(substeps_of(frame, current))
             count, first = taken[-1], sum(taken[:-1])
             dt = self.frame_dt / count
             if variable:
@@ -238,8 +243,8 @@ class Simulator:
             lag = dt
             if forces is not None:
                 reactions.append(mean_force(forces, steps) if variable else forces)
-            for name, value in zip(recorded, (current[0], current[1], current[3], current[4])):
-                recorded[name].append(value)
+            for name, values in recorded.items():
+                values.append(getattr(current, name))
             if progress is not None:
                 progress(frame)
         return self._recorded(recorded, current, reactions, taken)
@@ -278,9 +283,8 @@ class Simulator:
         each = self._motions_of_worlds(motions, worlds)
         poses = [self._poses(own, frames, start_time) for own in each]
         poses = tuple(torch.cat(parts, 1) for parts in zip(*poses))
-        C = self._affine(state, started)
-        current = flat(replace(state, C_affine=C, F_tot=state.F_tot if self.law.plastic else state.F))
-        recorded = {name: [value] for name, value in zip(("x", "v", "F", "F_tot"), (*current[:2], *current[3:]))}
+        current = flat(self._begun(state, started))
+        recorded = {name: [getattr(current, name)] for name in RECORDED}
         if not started:
             current = prepared.first_advance(current, self.dt)
         prepared.settle(current)
@@ -293,13 +297,13 @@ class Simulator:
             along = tuple(part[first : first + self.substeps] for part in poses)
             current, forces = prepared.frame(current, lengths, first, along, None)
             reactions += [] if forces is None else [forces]
-            for name, value in zip(recorded, (current[0], current[1], current[3], current[4])):
-                recorded[name].append(value)
+            for name, values in recorded.items():
+                values.append(getattr(current, name))
             if progress is not None:
                 progress(frame)
         found = self._recorded(recorded, current, reactions, [self.substeps] * (frames - 1))
-        apart = {name: getattr(found, name).unflatten(1, (worlds, -1)) for name in ("x", "v", "F", "F_tot")}
-        final = ParticleState(*(getattr(found.final, name).unflatten(0, (worlds, -1)) for name in STATE))
+        apart = {name: getattr(found, name).unflatten(1, (worlds, -1)) for name in RECORDED}
+        final = ParticleState(*(t.unflatten(0, (worlds, -1)) for t in current))
         forces = None if found.reactions is None else found.reactions.unflatten(2, (worlds, -1))
         return replace(found, **apart, final=final, reactions=forces)
 
@@ -338,9 +342,8 @@ class Simulator:
         chooser = None
         if control is not None:
             chooser = self._chooser(control, prepared, parameters, density, each[0])
-        current = replace(state, C_affine=self._affine(state, started), F_tot=state.F_tot if self.law.plastic else state.F)
-        parts = tuple(getattr(current, name) for name in STATE) if worlds is None else flat(current)
-        prepared.settle(parts)
+        current = self._begun(state, started)
+        prepared.settle(State.of(current) if worlds is None else flat(current))
         prepared.give_memory(steps * self.substeps, torch.is_grad_enabled())
         stepper = Stepper(prepared, worlds, self.substeps, self.frame_dt, chooser, each, self.dtype)
         return stepper, Moment(current, self.substeps if started else 0)
@@ -361,21 +364,24 @@ class Simulator:
         if cutoff is None:
             cutoff = 0.0 if self.dtype == torch.float64 else 1e-12 * mean_mass
         if worlds is None:
-            solvers = [SegmentSolver(self.numerics, volume, density, cutoff, self._workspaces)]
+            solvers = [SegmentSolver(self.numerics, volume, density, cutoff)]
         else:
             size = together or (worlds if self.device.type == "cuda" else 1)
             volume, density = (t.repeat(size) if isinstance(t, Tensor) else t for t in (volume, density))
             solvers = [
-                SegmentSolver(self.numerics, volume, density, cutoff, self._workspaces, 0.0, gravities[i : i + size], i)
+                SegmentSolver(self.numerics, volume, density, cutoff, gravities[i : i + size], i)
                 for i in range(0, worlds, size)
             ]
         if isinstance(adapter, Sequence):
             adapter = Several(adapter, count)
-        lanes = Lanes(solvers, self._buffers, self._warm)
+        lanes = Lanes(solvers, self.buffers)
         return Prepared(self.numerics, self._ask, lanes, packed, adapter, stride, collect, self._long)
 
-    def _affine(self, state: ParticleState, started: bool) -> Tensor:
-        return state.C_affine if started or self.init_affine == "spin" else torch.zeros_like(state.C_affine)
+    def _begun(self, state: ParticleState, started: bool) -> ParticleState:
+        """The state that is advanced: F_tot is F itself where the law does not yield."""
+        spins = started or self.init_affine == "spin"
+        C_affine = state.C_affine if spins else torch.zeros_like(state.C_affine)
+        return replace(state, C_affine=C_affine, F_tot=state.F_tot if self.law.plastic else state.F)
 
     def _chooser(
         self, control: StepControl, prepared: Prepared, parameters: dict[str, Tensor], density: float | Tensor, motions
@@ -385,7 +391,7 @@ class Simulator:
         return StepChooser(control, self.numerics, parameters, prepared.packed, density, self.frame_dt, solids)
 
     def _recorded(
-        self, recorded: dict[str, list[Tensor]], current: tuple[Tensor, ...], reactions: list[Tensor], taken: list[int]
+        self, recorded: dict[str, list[Tensor]], current: State, reactions: list[Tensor], taken: list[int]
     ) -> Rollout:
         stacked = {name: torch.stack(values) for name, values in recorded.items() if name != "F_tot"}
         stacked["F_tot"] = torch.stack(recorded["F_tot"]) if self.law.plastic else stacked["F"]
@@ -449,7 +455,7 @@ class Simulator:
 
     def _check(self, state: ParticleState, volume: Tensor) -> None:
         *worlds, n = state.x.shape[:-1]
-        shapes = {name: (*worlds, n, 3) if name in ("x", "v") else (*worlds, n, 3, 3) for name in STATE}
+        shapes = {name: (*worlds, n, 3) if name in ("x", "v") else (*worlds, n, 3, 3) for name in State._fields}
         values = {name: (getattr(state, name), shape) for name, shape in shapes.items()} | {"volume": (volume, (n,))}
         for name, (value, shape) in values.items():
             if tuple(value.shape) != shape or value.dtype != self.dtype or value.device.type != self.device.type:

@@ -14,17 +14,22 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.physics.constitutive.material_operations import first_advance
 from mosa.physics.contact.motion import Motion, Poses, Trajectory, sample_poses
 from mosa.physics.engine.adapter_interface import ANSWER, AdapterOperator, MaterialState
 from mosa.physics.engine.adaptive_steps import StepChooser
-from mosa.physics.engine.budget import room
+from mosa.physics.engine.budget import room, substep_bytes
 from mosa.physics.engine.chain_schedule import SEGMENT
-from mosa.physics.engine.segment import LONGEST, LONGEST_KEPT, Lanes, advance_segment, substep_bytes, wants_gradient
-from mosa.physics.engine.workspace import Numerics, Steps
+from mosa.physics.engine.lanes import Lanes
+from mosa.physics.engine.material_operations import first_advance
+from mosa.physics.engine.numerics import Numerics, State, Steps, flat
+from mosa.physics.engine.operation import wants_gradient
+from mosa.physics.engine.segment import advance_segment
 from mosa.types import ParticleState
 
-STATE = ("x", "v", "C_affine", "F", "F_tot")
+LONGEST = 256
+"""Most substeps of a segment of which no gradient is wanted, on CUDA: each segment costs a look at the host."""
+LONGEST_KEPT = 96
+"""The same where a gradient is wanted and all states are kept; its buffers hold those of a segment once more."""
 
 
 @dataclass
@@ -47,21 +52,21 @@ class Prepared:
     def __post_init__(self) -> None:
         self.held = {"parameters": self.packed, **dict.fromkeys(ANSWER)}
 
-    def first_advance(self, state: tuple[Tensor, ...], dt: float) -> tuple[Tensor, ...]:
-        """The advance of F by dt [s] with which a motion begins. state: (x, v, C_affine, F, F_tot)."""
-        x, v, C, F, F_tot = state
+    def first_advance(self, state: State, dt: float) -> State:
+        """The advance of F by dt [s] with which a motion begins."""
+        C, F, F_tot = state.C_affine, state.F, state.F_tot
         numerics = replace(self.numerics, dt=dt)
         if not numerics.law.plastic:
             F = first_advance(numerics, F, C, self.packed)
-            return x, v, C, F, F
+            return state._replace(F=F, F_tot=F)
         operator = self.ask(self.adapter, F, C, self.packed, self.collect) if self.adapter is not None else self.held
         mapped = first_advance(numerics, F, C, self.packed, operator["plastic_G"], operator["plastic_h"])
-        return x, v, C, mapped, F_tot + dt * (C @ F_tot)
+        return state._replace(F=mapped, F_tot=F_tot + dt * (C @ F_tot))
 
-    def settle(self, state: tuple[Tensor, ...]) -> None:
+    def settle(self, state: State) -> None:
         """Ask an adapter whose operator is the same in every state, once and for all: nothing cuts the segments then."""
         if self.adapter is not None and self.stride is None:
-            self.held.update(self.ask(self.adapter, state[3], state[2], self.packed, self.collect))
+            self.held.update(self.ask(self.adapter, state.F, state.C_affine, self.packed, self.collect))
             self.adapter = None
 
     def give_memory(self, substeps: int, wanted: bool) -> None:
@@ -85,18 +90,17 @@ class Prepared:
         return segments(count, None if self.adapter is None else self.stride, self.most_alone)
 
     def frame(
-        self, state: tuple[Tensor, ...], lengths: Sequence[int], first: int, poses: tuple[Tensor, ...], steps: Steps | None
-    ) -> tuple[tuple[Tensor, ...], Tensor | None]:
+        self, state: State, lengths: Sequence[int], first: int, poses: tuple[Tensor, ...], steps: Steps | None
+    ) -> tuple[State, Tensor | None]:
         """(state after the segments of a frame, reactions (substeps, W K, 6) or None). first: number of its first substep; poses:
         of W worlds with K colliders at its substeps, () where there are none; steps: None for the numerics' dt."""
         forces, done = [], 0
         flow = getattr(self.adapter, "flow", None)
         for length in lengths:
             if flow is not None:
-                x, v, C, F, F_tot = state
-                state = (x, v, C, flow(F, length * (self.numerics.dt if steps is None else steps.dt)), F_tot)
+                state = state._replace(F=flow(state.F, length * (self.numerics.dt if steps is None else steps.dt)))
             if self.adapter is not None:
-                self.held.update(self.ask(self.adapter, state[3], state[2], self.packed, self.collect))
+                self.held.update(self.ask(self.adapter, state.F, state.C_affine, self.packed, self.collect))
             along = tuple(part[done : done + length] for part in poses)
             state, reaction = advance_segment(self.lanes, state, self.held, length, first + done, along, steps)
             forces += [torch.cat(reaction, -1)] if reaction else []
@@ -117,11 +121,6 @@ def mean_force(forces: Tensor, steps: Steps) -> Tensor:
     """(1, K, 6) of (S, K, 6): the impulse over the time in which it acted, the first substep's being its kick."""
     longer = steps.kick / steps.dt - 1
     return (longer * forces[:1] + forces.sum(0, keepdim=True)) / (len(forces) + longer)
-
-
-def flat(state: ParticleState) -> tuple[Tensor, ...]:
-    """(x, v, C_affine, F, F_tot) of all worlds' particles, one world's after the other's."""
-    return tuple(getattr(state, name).flatten(0, 1) for name in STATE)
 
 
 class Moment(NamedTuple):
@@ -172,10 +171,10 @@ class Stepper:
         that of their own motions. Errors: SimulationDiverged naming substep and particle; ConfigError.
         """
         prepared, variable = self.prepared, self.chooser is not None
-        state = flat(moment.state) if self.worlds is not None else tuple(getattr(moment.state, name) for name in STATE)
+        state = flat(moment.state) if self.worlds is not None else State.of(moment.state)
         if not prepared.numerics.law.plastic:
-            state = (*state[:4], state[3])
-        count = self.chooser.choose(moment.frames + 1, *state[1:4], speed) if variable else self.count
+            state = state._replace(F_tot=state.F)
+        count = self.chooser.choose(moment.frames + 1, state, speed) if variable else self.count
         dt = self.frame_dt / count
         if moment.substeps == 0:
             state = prepared.first_advance(state, dt)

@@ -7,99 +7,27 @@ than it: a body that moves or speeds up goes through the same graphs.
 """
 
 from collections.abc import Sequence
-from contextlib import nullcontext
-from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
 
-from mosa.physics.constitutive.laws import SLOTS, Law
+from mosa.physics.constitutive.laws import SLOTS
 from mosa.physics.constitutive.material_kernels import kernels_of
-from mosa.physics.constitutive.particle_access import aligned, zeros_in_one
 from mosa.physics.contact.collider_buffers import ColliderBuffers
-from mosa.physics.contact.colliders import PackedColliders
-from mosa.physics.engine.capture import ON_CPU, Captures
+from mosa.physics.engine.capture import Graphs, WarpCapture
+from mosa.physics.engine.numerics import Numerics, State, Steps
 from mosa.physics.grid.transfer_kernels import NO_EVENT, transfer_kernels
 from mosa.physics.grid.window import SMALL
+from mosa.physics.launching import SCALARS, aligned, copies, launch, zeros_in_one
 
-SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
-
-
-@dataclass(frozen=True)
-class Numerics:
-    """What is constant over a rollout and the same in all worlds, but for gravity where each has its own. dx [m], dt [s] where the
-    step is fixed, gravity (3,) [m/s^2], planes (P, 6) and modes (P,) from `pack_planes`, low and high (3,) [m] corners of the
-    admissible domain, norm_eps under the root of yield norms, colliders None where there are none, strain: measure of an operator
-    that is a stiffness (`stress_kernel`), None for one that acts on the stress."""
-
-    law: Law
-    dtype: torch.dtype
-    device: torch.device
-    dx: float
-    dt: float
-    gravity: tuple[float, float, float]
-    planes: Tensor
-    modes: Tensor
-    plane_count: int
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-    norm_eps: float
-    rebuild: bool
-    check_J: bool
-    colliders: PackedColliders | None = None
-    strain: str | None = None
-
-
-class Steps(NamedTuple):
-    """Times [s] of a segment's substeps: each moves particles by `dt`; the first one's forces act for `kick`, the others' for dt.
-
-    Velocities lie between positions, half a substep back. Where dt changes, the way from the middle of the last substep to that
-    of the next is the mean of the two: with that kick the scheme stays the leapfrog that it is at a constant dt.
-    """
-
-    kick: float
-    dt: float
-
-
-MAX_GRAPHS = 64
-"""Captured graphs a workspace keeps: one per pass and time step."""
 SPARE = 8
 """Room for larger windows: half as many nodes again, at most `window.SMALL`, or one in so many where that is more. A window that
 finds none costs new buffers and captures."""
 IDLE = 8
 """Times the window's nodes that stay (`window.SMALL` in any case) for when it grows again: idle ones cost memory and, on CUDA,
 threads that end at once."""
-BLOCK = 64
-"""Threads of a CUDA block: small ones, so that ten thousand particles are spread over all multiprocessors."""
-
-
-def launch(kernel, dim: int, inputs: list, device, adj_inputs: list | None = None) -> None:
-    """On Warp's current stream. adj_inputs: launch the adjoint."""
-    block = BLOCK if device.is_cuda else None
-    with nullcontext() if device.is_cuda else ON_CPU.launching():
-        if adj_inputs is None:
-            wp.launch(kernel, dim, inputs=inputs, device=device, block_dim=block)
-        else:
-            wp.launch(kernel, dim, inputs=inputs, adj_inputs=adj_inputs, adjoint=True, device=device, block_dim=block)
-
-
-def warp_stream(device: torch.device):
-    """Context in which Warp launches on torch's current stream."""
-    if device.type != "cuda":
-        return wp.ScopedDevice("cpu")
-    # without waiting for Warp's own stream: nothing is left on it, and a stream that is being captured could not
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
-
-
-def copies(tensors: Sequence[Tensor]) -> list[Tensor]:
-    """Contiguous copies, in one launch on CUDA."""
-    made = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in tensors]
-    if made:
-        torch._foreach_copy_(made, list(tensors))
-    return made
 
 
 class Workspace:
@@ -171,8 +99,8 @@ class Workspace:
         self._placed: np.ndarray | None = None
         self._pulled: tuple | None = None
         self.steps = Steps(numerics.dt, numerics.dt)
-        self._graphs: dict[tuple, object] = {}
-        self._captures = Captures("substeps cannot be captured as a graph and are launched one by one")
+        strategy = WarpCapture(numerics.device, self.flags_wp.device)
+        self._graphs = Graphs(strategy, "substeps cannot be captured as a graph and are launched one by one")
 
     def array(self, shape: tuple[int, ...], kind, dtype: torch.dtype | None = None) -> tuple[Tensor, wp.array]:
         """Zeros of `shape`, and the same memory as Warp's array of `kind`."""
@@ -215,7 +143,8 @@ class Workspace:
 
     @torch.inference_mode(False)  # another rollout may want gradients
     def _allocate_nodes(self, count: int) -> None:
-        self._graphs, self.allocations = {}, self.allocations + 1
+        self.allocations += 1
+        self._graphs.forget()
         self.capacity = 0  # until all is there: memory may run out
         self.fields = self.grid_wp = self.velocity_wp = None  # freed before there are others
         self.adj_grid = self.adj_grid_wp = self.adj_velocity = self.adj_velocity_wp = None
@@ -230,11 +159,11 @@ class Workspace:
         self.capacity = count
 
     def load(
-        self, state: tuple[Tensor, ...], held: dict[str, Tensor | None], volume: Tensor, mass: Tensor, cutoff: float,
+        self, state: State, held: dict[str, Tensor | None], volume: Tensor, mass: Tensor, cutoff: float,
         poses: tuple[Tensor, ...] | None = None, steps: Steps | None = None,
         gravities: tuple[tuple[float, float, float], ...] | None = None,
     ) -> None:  # fmt: skip
-        """Copy the start of a segment in: (x, v, C_affine, F, F_tot), the parameters, the adapter's operator, colliders' poses.
+        """Copy the start of a segment in: the state, the parameters, the adapter's operator, colliders' poses.
 
         steps: the numerics' dt by default; gravities: of every world [m/s^2], the numerics' by default."""
         self.steps = steps or Steps(self.numerics.dt, self.numerics.dt)
@@ -252,7 +181,7 @@ class Workspace:
         self.hold(held)
         if cutoff != self.cutoff:
             self.cutoff = cutoff
-            self._graphs.clear()
+            self._graphs.forget()
 
     def hold(self, held: dict[str, Tensor | None]) -> None:
         """Copy parameters and the adapter's operator in, those that are given."""
@@ -265,19 +194,19 @@ class Workspace:
             if value is not None:
                 self.held_wp[name] = wp.from_torch(aligned(value.detach()), dtype=self.held_wp[name].dtype)
 
-    def final(self) -> tuple[Tensor, ...]:
-        """Copies of (x, v, C_affine, F, F_tot) after the segment; F_tot is F itself where the law does not yield."""
-        return self.whole(self.state(self.substeps))
+    def final(self) -> State:
+        """Copies of the state after the segment."""
+        return State.whole(self.state(self.substeps))
+
+    def adjoint_slots(self) -> list[list[Tensor]]:
+        """Both slots of the adjoints of (x, v, C_affine, F), where the law yields of F_tot too."""
+        return [self.adj_x, self.adj_v, self.adj_C, self.adj_F, *([self.adj_A] if self.plastic else [])]
 
     def state(self, step: int) -> list[Tensor]:
         """Copies of (x, v, C_affine, F), where the law yields of F_tot too, after `step` substeps: the last ones, or any of those
         whose states are kept."""
         slot = step % len(self.x)
         return copies([part[slot] for part in (self.x, self.v, self.C, self.F, *((self.A,) if self.plastic else ()))])
-
-    def whole(self, parts: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """(x, v, C_affine, F, F_tot) from `state`."""
-        return tuple(parts) if self.plastic else (*parts, parts[3])
 
     def advance(self) -> None:
         """All substeps of the segment; events are left in `flags` for the caller to read."""
@@ -289,26 +218,10 @@ class Workspace:
         self._launch("adjoint", lambda: self.adjoint_steps(0, self.substeps))
 
     def _launch(self, name: str, body) -> None:
-        cuda = self.numerics.device.type == "cuda"
-        stream = wp.stream_from_torch(torch.cuda.current_stream(self.numerics.device)) if cuda else None
-        key = (name, *self.steps)
-        graph = self._graphs.get(key)
-        if len(self._graphs) > MAX_GRAPHS:
-            self._graphs.clear()
-        if graph == "loaded":
-            # on Warp's own stream: torch's default one cannot be captured
-            capture = wp.ScopedCapture(device=self.flags_wp.device, force_module_load=False)
-            graph = None
-            with nullcontext() if cuda else ON_CPU.capturing():
-                if self._captures.succeeds(capture, body):
-                    graph = self._graphs[key] = capture.graph
-        if graph is None:
-            with wp.ScopedStream(stream) if cuda else nullcontext():
-                body()  # the first pass compiles and loads the kernels, which a capture must not do
-            self._graphs[key] = "loaded"
-        else:
-            with nullcontext() if cuda else ON_CPU.launching():
-                wp.capture_launch(graph, stream=stream)
+        name = (name, *self.steps)
+        if self._graphs.waits(name):
+            self._graphs.capture(name, body)
+        self._graphs.play(name, body)
 
     def _run(self, kernel, dim: int, inputs: list, adj_inputs: list | None = None) -> None:
         launch(kernel, dim, inputs, self.flags_wp.device, adj_inputs)

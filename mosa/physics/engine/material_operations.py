@@ -9,8 +9,8 @@ from torch import Tensor
 
 from mosa.physics.constitutive.laws import Law
 from mosa.physics.constitutive.material_kernels import field_types, return_kernel, state_kernel, stress_kernel
-from mosa.physics.constitutive.particle_access import aligned, zeros_in_one
-from mosa.physics.engine.workspace import SCALARS, Numerics, launch, warp_stream
+from mosa.physics.engine.numerics import Numerics
+from mosa.physics.launching import SCALARS, aligned, launch, warp_stream, zeros_in_one
 
 
 def _arrays(tensors: list[Tensor | None], kinds: list) -> list:

@@ -1,0 +1,185 @@
+"""Runs segments of substeps, in windows of the grid that hold the body, and says where a motion fails."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mosa.errors import SimulationDiverged
+from mosa.physics.engine.budget import substep_bytes
+from mosa.physics.engine.numerics import Numerics, State, Steps
+from mosa.physics.engine.workspace import Workspace
+from mosa.physics.grid.transfer_kernels import INVERTED, NO_EVENT, NONFINITE, OUTSIDE, WINDOW
+from mosa.physics.grid.window import MAX_NODES, SMALL, extent, fallen, grid_window, window_of
+from mosa.physics.launching import copies, same_memory
+
+WIDENED = 32
+"""Most substeps of a segment whose window may be widened for particles of any speed; longer ones are cut instead."""
+
+
+class LeftWindow(Exception):
+    """A particle left the window of many substeps: of fewer, it has room for any speed."""
+
+
+class SegmentSolver:
+    """Runs the segments of one rollout, of one world or of several in the same launches. volume: (N,) [m^3]; density: number or
+    (N,) [kg/m^3]; cutoff: node mass [kg].
+
+    workspaces: by shape, those that it has while it runs (`Buffers.workspaces`).
+    room: bytes for the states of all substeps, between the passes; segments that do not fit are run again in the backward pass.
+    gravities: of every world [m/s^2], among which the particles are shared in equal parts; None: one world with the numerics' own.
+    first_world: number of the first one, for messages, None where there is but one.
+    """
+
+    def __init__(
+        self, numerics: Numerics, volume: Tensor, density: float | Tensor, cutoff: float,
+        gravities: Sequence[tuple[float, float, float]] | None = None, first_world: int | None = None,
+    ) -> None:  # fmt: skip
+        self.numerics, self.volume, self.cutoff = numerics, volume, cutoff
+        self.mass = density * volume
+        self.workspaces: dict[tuple, Workspace] = {}
+        self.room = 0.0
+        self.gravities = tuple(gravities) if gravities is not None else (numerics.gravity,)
+        self._first_world = first_world
+        self._known: tuple | None = None
+
+    @property
+    def worlds(self) -> int:
+        return len(self.gravities)
+
+    def workspace(self, substeps: int, adapted: bool, plastic_adapted: bool, with_adjoint: bool) -> Workspace:
+        key = (len(self.volume), substeps, adapted, plastic_adapted, with_adjoint, self.worlds)
+        if key not in self.workspaces:
+            self.workspaces[key] = Workspace(
+                self.numerics, len(self.volume), substeps, adapted=adapted, plastic_adapted=plastic_adapted,
+                with_adjoint=with_adjoint, worlds=self.worlds,
+            )  # fmt: skip
+        return self.workspaces[key]
+
+    def prepare(
+        self, state: State, held: dict, poses, substeps: int, windows: tuple[np.ndarray, np.ndarray],
+        with_adjoint: bool, steps: Steps | None = None,
+    ) -> Workspace:  # fmt: skip
+        """A workspace loaded with the start of a segment. poses: of the colliders at its substeps, None where there are none;
+        windows: of every world."""
+        work = self.workspace(substeps, held["G"] is not None, held["plastic_G"] is not None, with_adjoint)
+        work.set_window(*windows)
+        work.load(state, held, self.volume, self.mass, self.cutoff, poses, steps, self.gravities)
+        return work
+
+    def advance(
+        self, state: State, held: dict, poses, substeps: int, first: int, steps: Steps | None = None,
+        kept: bool = False,
+    ) -> tuple[tuple, tuple, tuple, list[Tensor]]:  # fmt: skip
+        """(state after `substeps`, reactions (force, torque) of the colliders or (), grid windows used, `Workspace.tape`).
+
+        first: number of the first substep, for messages; steps: their times, the numerics' dt by default; kept: whether to make
+        the last, [] otherwise.
+
+        Errors: SimulationDiverged naming substep and particle; LeftWindow of more than `WIDENED` substeps.
+        """
+        # the speed at the start tells the window; a body that is being accelerated may need the most that the time step bound
+        # allows, half a cell per substep
+        steps = steps or Steps(self.numerics.dt, self.numerics.dt)
+        cut = substeps > WIDENED  # where the first window does not do, not widened
+        for margin in (2,) if cut else (2, 3 + substeps // 2):
+            found, flags, work = self._attempt(state, held, poses, substeps, margin, steps, kept)
+            if not self.left_window(flags, first, steps.dt):
+                return *found, work.tape() if kept else []
+        raise LeftWindow if cut else self.left_behind(flags, first, steps.dt)
+
+    def piece(self, state: State, left: int, most: int, dt: float) -> int:
+        """How many of the `left` substeps the next window is to serve: at most `most`, and so few that it is not much larger than
+        the window of `WIDENED` substeps."""
+        bounds, pieces = self.bounds(state), -(-left // most)
+        if not np.isfinite(bounds).all():
+            return min(left, WIDENED)
+        while (count := -(-left // pieces)) > WIDENED:
+            reach = fallen(bounds, self.gravities, count * dt)
+            long, short = (window_of(reach, self.numerics.dx, n * dt, 2)[1].prod(-1) for n in (count, WIDENED))
+            if long.sum() <= short.sum() + SMALL and long.max() <= MAX_NODES:
+                break
+            pieces *= 2
+        return count
+
+    def windows(self, state: State, time: float, margin: int, falls: bool) -> tuple[np.ndarray, np.ndarray]:
+        """The windows of the worlds, (W, 3) each, for `time` [s], with room for `margin` nodes more. falls: also for what gravity
+        adds to the speeds at the start. Errors: SimulationDiverged as `grid_window`."""
+        bounds = self.bounds(state)
+        bounds = fallen(bounds, self.gravities, time) if falls else bounds
+        x, v = (self._apart(t) for t in state[:2])
+        return grid_window(x, v, self.numerics.dx, time, margin, bounds=bounds, name=self._named)
+
+    def _named(self, world: int) -> str:
+        return "" if self._first_world is None else f"world {self._first_world + world}: "
+
+    def _attempt(
+        self, state: State, held: dict, poses, substeps: int, margin: int, steps: Steps, kept: bool = False
+    ) -> tuple[tuple[tuple, tuple, tuple], list[int], Workspace]:
+        """((state, reactions, windows), flags, workspace), in windows for the speeds at the start and `margin` nodes more."""
+        # a few substeps that gravity takes out of the window are cheaper than nodes for it in every window
+        windows = self.windows(state, substeps * steps.dt, margin, falls=substeps > WIDENED)
+        work = self.prepare(state, held, poses, substeps, windows, with_adjoint=kept, steps=steps)
+        work.advance()
+        final = work.final()
+        flags = self.look(work.flags, final)
+        reaction = () if work.colliders is None else tuple(copies(work.colliders.reaction))
+        return (final, reaction, windows), flags, work
+
+    def look(self, flags: Tensor, final: State) -> list[int]:
+        """The events of a segment; the same transfer tells the host where the next one starts."""
+        bounds = extent(*(self._apart(t) for t in final[:2]))
+        numbers = torch.cat([flags.double(), bounds.double().flatten()]).numpy(force=True)  # float64 holds the flags exactly
+        self._know(final, numbers[4:].reshape(-1, 12))
+        return [int(n) for n in numbers[:4]]
+
+    def _apart(self, t: Tensor) -> Tensor:
+        """(worlds, particles of each, ...)."""
+        return t.unflatten(0, (self.worlds, -1))
+
+    def has_room(self, substeps: int) -> bool:
+        """Whether the states of so many substeps may be kept."""
+        return substeps * substep_bytes(self.numerics, len(self.volume)) <= self.room
+
+    def bounds(self, state: State) -> np.ndarray:
+        """`extent` (W, 12) of every world's x and v, without a transfer where `look` has told it."""
+        if self._known is None or not same_memory(self._known[0], state[:2]):
+            self._know(state, extent(*(self._apart(t) for t in state[:2])).double().numpy(force=True))
+        return self._known[1]
+
+    def _know(self, state: State, bounds: np.ndarray) -> None:
+        # aliases hold the memory, so that it does not become another tensor's, but not the graph, which holds the solver
+        self._known = [t.detach() for t in state[:2]], bounds
+
+    def left_behind(self, flags: list[int], first: int, dt: float) -> SimulationDiverged:
+        """The error to raise for a particle that leaves even the widest window."""
+        return self._error(WINDOW, flags[WINDOW], first, dt)
+
+    def left_window(self, flags: list[int], first: int, dt: float) -> bool:
+        """Whether a particle left the grid's window; any other event raises."""
+        if min(flags) == NO_EVENT:
+            return False
+        n = len(self.volume)
+        event = min(range(4), key=lambda i: (flags[i] // n, i != INVERTED, i == WINDOW, flags[i]))
+        if event == WINDOW:
+            return True
+        raise self._error(event, flags[event], first, dt)
+
+    def _error(self, event: int, flag: int, first: int, dt: float) -> SimulationDiverged:
+        substep, particle = first + flag // len(self.volume), flag % len(self.volume)
+        world, particle = divmod(particle, len(self.volume) // self.worlds)
+        law, numerics = self.numerics.law, self.numerics
+        what = {
+            WINDOW: "moved by more than half a cell per substep",
+            NONFINITE: "position, velocity or deformation is no longer finite",
+            OUTSIDE: f"position is outside the box {list(numerics.low)} to {list(numerics.high)} m",
+            INVERTED: "det F <= 0, which "
+            + (f"law {law.name} has no value for" if law.needs_positive_J else "on_inversion=error forbids"),
+        }[event]
+        return SimulationDiverged(
+            f"{self._named(world)}substep {substep}, particle {particle}: {what} (dt {dt:.3g} s, dx {numerics.dx:.3g} m); "
+            "use more substeps, a larger box, or parameters nearer to the calibrated ones"
+        )

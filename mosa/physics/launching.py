@@ -1,0 +1,103 @@
+"""Launches of Warp kernels on torch's tensors: where they lie in memory, on which stream, beside which other threads."""
+
+import math
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+
+import torch
+import warp as wp
+from torch import Tensor
+
+SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
+BYTES = 16
+"""Kernels read a particle's part in pieces of so many: arrays begin at a multiple."""
+APART = 32
+"""Numbers of which arrays in one buffer begin at multiples."""
+BLOCK = 64
+"""Threads of a CUDA block: small ones, so that ten thousand particles are spread over all multiprocessors."""
+
+
+class Turns:
+    """Many threads launch at once, or one captures alone: Warp's capture on a CPU records every thread's launches."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._launching, self._capturing = 0, None
+
+    @contextmanager
+    def launching(self) -> Iterator[None]:
+        """Beside other launches; within this thread's own capture too."""
+        if self._capturing == threading.get_ident():
+            yield
+            return
+        with self._changed:
+            self._changed.wait_for(lambda: self._capturing is None)
+            self._launching += 1
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._launching -= 1
+                self._changed.notify_all()
+
+    @contextmanager
+    def capturing(self) -> Iterator[None]:
+        """When no other thread launches, and until it ends none begins to."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._capturing is None and self._launching == 0)
+            self._capturing = threading.get_ident()
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._capturing = None
+                self._changed.notify_all()
+
+
+ON_CPU = Turns()
+"""Of this process."""
+
+
+def launch(kernel, dim: int, inputs: list, device, adj_inputs: list | None = None) -> None:
+    """On Warp's current stream. adj_inputs: launch the adjoint."""
+    block = BLOCK if device.is_cuda else None
+    with nullcontext() if device.is_cuda else ON_CPU.launching():
+        if adj_inputs is None:
+            wp.launch(kernel, dim, inputs=inputs, device=device, block_dim=block)
+        else:
+            wp.launch(kernel, dim, inputs=inputs, adj_inputs=adj_inputs, adjoint=True, device=device, block_dim=block)
+
+
+def warp_stream(device: torch.device):
+    """Context in which Warp launches on torch's current stream."""
+    if device.type != "cuda":
+        return wp.ScopedDevice("cpu")
+    # without waiting for Warp's own stream: nothing is left on it, and a stream that is being captured could not
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
+
+
+def copies(tensors: Sequence[Tensor]) -> list[Tensor]:
+    """Contiguous copies, in one launch on CUDA."""
+    made = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in tensors]
+    if made:
+        torch._foreach_copy_(made, list(tensors))
+    return made
+
+
+def same_memory(a: Sequence[Tensor], b: Sequence[Tensor]) -> bool:
+    """Whether these are views of the same memory, one by one. Whoever holds `a` knows that it has not become another tensor's."""
+    return len(a) == len(b) and all(s.is_set_to(t) for s, t in zip(a, b))
+
+
+def aligned(t: Tensor) -> Tensor:
+    """t, contiguous and where the kernels can read it in pieces; itself, if it is already."""
+    t = t.contiguous()
+    return t if t.data_ptr() % BYTES == 0 else t.clone()
+
+
+def zeros_in_one(shapes: Sequence[Sequence[int]], dtype: torch.dtype, device: torch.device) -> tuple[Tensor, list[Tensor]]:
+    """(buffer, its parts of these shapes), each part as `aligned` wants it: all are cleared in one launch."""
+    sizes = [-(-math.prod(shape) // APART) * APART for shape in shapes]
+    buffer = torch.zeros(sum(sizes), dtype=dtype, device=device)
+    return buffer, [part[: math.prod(shape)].view(*shape) for part, shape in zip(buffer.split(sizes), shapes)]
