@@ -71,7 +71,7 @@ def measure(dtype: torch.dtype, particles: int, grid: int | None, substeps: int,
         def call(work=work, with_adjoint=with_adjoint):
             if not with_adjoint:
                 return work.advance()
-            for seed in (work.adj_x, work.adj_v, work.adj_C, work.adj_F):
+            for seed in (work.adj_x, work.adj_v, work.adj_C_affine, work.adj_F):
                 seed[substeps % 2].fill_(1e-3)
             return work.adjoint()
 

@@ -99,7 +99,7 @@ class Episode:
         with self._gradients():
             if self.worlds is None:
                 ready = body.ready(starts, world, **options)
-                more = {"control": ready.timing.get("control")}
+                more = {"timing": ready.timing}
             else:
                 ready, self._begin = _worlds(body, world, starts, laws, gravity, options)
                 more = {"gravity": gravity, "together": together}

@@ -23,6 +23,7 @@ from mosa.physics.contact.colliders import Collider, reach
 from mosa.physics.contact.planes import Plane
 from mosa.physics.engine.adapter_interface import AdapterOperator
 from mosa.physics.engine.adaptive_steps import StepControl
+from mosa.physics.engine.clock import Adaptive, Replay
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.engine.time_step import required_substeps
 from mosa.rotations import skew
@@ -69,14 +70,14 @@ class Ready:
     """A body at its start, and what a simulation of it takes; or, by `stack`, the same in B worlds.
 
     state: in the simulator's type, higher by `lift` (3,) [m], the contact's offset, than where the body is seen; arguments: of
-    `Simulator.rollout`; timing: those of substeps that vary, {} where they are fixed.
+    `Simulator.rollout`; timing: of substeps that vary, None where they are fixed.
     """
 
     simulator: Simulator
     state: ParticleState
     lift: Tensor
     arguments: dict
-    timing: dict
+    timing: Adaptive | Replay | None
 
     def simulate(
         self, frames: int, colliders: Sequence[Collider] = (), *, collect: Callable | None = None,
@@ -90,7 +91,8 @@ class Ready:
             roll = partial(simulator.rollout, **self.arguments, collect=collect, motions=self.motions(colliders))
         lift = self.lift[:, None] if stacked else self.lift
         if observed is None:
-            rollout = roll(self.state, frames=frames, progress=progress, **self.timing)
+            timing = {} if self.timing is None else {"timing": self.timing}
+            rollout = roll(self.state, frames=frames, progress=progress, **timing)
         else:
             if self.timing:
                 raise ConfigError("simulation.adaptive: expected false where a criterion corrects the prediction frame by frame")
@@ -364,11 +366,12 @@ class Body(nn.Module):
         factor = self.factor(heterogeneity)
         parameters = material.per_particle(factor)
         gravity, up = world.gravity.to(self.rest), world.up.to(self.rest)
-        timing = {}
+        timing = None
         if self.settings.adaptive or counts is not None:
             # every variant takes the substeps its own states ask for; velocities at frame 0 itself: the rollout starts with half a
             # kick, whatever its first substep
-            timing = {"control": self.step_control(self.adapter is not None), "counts": counts, "lag": 0.0}
+            control = self.step_control(self.adapter is not None)
+            timing = Adaptive(control, lag=0.0) if counts is None else Replay(counts, lag=0.0)
             substeps = self.settings.max_substeps
             state = self.initial_state(start, 0.0, gravity)
         elif substeps is not None:
@@ -386,7 +389,7 @@ class Body(nn.Module):
             state = self.initial_state(start, frame_dt / substeps, gravity)
         lift = contact() * up
         if (own := getattr(adapter, "simulator", None)) is not None:  # no law on a grid: the adapter brings its dynamics
-            simulator, lift, timing = own(self.density, world, frame_dt), torch.zeros_like(lift), {}
+            simulator, lift, timing = own(self.density, world, frame_dt), torch.zeros_like(lift), None
             state = self.initial_state(start, frame_dt / simulator.substeps, gravity)
         else:
             simulator = self.simulator(material.law, substeps, frame_dt, world, getattr(adapter, "strain", None))

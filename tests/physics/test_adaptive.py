@@ -11,11 +11,17 @@ from mosa.physics.contact.colliders import Box, Collider
 from mosa.physics.contact.motion import Motion, Trajectory
 from mosa.physics.engine.adapter_interface import AdapterOperator
 from mosa.physics.engine.adaptive_steps import StepControl, current_modulus
+from mosa.physics.engine.clock import Adaptive, Replay
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.engine.time_step import required_substeps
 from mosa.types import Ground, ParticleState
 
 DENSITY = 1000.0
+
+
+def timed(control=None, counts=None, lag=0.0):
+    """lag: by default of velocities at frame 0 itself."""
+    return Adaptive(control, lag) if counts is None else Replay(counts, lag)
 
 
 def cube(n=6, spacing=0.01, height=0.3, speed=0.0):
@@ -64,8 +70,9 @@ def test_gradient_is_exact_for_the_counts_taken(law, make_block):
         sim = simulator(law, dx=0.04, frame_dt=0.012, colliders=[collider])
         start = replace(state, v=state.v + leaves["v0"])
         extra = {"yield_stress": 2e4} if law == "von_mises" else {}
-        return sim.rollout(start, parameters_of(leaves["E"]) | extra, volume_of(state), DENSITY, 4, stride=4, lag=0.0,
-                           adapter=lambda _: AdapterOperator(leaves["G"], 0 * leaves["G"][:, 0]), **timing)  # fmt: skip
+        return sim.rollout(start, parameters_of(leaves["E"]) | extra, volume_of(state), DENSITY, 4, stride=4,
+                           adapter=lambda _: AdapterOperator(leaves["G"], 0 * leaves["G"][:, 0]),
+                           timing=timed(**timing))  # fmt: skip
 
     def loss(rollout):
         return sum((weights[k] * getattr(rollout, k)).sum() for k in weights)
@@ -102,7 +109,7 @@ def test_single_precision_follows_double_at_the_same_counts(make_block):
         state = make_block(dtype=dtype, velocity=(0.3, -2.0, 0.1))
         E, v0 = torch.tensor(4e4, dtype=dtype, requires_grad=True), torch.zeros(3, dtype=dtype, requires_grad=True)
         rollout = simulator("corotated", dx=0.04, dtype=dtype).rollout(
-            replace(state, v=state.v + v0), parameters_of(E), volume_of(state), DENSITY, 4, counts=counts, lag=0.0
+            replace(state, v=state.v + v0), parameters_of(E), volume_of(state), DENSITY, 4, timing=timed(counts=counts)
         )
         gradients.append(torch.autograd.grad((rollout.x[1:] ** 2).sum() / 100, [E, v0]))
     for single, double in zip(*gradients):
@@ -120,8 +127,8 @@ def test_equal_counts_are_the_fixed_step_bit_for_bit(make_block):
     values = {"mu": 4e4, "lam": 5e4, "yield_stress": 800.0}
     leaf = state.v.clone().requires_grad_()
     results = []
-    for timing in ({}, {"counts": [10] * 3}):
-        rollout = sim.rollout(replace(state, v=leaf), values, volume_of(state), DENSITY, 4, **timing)
+    for timing in (None, Replay([10] * 3)):
+        rollout = sim.rollout(replace(state, v=leaf), values, volume_of(state), DENSITY, 4, timing=timing)
         results.append((rollout, torch.autograd.grad((rollout.x**2).sum() + rollout.F_tot.sum(), leaf)[0]))
     assert torch.equal(results[0][0].x, results[1][0].x) and torch.equal(results[0][0].F, results[1][0].F)
     assert torch.equal(results[0][1], results[1][1])
@@ -133,7 +140,7 @@ def test_free_fall_is_exact_whatever_the_counts():
     state, volume = cube(height=1.0, speed=-1.0)
     counts = [3, 11, 2, 2, 7]
     with torch.no_grad():
-        rollout = simulator(ground=None).rollout(state, parameters(1e4), volume, DENSITY, 6, counts=counts, lag=0.0)
+        rollout = simulator(ground=None).rollout(state, parameters(1e4), volume, DENSITY, 6, timing=timed(counts=counts))
     t = rollout.times[:, None]
     torch.testing.assert_close(rollout.x[:, :, 1], state.x[:, 1] + t - 4.9 * t**2, rtol=0, atol=1e-12)
     late = torch.tensor([0.0] + [0.01 / c for c in counts], dtype=torch.float64)[:, None]
@@ -148,7 +155,7 @@ def test_it_converges_to_the_fixed_step():
     state = replace(state, F_tot=state.F)
     sim = simulator("stvk", ground=None, frame_dt=0.004)
     with torch.no_grad():
-        roll = lambda **timing: sim.rollout(state, parameters(2e4), volume, DENSITY, 4, lag=0.0, **timing)  # noqa: E731
+        roll = lambda **timing: sim.rollout(state, parameters(2e4), volume, DENSITY, 4, timing=timed(**timing))  # noqa: E731
         fine = roll(counts=[320] * 3)
         chosen = [roll(control=StepControl(courant=c, multiple=1)) for c in (0.2, 0.1, 0.05)]
     errors = [float((r.x - fine.x).abs().max()) for r in chosen]
@@ -159,7 +166,7 @@ def test_counts_rise_in_an_impact_and_fall_after_it():
     state, volume = cube(height=0.02, speed=2.0)
     sim = simulator(frame_dt=0.005, ground=Ground(0.0, "separate"))
     with torch.no_grad():
-        rollout = sim.rollout(state, parameters(2e4), volume, DENSITY, 15, control=StepControl(courant=0.1, multiple=1))
+        rollout = sim.rollout(state, parameters(2e4), volume, DENSITY, 15, timing=Adaptive(StepControl(courant=0.1, multiple=1)))
     counts, fall = rollout.counts, rollout.v[:, :, 1].mean(1)
     turn = int((fall > 0).nonzero()[0])  # the first frame on the way up again: the body is squashed most just before
     assert float(torch.linalg.det(rollout.F[turn]).min()) < 0.8
@@ -178,7 +185,7 @@ def test_a_soft_body_needs_fewer_substeps_at_equal_error():
     sim = simulator()
     rule = required_substeps(float(values["lam"] + 2 * values["mu"]), DENSITY, 0.02, 0.02, v_max=9.8 * frames * 0.02)
     with torch.no_grad():
-        roll = lambda **timing: sim.rollout(state, values, volume, DENSITY, frames, lag=0.0, **timing)  # noqa: E731
+        roll = lambda **timing: sim.rollout(state, values, volume, DENSITY, frames, timing=timed(**timing))  # noqa: E731
         fine = roll(counts=[120] * 29)
 
         def figures(**timing):
@@ -222,7 +229,7 @@ def test_velocity_and_viscosity_bound_the_count(make_block):
     def first(start, mu=1.0, **options):
         control = StepControl(multiple=1, maximum=5000, **options)
         with torch.no_grad():
-            return sim.rollout(start, {"mu": mu, "kappa": 1e2}, volume_of(state), DENSITY, 2, control=control).counts[0]
+            return sim.rollout(start, {"mu": mu, "kappa": 1e2}, volume_of(state), DENSITY, 2, timing=Adaptive(control)).counts[0]
 
     slow, fast = first(still), first(replace(still, v=still.v + torch.tensor([20.0, 0, 0]).double()))
     assert fast == 21 > slow  # (20 + 9.8 * 0.02) * 0.02/(dx/2) = 20.2
@@ -232,7 +239,7 @@ def test_velocity_and_viscosity_bound_the_count(make_block):
     assert first(still, minimum=77) == 77
     eights = StepControl(maximum=20, multiple=8)
     with torch.no_grad():
-        counts = sim.rollout(still, {"mu": 1.0, "kappa": 1e2}, volume_of(state), DENSITY, 3, control=eights).counts
+        counts = sim.rollout(still, {"mu": 1.0, "kappa": 1e2}, volume_of(state), DENSITY, 3, timing=Adaptive(eights)).counts
     assert counts == (8, 8)
 
 
@@ -246,7 +253,7 @@ def test_the_lightest_of_equally_stiff_particles_sets_the_count(make_block):
     def first(density):
         with torch.no_grad():
             control = StepControl(multiple=1, maximum=5000)
-            return sim.rollout(state, {"mu": 4e4, "lam": 5e4}, volume_of(state), density, 2, control=control).counts[0]
+            return sim.rollout(state, {"mu": 4e4, "lam": 5e4}, volume_of(state), density, 2, timing=Adaptive(control)).counts[0]
 
     assert first(light) == pytest.approx(10 * first(DENSITY), abs=10) and first(DENSITY) >= 8
 
@@ -260,9 +267,9 @@ def test_going_on_from_an_earlier_rollout_is_the_same_rollout(dtype, make_block)
     plate = Collider(Box((0.4, 0.04, 0.4)), "separate", 0.2, Motion((0.15, 0.15, 0.11), velocity=(0.0, -0.5, 0.0)))
     sim = simulator("neo_hookean+von_mises", dx=0.04, frame_dt=0.01, dtype=dtype, colliders=[plate])
 
-    def roll(start, frames, **timing):
+    def roll(start, frames, lag=None, **options):
         with torch.no_grad():
-            return sim.rollout(start, values, volume_of(state), DENSITY, frames, control=CONTROL, **timing)
+            return sim.rollout(start, values, volume_of(state), DENSITY, frames, timing=Adaptive(CONTROL, lag), **options)
 
     whole, again, first = roll(state, 6), roll(state, 6), roll(state, 3)
     assert whole.counts == again.counts and torch.equal(whole.x, again.x) and len(set(whole.counts)) > 1
@@ -280,7 +287,7 @@ def test_a_resting_load_weighs_the_same_in_every_step():
     sim = simulator("corotated", ground=None, frame_dt=0.01, colliders=[floor])
     counts = [20, 31, 12, 25] * 30
     with torch.no_grad():
-        rollout = sim.rollout(state, parameters(2e4), volume, DENSITY, 121, counts=counts, lag=0.0)
+        rollout = sim.rollout(state, parameters(2e4), volume, DENSITY, 121, timing=timed(counts=counts))
     weight = 9.8 * DENSITY * float(volume.sum())
     # the impulse of the last 80 frames is the weight's but for the change of momentum
     momentum = DENSITY * float((volume[:, None] * (rollout.v[-1] - rollout.v[40])).sum(0)[1])
@@ -292,7 +299,7 @@ def test_errors(make_block):
     sim = simulator(dx=0.04, frame_dt=0.01)
 
     def roll(simulator=sim, **timing):
-        return simulator.rollout(state, {"mu": 4e4, "lam": 5e4}, volume_of(state), DENSITY, 3, **timing)
+        return simulator.rollout(state, {"mu": 4e4, "lam": 5e4}, volume_of(state), DENSITY, 3, timing=timed(**timing))
 
     limit = r"simulation\.max_substeps: expected at least \d+ for frame 1, found 3: particle \d+ has wave speed .* coarser grid"
     with pytest.raises(ConfigError, match=limit):

@@ -12,6 +12,7 @@ from mosa.physics.contact.motion import Motion, Poses, sample_poses
 from mosa.physics.contact.planes import Plane
 from mosa.physics.engine.adapter_interface import AdapterOperator
 from mosa.physics.engine.adaptive_steps import StepControl
+from mosa.physics.engine.clock import Adaptive
 from mosa.physics.engine.simulator import Simulator
 from mosa.types import ParticleState
 
@@ -202,5 +203,5 @@ def test_a_stepper_goes_on_from_a_state_with_poses_from_outside(make_block):
     given = Poses(*(torch.stack([part, part + (0.01 if i == 0 else 0)], 1) for i, part in enumerate(frames[2])))
     found = both.step(pair, given)
     assert found.reactions.shape == (SUBSTEPS, 2, 2, 6) and not torch.equal(*found.moment.state.x)
-    with pytest.raises(ConfigError, match="control: expected None with many worlds"):
-        sim.stepper(pair.state, law, volume, 1000.0, control=StepControl())
+    with pytest.raises(ConfigError, match="timing: expected None with many worlds"):
+        sim.stepper(pair.state, law, volume, 1000.0, timing=Adaptive(StepControl()))

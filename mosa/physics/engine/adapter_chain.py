@@ -183,9 +183,9 @@ class Chain:
     def _evaluate(self, step: int, collects: bool) -> _Evaluation:
         """The adapter's answer to the state in slot `step`; its graph adds the state's gradient to the segment's adjoint."""
         work, slot = self.full, step % 2
-        into = (work.adj_F[slot], work.adj_C[slot], work.adj_held["parameters"])
+        into = (work.adj_F[slot], work.adj_C_affine[slot], work.adj_held["parameters"])
         with torch.enable_grad(), at_hand():
-            inputs = (work.F[step], work.C[step], work.held["parameters"], *self.learned.weights)
+            inputs = (work.F[step], work.C_affine[step], work.held["parameters"], *self.learned.weights)
             # aliases: autograd ties a leaf to the stream it was first used on, which a capture on another one may not touch
             leaves = [t.detach().requires_grad_() for t in inputs]
             return _Evaluation(leaves, *self._ask(*leaves[:3], collects, leaves[3:], into))
@@ -194,7 +194,7 @@ class Chain:
     def _answer(self, work: Workspace, collects: bool, step: int) -> _Evaluation:
         """The same without a graph, in either workspace."""
         slot = step % len(work.x)
-        return _Evaluation([], *self._ask(work.F[slot], work.C[slot], work.held["parameters"], collects))
+        return _Evaluation([], *self._ask(work.F[slot], work.C_affine[slot], work.held["parameters"], collects))
 
     @same_weights()
     def _forward(self, full: bool) -> None:

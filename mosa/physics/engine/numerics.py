@@ -26,7 +26,7 @@ class State(NamedTuple):
 
     @classmethod
     def of(cls, particles: ParticleState) -> State:
-        """Of one body. Of several worlds see `flat`."""
+        """Of one body, or of several worlds as they are."""
         return cls(*(getattr(particles, name) for name in cls._fields))
 
     @classmethod
@@ -36,8 +36,9 @@ class State(NamedTuple):
 
 
 def flat(particles: ParticleState) -> State:
-    """Of all worlds' particles (W, N, ...), one world's after the other's."""
-    return State(*(t.flatten(0, 1) for t in State.of(particles)))
+    """Of all particles, one world's after the other's where there are worlds (W, N, ...)."""
+    state = State.of(particles)
+    return state if state.x.ndim == 2 else State(*(t.flatten(0, 1) for t in state))
 
 
 @dataclass(frozen=True)

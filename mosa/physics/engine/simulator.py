@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError
-from mosa.physics.constitutive.laws import SLOTS, law_named
+from mosa.physics.constitutive.laws import law_named
 from mosa.physics.constitutive.plasticity import yield_factor
 from mosa.physics.constitutive.strain import STRAINS
 from mosa.physics.contact.colliders import Collider, pack_colliders, reach
@@ -27,9 +27,18 @@ from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState
 from mosa.physics.engine.adaptive_steps import StepChooser, StepControl, check_counts
 from mosa.physics.engine.buffers import Buffers
 from mosa.physics.engine.chain_schedule import Chains
+from mosa.physics.engine.clock import Adaptive, Clock, Replay
+from mosa.physics.engine.inputs import (
+    check_state,
+    checked_density,
+    count_of_worlds,
+    gravity_of_worlds,
+    pack_parameters,
+    polar_rotation,
+)
 from mosa.physics.engine.lanes import Lanes
 from mosa.physics.engine.material_operations import material_state
-from mosa.physics.engine.numerics import Numerics, State, Steps, flat
+from mosa.physics.engine.numerics import Numerics, State, flat
 from mosa.physics.engine.operation import wants_gradient
 from mosa.physics.engine.solver import SegmentSolver
 from mosa.physics.engine.stepping import Moment, Prepared, Stepper, mean_force, segments
@@ -137,33 +146,8 @@ class Simulator:
         one.
         """
         shape = (particles,) if worlds is None else (worlds, particles)
-        expected = [name for name in self.law.parameters if name != self.law.reference]
-        if missing := [name for name in expected if name not in parameters]:
-            raise ConfigError(f"law {self.law.name!r} needs {', '.join(expected)}; missing: {', '.join(missing)}")
-        if unknown := [name for name in parameters if name not in expected]:
-            raise ConfigError(f"law {self.law.name!r} takes {', '.join(expected)}; unknown: {', '.join(unknown)}")
-        columns = []
-        for name, size in self.law.parameters.items():
-            if name == self.law.reference:
-                columns.append(rotation.detach().reshape(*shape, 9))
-                continue
-            value = parameters[name]
-            if isinstance(value, int | float):
-                value = torch.full((), value, dtype=self.dtype, device=self.device)  # a copy from the host would wait for CUDA
-            value = torch.as_tensor(value, dtype=self.dtype, device=self.device)
-            if name == "yield_stress" and "von_mises" in self.law.name.split("+"):
-                value = value * self.yield_factor  # the other laws that yield have their radius fixed
-            try:
-                columns.append((value[..., None] if size == 1 else value).expand(*shape, size))
-            except RuntimeError:
-                each, last = "" if worlds is None else f", ({worlds}, 1%s) or ({worlds}, {particles}%s)", f", {size}" * (size > 1)
-                raise ConfigError(
-                    f"parameter {name!r}: expected shape {'()' if size == 1 else f'({size},)'} or ({particles}"
-                    f"{last or ','}){each.replace('%s', last)}, found {tuple(value.shape)}"
-                ) from None
-        used = sum(self.law.parameters.values())
-        columns.append(torch.zeros(*shape, SLOTS - used, dtype=self.dtype, device=self.device))
-        return torch.cat(columns, -1).flatten(0, -2)
+        like = self.numerics.planes  # of its type and on its device
+        return pack_parameters(self.law, parameters, shape, like, rotation=rotation, yield_factor=self.yield_factor)
 
     def rollout(
         self,
@@ -178,9 +162,7 @@ class Simulator:
         started: bool = False,
         motions: Sequence[Motion | Trajectory] | None = None,
         start_time: float = 0.0,
-        control: StepControl | None = None,
-        counts: Sequence[int] | None = None,
-        lag: float | None = None,
+        timing: Adaptive | Replay | None = None,
         collect: Callable[[Any], None] | None = None,
     ) -> Rollout:
         """`frames` frames, the start being frame 0 (so frames - 1 intervals are simulated).
@@ -193,61 +175,21 @@ class Simulator:
         evaluation. progress: called with the number of each frame. An adapter that has `flow` is no part of a chain; before it is
         asked, F becomes flow(F (N, 3, 3), time until it is asked again [s]): plastic flow that a network has learned.
         motions: of the colliders, instead of their own; start_time [s]: time of frame 0 in these motions.
-        control: choose the substeps of each frame from the state at its start (see `adaptive_steps`) instead of taking `substeps`;
-        counts: of the frames - 1 intervals, instead of choosing: a replay, in which differences hold the substeps fixed.
-        lag [s]: with either, the start's velocities are those lag/2 before its positions: 0 for velocities at frame 0 itself,
-        frame_dt/counts[-1] of an earlier rollout that this one goes on from, None: the first substep's dt, as with a fixed step.
+        timing: substeps that are chosen for each frame, or those of an earlier rollout, instead of `substeps` in all (see `clock`).
         Frame 0 of the result holds the state as given. Errors: SimulationDiverged naming substep and particle; ConfigError.
         """
         prepared = self._prepare(state, parameters, volume, density, adapter, stride, collect, frames)
-        motions, variable = self._motions(motions), control is not None or counts is not None
-        given = None if counts is None else check_counts(counts, frames)
-        chooser = self._chooser(control, prepared, parameters, density, motions) if variable and given is None else None
-        poses = () if variable else self._poses(motions, frames, start_time)
-        current = State.of(self._begun(state, started))
-        recorded = {name: [getattr(current, name)] for name in RECORDED}
+        motions = self._motions(motions)
+        clock = self._clock(timing, frames, prepared, parameters, density, motions)
+        poses = () if clock.varies else self._poses(motions, frames, start_time)
 
-        def substeps_of(frame: int, current: State) -> int:
-            if not variable:
-                return self.substeps
-            return given[frame - 1] if given is not None else chooser.choose(frame, current)
+        def along(clock: Clock) -> tuple[Tensor, ...]:
+            if not clock.varies or not self.colliders:
+                return tuple(part[clock.first : clock.first + clock.count] for part in poses)
+            place = len(clock.taken) - 1, frames - 1, clock.taken, self.frame_dt, start_time
+            return sample_frame(motions, *place, self.dtype, self.device, isinstance(timing, Replay))
 
-        taken = [substeps_of(1, current)] if frames > 1 else []
-        if not started:
-            current = prepared.first_advance(current, self.frame_dt / taken[0] if taken else self.dt)
-        prepared.settle(current)
-        chained = self.chained and isinstance(prepared.adapter, nn.Module) and not variable and not self.colliders
-        chained = chained and getattr(prepared.adapter, "chained", True)
-        if chained:
-            solver, lengths = prepared.lanes.solvers[0], segments(self.substeps, stride)
-            states = self._chains.frames(solver, adapter, current, prepared.packed, frames - 1, lengths, collect)
-        wanted, total = wants_gradient((*current, *prepared.held.values(), *poses)), (frames - 1) * self.substeps
-        if not chained:
-            prepared.give_memory(total, wanted)
-        prepared.choose_lengths(total, wanted, variable)
-        reactions = []
-        for frame in range(1, frames):
-            if frame > 1:
-                taken.append(substeps_of(frame, current))
-            count, first = taken[-1], sum(taken[:-1])
-            dt = self.frame_dt / count
-            if variable:
-                steps = Steps(dt if lag is None else 0.5 * (lag + dt), dt)
-                along = self._poses_of_frame(motions, frames, taken, start_time, given is not None)
-            else:
-                steps, along = None, tuple(part[first : first + count] for part in poses)
-            if chained:
-                current, forces = next(states), None
-            else:
-                current, forces = prepared.frame(current, prepared.lengths(count, variable), first, along, steps)
-            lag = dt
-            if forces is not None:
-                reactions.append(mean_force(forces, steps) if variable else forces)
-            for name, values in recorded.items():
-                values.append(getattr(current, name))
-            if progress is not None:
-                progress(frame)
-        return self._recorded(recorded, current, reactions, taken)
+        return self._run(prepared, self._begun(state, started), frames, clock, poses, along, started, progress, self.chained)
 
     def rollout_worlds(
         self,
@@ -277,33 +219,20 @@ class Simulator:
         CPU each world has the bits of its own `rollout`, where gradients of what worlds share are summed over them.
         Errors: as `rollout`; SimulationDiverged names the world: none of the others is returned.
         """
-        worlds = self._check_worlds(state, together)
-        gravities = self._gravities(gravity, worlds)
+        worlds = count_of_worlds(state, together)
+        gravities = gravity_of_worlds(gravity, worlds, self.numerics.gravity)
         prepared = self._prepare(state, parameters, volume, density, adapter, stride, None, frames, worlds, gravities, together)
         each = self._motions_of_worlds(motions, worlds)
         poses = [self._poses(own, frames, start_time) for own in each]
         poses = tuple(torch.cat(parts, 1) for parts in zip(*poses))
-        current = flat(self._begun(state, started))
-        recorded = {name: [getattr(current, name)] for name in RECORDED}
-        if not started:
-            current = prepared.first_advance(current, self.dt)
-        prepared.settle(current)
-        wanted, total = wants_gradient((*current, *prepared.held.values(), *poses)), (frames - 1) * self.substeps
-        prepared.give_memory(total, wanted)
-        prepared.choose_lengths(total, wanted, False)
-        lengths, reactions = prepared.lengths(self.substeps, False), []
-        for frame in range(1, frames):
-            first = (frame - 1) * self.substeps
-            along = tuple(part[first : first + self.substeps] for part in poses)
-            current, forces = prepared.frame(current, lengths, first, along, None)
-            reactions += [] if forces is None else [forces]
-            for name, values in recorded.items():
-                values.append(getattr(current, name))
-            if progress is not None:
-                progress(frame)
-        found = self._recorded(recorded, current, reactions, [self.substeps] * (frames - 1))
+        clock = Clock(self.frame_dt, self.substeps)
+
+        def along(clock: Clock) -> tuple[Tensor, ...]:
+            return tuple(part[clock.first : clock.first + clock.count] for part in poses)
+
+        found = self._run(prepared, self._begun(state, started), frames, clock, poses, along, started, progress)
         apart = {name: getattr(found, name).unflatten(1, (worlds, -1)) for name in RECORDED}
-        final = ParticleState(*(t.unflatten(0, (worlds, -1)) for t in current))
+        final = ParticleState(*(t.unflatten(0, (worlds, -1)) for t in State.of(found.final)))
         forces = None if found.reactions is None else found.reactions.unflatten(2, (worlds, -1))
         return replace(found, **apart, final=final, reactions=forces)
 
@@ -320,33 +249,86 @@ class Simulator:
         motions: Sequence | None = None,
         gravity: Tensor | Sequence | None = None,
         together: int | None = None,
-        control: StepControl | None = None,
+        timing: Adaptive | None = None,
         steps: int = 30,
     ) -> tuple[Stepper, Moment]:
         """(what advances a body, or B of them, frame by frame, the moment to start from); arguments as `rollout` and
         `rollout_worlds`.
 
-        state: x (N, 3), or (B, N, 3) of B worlds. control: choose the substeps of every frame (one world only). steps: for which
+        state: x (N, 3), or (B, N, 3) of B worlds. timing: choose the substeps of every frame (one world only). steps: for which
         there shall be memory to keep all states, where a gradient is wanted; there may be more. Every step gives the bits of the
         same frame of a rollout. Errors: ConfigError.
         """
-        worlds = None if state.x.ndim == 2 else self._check_worlds(state, together)
-        if worlds is not None and control is not None:
-            raise ConfigError("control: expected None with many worlds, which take the same substeps")
+        worlds = None if state.x.ndim == 2 else count_of_worlds(state, together)
+        if worlds is not None and timing is not None:
+            raise ConfigError("timing: expected None with many worlds, which take the same substeps")
         if worlds is None and (gravity is not None or together is not None):
             raise ConfigError("gravity and together: expected None without worlds; gravity is the simulator's")
-        gravities = None if worlds is None else self._gravities(gravity, worlds)
+        gravities = None if worlds is None else gravity_of_worlds(gravity, worlds, self.numerics.gravity)
         prepared = self._prepare(state, parameters, volume, density, adapter, stride, None, 1, worlds, gravities, together)
         each = [self._motions(motions)] if worlds is None else self._motions_of_worlds(motions, worlds)
         each = [[m.timed(None, self.frame_dt) if isinstance(m, Motion) else m for m in own] for own in each]
-        chooser = None
-        if control is not None:
-            chooser = self._chooser(control, prepared, parameters, density, each[0])
+        chooser = None if timing is None else self._chooser(timing.control, prepared, parameters, density, each[0])
         current = self._begun(state, started)
-        prepared.settle(State.of(current) if worlds is None else flat(current))
+        prepared.settle(flat(current))
         prepared.give_memory(steps * self.substeps, torch.is_grad_enabled())
         stepper = Stepper(prepared, worlds, self.substeps, self.frame_dt, chooser, each, self.dtype)
         return stepper, Moment(current, self.substeps if started else 0)
+
+    def _run(
+        self, prepared: Prepared, start: ParticleState, frames: int, clock: Clock, poses: tuple[Tensor, ...],
+        along: Callable[[Clock], tuple[Tensor, ...]], started: bool, progress: Callable[[int], None] | None, chained: bool = False,
+    ) -> Rollout:  # fmt: skip
+        """The frames, of one body or of many worlds one after another. poses: of the colliders at all substeps, where these are
+        known beforehand; along: at those of the frame that is under way; chained: where the adapter can be."""
+        current = flat(start)
+        recorded = {name: [getattr(current, name)] for name in RECORDED}
+        if frames > 1:
+            clock.start(current)
+        if not started:
+            current = prepared.first_advance(current, clock.dt)
+        prepared.settle(current)
+        states = None
+        if chained and self._can_be_chained(prepared.adapter) and not clock.varies:
+            lengths = segments(self.substeps, prepared.stride)
+            states = self._chains.frames(
+                prepared.lanes.solvers[0], prepared.adapter, current, prepared.packed, frames - 1, lengths, prepared.collect
+            )
+        wanted, total = wants_gradient((*current, *prepared.held.values(), *poses)), (frames - 1) * self.substeps
+        if states is None:
+            prepared.give_memory(total, wanted)
+        prepared.choose_lengths(total, wanted, clock.varies)
+        reactions = []
+        for frame in range(1, frames):
+            if frame > 1:
+                clock.start(current)
+            if states is not None:
+                current, forces = next(states), None
+            else:
+                lengths = prepared.lengths(clock.count, clock.varies)
+                current, forces = prepared.frame(current, lengths, clock.first, along(clock), clock.steps)
+            if forces is not None:
+                reactions.append(mean_force(forces, clock.steps) if clock.varies else forces)
+            for name, values in recorded.items():
+                values.append(getattr(current, name))
+            if progress is not None:
+                progress(frame)
+        return self._recorded(recorded, current, reactions, clock.taken)
+
+    def _can_be_chained(self, adapter: Callable | None) -> bool:
+        return isinstance(adapter, nn.Module) and getattr(adapter, "chained", True) and not self.colliders
+
+    def _clock(
+        self, timing: Adaptive | Replay | None, frames: int, prepared: Prepared, parameters: dict[str, Tensor],
+        density: float | Tensor, motions,
+    ) -> Clock:  # fmt: skip
+        if timing is None:
+            return Clock(self.frame_dt, self.substeps)
+        if isinstance(timing, Replay):
+            counts = check_counts(timing.counts, frames)
+            return Clock(self.frame_dt, self.substeps, lambda frame, state: counts[frame - 1], timing.lag)
+        chooser = self._chooser(timing.control, prepared, parameters, density, motions)
+        return Clock(self.frame_dt, self.substeps, chooser.choose, timing.lag)
 
     def _prepare(
         self, state: ParticleState, parameters: dict[str, Tensor], volume: Tensor, density: float | Tensor, adapter, stride,
@@ -355,11 +337,11 @@ class Simulator:
         """What a rollout needs besides its state. Errors: ConfigError."""
         if frames < 1 or (stride is not None and stride < 1):
             raise ConfigError(f"frames and stride: expected at least 1, found {frames} and {stride}")
-        self._check(state, volume)
+        check_state(self.numerics, state, volume)
         volume, n, count = volume.detach().contiguous(), len(volume), worlds or 1
-        density, mean_mass = self._density(density, volume)
+        density, mean_mass = checked_density(density, volume)
         F = state.F if worlds is None else state.F.flatten(0, 1)
-        packed = self.pack(parameters, n, _polar(F) if self.law.reference is not None else None, worlds)
+        packed = self.pack(parameters, n, polar_rotation(F) if self.law.reference is not None else None, worlds)
         cutoff = self.mass_cutoff
         if cutoff is None:
             cutoff = 0.0 if self.dtype == torch.float64 else 1e-12 * mean_mass
@@ -399,28 +381,11 @@ class Simulator:
         times = self.frame_dt * torch.arange(frames, dtype=self.dtype, device=self.device)
         inverted = int((_determinant(stacked["F"].detach()) <= 0).sum())
         if inverted and self.on_inversion == "warn":
-            warnings.warn(f"{inverted} particle states with det F <= 0 in {frames} frames", stacklevel=3)
+            warnings.warn(f"{inverted} particle states with det F <= 0 in {frames} frames", stacklevel=4)
         per_frame = torch.stack(reactions) if reactions else None
         return Rollout(
             **stacked, times=times, final=ParticleState(*current), inverted=inverted, reactions=per_frame, counts=tuple(taken)
         )
-
-    def _check_worlds(self, state: ParticleState, together: int | None) -> int:
-        """The number of worlds. Errors: ConfigError."""
-        if state.x.ndim != 3:
-            raise ConfigError(f"x: expected shape (worlds, particles, 3), found {tuple(state.x.shape)}")
-        worlds = len(state.x)
-        if together is not None and (together < 1 or worlds % together):
-            raise ConfigError(f"together: expected a divisor of the {worlds} worlds, found {together}")
-        return worlds
-
-    def _gravities(self, gravity: Tensor | Sequence | None, worlds: int) -> tuple[tuple[float, float, float], ...]:
-        if gravity is None:
-            return (self.numerics.gravity,) * worlds
-        gravity = torch.as_tensor(gravity, dtype=torch.float64)
-        if tuple(gravity.shape) != (worlds, 3) or not bool(torch.isfinite(gravity).all()):
-            raise ConfigError(f"gravity: expected finite numbers of shape ({worlds}, 3), found shape {tuple(gravity.shape)}")
-        return tuple(map(tuple, gravity.tolist()))
 
     def _motions_of_worlds(self, motions: Sequence | None, worlds: int) -> list[Sequence[Motion | Trajectory]]:
         if motions is None or not any(isinstance(own, Sequence) for own in motions):
@@ -440,61 +405,13 @@ class Simulator:
             return ()
         return sample_poses(motions, frames - 1, self.substeps, self.dt, start_time, self.dtype, self.device)
 
-    def _poses_of_frame(
-        self, motions: Sequence[Motion | Trajectory], frames: int, counts: list[int], start_time: float, replayed: bool
-    ) -> tuple[Tensor, ...]:
-        if not self.colliders:
-            return ()
-        last = len(counts) - 1
-        return sample_frame(motions, last, frames - 1, counts, self.frame_dt, start_time, self.dtype, self.device, replayed)
-
     def material_state(self, F: Tensor, C_affine: Tensor, parameters: dict[str, Tensor]) -> MaterialState:
         """What an adapter would read at deformation gradients F (N, 3, 3); differentiable. For analysis and tests."""
         rotation = torch.eye(3, dtype=self.dtype, device=self.device).expand(len(F), 3, 3)
         return MaterialState(*material_state(self.law, F, C_affine, self.pack(parameters, len(F), rotation)))
 
-    def _check(self, state: ParticleState, volume: Tensor) -> None:
-        *worlds, n = state.x.shape[:-1]
-        shapes = {name: (*worlds, n, 3) if name in ("x", "v") else (*worlds, n, 3, 3) for name in State._fields}
-        values = {name: (getattr(state, name), shape) for name, shape in shapes.items()} | {"volume": (volume, (n,))}
-        for name, (value, shape) in values.items():
-            if tuple(value.shape) != shape or value.dtype != self.dtype or value.device.type != self.device.type:
-                raise ConfigError(
-                    f"{name}: expected shape {shape} of {self.dtype} on {self.device}, found {tuple(value.shape)} of "
-                    f"{value.dtype} on {value.device}"
-                )
-
-    def _density(self, density: float | Tensor, volume: Tensor) -> tuple[float | Tensor, float]:
-        """(density, mean mass of a particle [kg]), also checks the volumes: one look at the host for all.
-
-        A number stays one: arithmetic, and so every bit, is that of a body of one material."""
-        if not isinstance(density, Tensor) or density.ndim == 0:
-            density = float(density)
-            if not (math.isfinite(density) and density > 0):
-                raise ConfigError(f"density: expected a positive number [kg/m^3], found {density}")
-            valid = torch.ones((), dtype=torch.bool, device=volume.device)
-        else:
-            if density.shape != volume.shape:
-                raise ConfigError(f"density: expected a number or shape {tuple(volume.shape)}, found {tuple(density.shape)}")
-            density = density.detach().to(volume)
-            valid = (torch.isfinite(density) & (density > 0)).all()
-        numbers = [(volume > 0).all(), valid, (density * volume).mean()]
-        volumes, densities, mass = torch.stack([n.double() for n in numbers]).tolist()
-        if not volumes:
-            raise ConfigError("volume: expected positive numbers [m^3] for all particles")
-        if not densities:
-            raise ConfigError("density: expected positive numbers [kg/m^3] for all particles")
-        return density, mass
 
 
 def _determinant(F: Tensor) -> Tensor:
     """Of (..., 3, 3), as a triple product: a factorisation of each matrix takes CUDA longer than a substep."""
     return (F[..., 0, :] * torch.linalg.cross(F[..., 1, :], F[..., 2, :])).sum(-1)
-
-
-def _polar(F: Tensor) -> Tensor:
-    """Polar rotation of F (N, 3, 3), without gradient."""
-    U, S, Vh = torch.linalg.svd(F.detach().double())
-    sign = torch.ones_like(S)
-    sign[..., 2] = torch.linalg.det(U @ Vh)
-    return ((U * sign[..., None, :]) @ Vh).to(F.dtype)

@@ -171,7 +171,7 @@ class Stepper:
         that of their own motions. Errors: SimulationDiverged naming substep and particle; ConfigError.
         """
         prepared, variable = self.prepared, self.chooser is not None
-        state = flat(moment.state) if self.worlds is not None else State.of(moment.state)
+        state = flat(moment.state)
         if not prepared.numerics.law.plastic:
             state = state._replace(F_tot=state.F)
         count = self.chooser.choose(moment.frames + 1, state, speed) if variable else self.count

@@ -53,10 +53,10 @@ class Workspace:
         states = substeps + 1 if with_adjoint else 2
         self.x, self.x_wp = self._per_slot(states, (n, 3), self.kernels.vec3)
         self.v, self.v_wp = self._per_slot(states, (n, 3), self.kernels.vec3)
-        self.C, self.C_wp = self._per_slot(states, (n, 3, 3), self.kernels.mat33)
+        self.C_affine, self.C_affine_wp = self._per_slot(states, (n, 3, 3), self.kernels.mat33)
         self.F, self.F_wp = self._per_slot(states, (n, 3, 3), self.kernels.mat33)
         # the deformation gradient that is never mapped: F itself where the law does not yield
-        self.A, self.A_wp = self._per_slot(states, (n, 3, 3), self.kernels.mat33) if self.plastic else (self.F, self.F_wp)
+        self.F_tot, self.F_tot_wp = self._per_slot(states, (n, 3, 3), self.kernels.mat33) if self.plastic else (self.F, self.F_wp)
         self.tau, self.tau_wp = self._per_slot(substeps if with_adjoint else 1, (n, 3, 3), self.kernels.mat33)
         self.mass, self.mass_wp = self.array((n,), self.scalar)
         self.volume, self.volume_wp = self.array((n,), self.scalar)
@@ -73,11 +73,11 @@ class Workspace:
         if with_adjoint:
             self.adj_x, self.adj_x_wp = self._per_slot(2, (n, 3), self.kernels.vec3)
             self.adj_v, self.adj_v_wp = self._per_slot(2, (n, 3), self.kernels.vec3)
-            self.adj_C, self.adj_C_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
+            self.adj_C_affine, self.adj_C_affine_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
             self.adj_F, self.adj_F_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
-            self.adj_A, self.adj_A_wp = self.adj_F, self.adj_F_wp
+            self.adj_F_tot, self.adj_F_tot_wp = self.adj_F, self.adj_F_wp
             if self.plastic:
-                self.adj_A, self.adj_A_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
+                self.adj_F_tot, self.adj_F_tot_wp = self._per_slot(2, (n, 3, 3), self.kernels.mat33)
             self.adj_tau, self.adj_tau_wp = self.array((n, 3, 3), self.kernels.mat33)
             buffer, parts = zeros_in_one([shape for shape, _ in shapes.values()], numerics.dtype, numerics.device)
             self.adj_held = dict(zip(shapes, parts))
@@ -121,7 +121,7 @@ class Workspace:
         self.grid_slots().copy_(tape[-1])
 
     def _particle_slots(self) -> list[Tensor]:
-        parts = [self.x, self.v, self.C, self.F, self.tau] + ([self.A] if self.plastic else [])
+        parts = [self.x, self.v, self.C_affine, self.F, self.tau] + ([self.F_tot] if self.plastic else [])
         return [part[0]._base for part in parts]
 
     def grid_slots(self) -> Tensor:
@@ -175,7 +175,7 @@ class Workspace:
             self._pulled = pulled
         if self.colliders is not None:
             self.colliders.load(poses)
-        slots = (self.x, self.v, self.C, self.F) + ((self.A,) if self.plastic else ())
+        slots = (self.x, self.v, self.C_affine, self.F) + ((self.F_tot,) if self.plastic else ())
         targets = [*(slot[0] for slot in slots), self.volume, self.mass]
         torch._foreach_copy_(targets, [*state[: len(slots)], volume, mass])
         self.hold(held)
@@ -200,13 +200,13 @@ class Workspace:
 
     def adjoint_slots(self) -> list[list[Tensor]]:
         """Both slots of the adjoints of (x, v, C_affine, F), where the law yields of F_tot too."""
-        return [self.adj_x, self.adj_v, self.adj_C, self.adj_F, *([self.adj_A] if self.plastic else [])]
+        return [self.adj_x, self.adj_v, self.adj_C_affine, self.adj_F, *([self.adj_F_tot] if self.plastic else [])]
 
     def state(self, step: int) -> list[Tensor]:
         """Copies of (x, v, C_affine, F), where the law yields of F_tot too, after `step` substeps: the last ones, or any of those
         whose states are kept."""
         slot = step % len(self.x)
-        return copies([part[slot] for part in (self.x, self.v, self.C, self.F, *((self.A,) if self.plastic else ()))])
+        return copies([part[slot] for part in (self.x, self.v, self.C_affine, self.F, *((self.F_tot,) if self.plastic else ()))])
 
     def advance(self) -> None:
         """All substeps of the segment; events are left in `flags` for the caller to read."""
@@ -251,12 +251,12 @@ class Workspace:
 
     def _stress_arguments(self, state: int, slot: int) -> list:
         held = self.held_wp
-        return [self.F_wp[state], self.C_wp[state], held["parameters"], held["G"], held["h"], self.tau_wp[slot]]
+        return [self.F_wp[state], self.C_affine_wp[state], held["parameters"], held["G"], held["h"], self.tau_wp[slot]]
 
     def _mapping_arguments(self, state: int, new: int) -> list:
         held, numerics = self.held_wp, self.numerics
         return [
-            self.F_wp[state], self.C_wp[new], held["parameters"], held["plastic_G"], held["plastic_h"], self.steps.dt,
+            self.F_wp[state], self.C_affine_wp[new], held["parameters"], held["plastic_G"], held["plastic_h"], self.steps.dt,
             numerics.norm_eps, int(numerics.rebuild), self.F_wp[new],
         ]  # fmt: skip
 
@@ -273,15 +273,15 @@ class Workspace:
             self.over_nodes(kernels.clear, [self.grid_wp[g]])
             self._run(self.stress, n, self._stress_arguments(a, g))
             self._run(kernels.p2g, n, [
-                self.x_wp[a], self.v_wp[a], self.C_wp[a], self.F_wp[a], self.tau_wp[g], self.mass_wp, self.volume_wp,
+                self.x_wp[a], self.v_wp[a], self.C_affine_wp[a], self.F_wp[a], self.tau_wp[g], self.mass_wp, self.volume_wp,
                 *(geometry if step else kicked), int(numerics.check_J), step, self.flags_wp, self.grid_wp[g],
             ])  # fmt: skip
             self.over_nodes(kernels.grid_update, [*self._grid_arguments(g, step), self.velocity_wp[g]])
             if self.colliders is not None:
                 self.colliders.apply(step, self._collider_place(g), self._kick(step), self.velocity_wp[g])
             self._run(kernels.g2p, n, [
-                self.x_wp[a], self.A_wp[a], self.velocity_wp[g], *geometry, low, high, step, self.flags_wp,
-                self.x_wp[b], self.v_wp[b], self.C_wp[b], self.A_wp[b],
+                self.x_wp[a], self.F_tot_wp[a], self.velocity_wp[g], *geometry, low, high, step, self.flags_wp,
+                self.x_wp[b], self.v_wp[b], self.C_affine_wp[b], self.F_tot_wp[b],
             ])  # fmt: skip
             if self.plastic:
                 self._run(self.mapping, n, self._mapping_arguments(a, b))
@@ -300,14 +300,14 @@ class Workspace:
             if self.plastic:
                 self.adj_F_wp[a].zero_()
                 self._run(self.mapping, n, self._mapping_arguments(step, step + 1), [
-                    self.adj_F_wp[a], self.adj_C_wp[b], held["parameters"], held["plastic_G"], held["plastic_h"], 0.0, 0.0, 0,
-                    self.adj_F_wp[b],
+                    self.adj_F_wp[a], self.adj_C_affine_wp[b], held["parameters"], held["plastic_G"], held["plastic_h"],
+                    0.0, 0.0, 0, self.adj_F_wp[b],
                 ])  # fmt: skip
             self.over_nodes(kernels.clear, [self.adj_velocity_wp])
             self._run(kernels.adj_g2p, n, [
-                self.x_wp[step], self.A_wp[step], self.velocity_wp[step], self.C_wp[step + 1], *geometry,
-                self.adj_x_wp[b], self.adj_v_wp[b], self.adj_C_wp[b], self.adj_A_wp[b],
-                self.adj_x_wp[a], self.adj_A_wp[a], self.adj_velocity_wp,
+                self.x_wp[step], self.F_tot_wp[step], self.velocity_wp[step], self.C_affine_wp[step + 1], *geometry,
+                self.adj_x_wp[b], self.adj_v_wp[b], self.adj_C_affine_wp[b], self.adj_F_tot_wp[b],
+                self.adj_x_wp[a], self.adj_F_tot_wp[a], self.adj_velocity_wp,
             ])  # fmt: skip
             if self.colliders is not None:
                 # the velocities that the colliders found are cheaper to compute again than to keep
@@ -317,10 +317,10 @@ class Workspace:
             if self.colliders is not None:
                 self.colliders.add_mass(self.adj_grid_wp)
             self._run(kernels.adj_p2g, n, [
-                self.x_wp[step], self.v_wp[step], self.C_wp[step], self.tau_wp[step], self.mass_wp, self.volume_wp,
-                *(geometry if step else kicked), self.adj_grid_wp, self.adj_x_wp[a], self.adj_v_wp[a], self.adj_C_wp[a],
+                self.x_wp[step], self.v_wp[step], self.C_affine_wp[step], self.tau_wp[step], self.mass_wp, self.volume_wp,
+                *(geometry if step else kicked), self.adj_grid_wp, self.adj_x_wp[a], self.adj_v_wp[a], self.adj_C_affine_wp[a],
                 self.adj_tau_wp,
             ])  # fmt: skip
             self._run(self.stress, n, self._stress_arguments(step, step), [
-                self.adj_F_wp[a], self.adj_C_wp[a], held["parameters"], held["G"], held["h"], self.adj_tau_wp,
+                self.adj_F_wp[a], self.adj_C_affine_wp[a], held["parameters"], held["G"], held["h"], self.adj_tau_wp,
             ])  # fmt: skip

@@ -1,0 +1,116 @@
+"""What a user gives a simulator, checked and in the order and types of the kernels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from mosa.errors import ConfigError
+from mosa.physics.constitutive.laws import SLOTS, Law
+from mosa.physics.engine.numerics import Numerics, State
+from mosa.types import ParticleState
+
+
+def pack_parameters(
+    law: Law, parameters: dict[str, Tensor], shape: tuple[int, ...], like: Tensor, *, rotation: Tensor | None = None,
+    yield_factor: float = 1.0,
+) -> Tensor:  # fmt: skip
+    """(N, SLOTS) parameters in the law's order, of particles of `shape`, (N,) or (W, N) of W worlds; type and device as `like`. See
+    `Simulator.pack`. yield_factor: on the yield stress of von Mises. Errors: ConfigError naming a parameter."""
+    *worlds, particles = shape
+    expected = [name for name in law.parameters if name != law.reference]
+    if missing := [name for name in expected if name not in parameters]:
+        raise ConfigError(f"law {law.name!r} needs {', '.join(expected)}; missing: {', '.join(missing)}")
+    if unknown := [name for name in parameters if name not in expected]:
+        raise ConfigError(f"law {law.name!r} takes {', '.join(expected)}; unknown: {', '.join(unknown)}")
+    columns = []
+    for name, size in law.parameters.items():
+        if name == law.reference:
+            columns.append(rotation.detach().reshape(*shape, 9))
+            continue
+        value = parameters[name]
+        if isinstance(value, int | float):
+            value = torch.full((), value, dtype=like.dtype, device=like.device)  # a copy from the host would wait for CUDA
+        value = torch.as_tensor(value, dtype=like.dtype, device=like.device)
+        if name == "yield_stress" and "von_mises" in law.name.split("+"):
+            value = value * yield_factor  # the other laws that yield have their radius fixed
+        try:
+            columns.append((value[..., None] if size == 1 else value).expand(*shape, size))
+        except RuntimeError:
+            last = f", {size}" * (size > 1)
+            each = f", ({worlds[0]}, 1{last}) or ({worlds[0]}, {particles}{last})" if worlds else ""
+            raise ConfigError(
+                f"parameter {name!r}: expected shape {'()' if size == 1 else f'({size},)'} or ({particles}"
+                f"{last or ','}){each}, found {tuple(value.shape)}"
+            ) from None
+    columns.append(like.new_zeros(*shape, SLOTS - sum(law.parameters.values())))
+    return torch.cat(columns, -1).flatten(0, -2)
+
+
+def check_state(numerics: Numerics, state: ParticleState, volume: Tensor) -> None:
+    """Errors: ConfigError naming what has another shape, type or device."""
+    *worlds, n = state.x.shape[:-1]
+    shapes = {name: (*worlds, n, 3) if name in ("x", "v") else (*worlds, n, 3, 3) for name in State._fields}
+    values = {name: (getattr(state, name), shape) for name, shape in shapes.items()} | {"volume": (volume, (n,))}
+    for name, (value, shape) in values.items():
+        if tuple(value.shape) != shape or value.dtype != numerics.dtype or value.device.type != numerics.device.type:
+            raise ConfigError(
+                f"{name}: expected shape {shape} of {numerics.dtype} on {numerics.device}, found {tuple(value.shape)} of "
+                f"{value.dtype} on {value.device}"
+            )
+
+
+def checked_density(density: float | Tensor, volume: Tensor) -> tuple[float | Tensor, float]:
+    """(density, mean mass of a particle [kg]), also checks the volumes: one look at the host for all.
+
+    A number stays one: arithmetic, and so every bit, is that of a body of one material. Errors: ConfigError."""
+    if not isinstance(density, Tensor) or density.ndim == 0:
+        density = float(density)
+        if not (math.isfinite(density) and density > 0):
+            raise ConfigError(f"density: expected a positive number [kg/m^3], found {density}")
+        valid = torch.ones((), dtype=torch.bool, device=volume.device)
+    else:
+        if density.shape != volume.shape:
+            raise ConfigError(f"density: expected a number or shape {tuple(volume.shape)}, found {tuple(density.shape)}")
+        density = density.detach().to(volume)
+        valid = (torch.isfinite(density) & (density > 0)).all()
+    numbers = [(volume > 0).all(), valid, (density * volume).mean()]
+    volumes, densities, mass = torch.stack([n.double() for n in numbers]).tolist()
+    if not volumes:
+        raise ConfigError("volume: expected positive numbers [m^3] for all particles")
+    if not densities:
+        raise ConfigError("density: expected positive numbers [kg/m^3] for all particles")
+    return density, mass
+
+
+def count_of_worlds(state: ParticleState, together: int | None) -> int:
+    """Errors: ConfigError."""
+    if state.x.ndim != 3:
+        raise ConfigError(f"x: expected shape (worlds, particles, 3), found {tuple(state.x.shape)}")
+    worlds = len(state.x)
+    if together is not None and (together < 1 or worlds % together):
+        raise ConfigError(f"together: expected a divisor of the {worlds} worlds, found {together}")
+    return worlds
+
+
+def gravity_of_worlds(
+    gravity: Tensor | Sequence | None, worlds: int, common: tuple[float, float, float]
+) -> tuple[tuple[float, float, float], ...]:
+    """common: where none is given. Errors: ConfigError."""
+    if gravity is None:
+        return (common,) * worlds
+    gravity = torch.as_tensor(gravity, dtype=torch.float64)
+    if tuple(gravity.shape) != (worlds, 3) or not bool(torch.isfinite(gravity).all()):
+        raise ConfigError(f"gravity: expected finite numbers of shape ({worlds}, 3), found shape {tuple(gravity.shape)}")
+    return tuple(map(tuple, gravity.tolist()))
+
+
+def polar_rotation(F: Tensor) -> Tensor:
+    """Polar rotation of F (N, 3, 3), without gradient."""
+    U, S, Vh = torch.linalg.svd(F.detach().double())
+    sign = torch.ones_like(S)
+    sign[..., 2] = torch.linalg.det(U @ Vh)
+    return ((U * sign[..., None, :]) @ Vh).to(F.dtype)
