@@ -25,7 +25,7 @@ from mosa.physics.engine.capture import ATTEMPTS, Graphs, TorchCapture
 from mosa.physics.engine.network_evaluation import at_hand, same_weights
 from mosa.physics.engine.numerics import Numerics, State
 from mosa.physics.engine.operation import Kept, Stretch, advance
-from mosa.physics.engine.solver import WIDENED, LeftWindow, SegmentSolver
+from mosa.physics.engine.solver import WIDENED, SegmentSolver
 from mosa.physics.engine.workspace import Workspace
 from mosa.physics.grid.transfer_kernels import NO_EVENT
 from mosa.physics.launching import copies, same_memory, warp_stream
@@ -109,20 +109,20 @@ class Chain:
         backward pass, which kept needs and any rollout with one has anyway. Errors: as `SegmentSolver.advance`; LeftWindow of
         chains that can be cut, with marks or of more than `WIDENED` substeps in several segments."""
         dt, total = self.numerics.dt, self.substeps
-        work = self._full() if full else self._light()
-        for margin in (MARGIN, 3 + total // 2):
-            window = solver.windows(state, total * dt, margin, falls=True)
+
+        def run(window: tuple) -> Workspace:
+            work = self._full() if full else self._light()
             self._load(work, window, solver, learned, state, packed)
             self._capture()
             self._play(("forward", full))
-            final = work.final()
-            flags = solver.look(work.flags, final)
-            if not solver.left_window(flags, first, dt):
-                states = [*(State.whole(copies(state)) for state in self.marked), final]
-                return states, tuple(copies(self.statistics[full])), window, work.tape() if kept else []
-            if self.marks or (total > WIDENED and len(self.lengths) > 1):
-                raise LeftWindow  # shorter chains need less than the widest window, which is larger than any may be
-        raise solver.left_behind(flags, first, dt)
+            return work
+
+        # shorter chains need less than the widest window, which is larger than any may be
+        cut = bool(self.marks) or (total > WIDENED and len(self.lengths) > 1)
+        margins = (MARGIN,) if cut else (MARGIN, 3 + total // 2)
+        work, final, window = solver.within(run, state, total * dt, margins, True, first, dt)
+        states = [*(State.whole(copies(state)) for state in self.marked), final]
+        return states, tuple(copies(self.statistics[full])), window, work.tape() if kept else []
 
     def adjoint(
         self, solver: SegmentSolver, learned: Learned, state: State, packed: Tensor, window: tuple,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -81,15 +81,38 @@ class SegmentSolver:
 
         Errors: SimulationDiverged naming substep and particle; LeftWindow of more than `WIDENED` substeps.
         """
-        # the speed at the start tells the window; a body that is being accelerated may need the most that the time step bound
-        # allows, half a cell per substep
         steps = steps or Steps(self.numerics.dt, self.numerics.dt)
         cut = substeps > WIDENED  # where the first window does not do, not widened
-        for margin in (2,) if cut else (2, 3 + substeps // 2):
-            found, flags, work = self._attempt(state, held, poses, substeps, margin, steps, kept)
-            if not self.left_window(flags, first, steps.dt):
-                return *found, work.tape() if kept else []
-        raise LeftWindow if cut else self.left_behind(flags, first, steps.dt)
+
+        def run(windows: tuple[np.ndarray, np.ndarray]) -> Workspace:
+            work = self.prepare(state, held, poses, substeps, windows, with_adjoint=kept, steps=steps)
+            work.advance()
+            return work
+
+        # a few substeps that gravity takes out of the window are cheaper than nodes for it in every window
+        margins = (2,) if cut else (2, 3 + substeps // 2)
+        work, final, windows = self.within(run, state, substeps * steps.dt, margins, cut, first, steps.dt)
+        reaction = () if work.colliders is None else tuple(copies(work.colliders.reaction))
+        return final, reaction, windows, work.tape() if kept else []
+
+    def within(
+        self, run: Callable[[tuple[np.ndarray, np.ndarray]], Workspace], state: State, time: float, margins: Sequence[int],
+        falls: bool, first: int, dt: float,
+    ) -> tuple[Workspace, State, tuple[np.ndarray, np.ndarray]]:  # fmt: skip
+        """(what `run` has run in, the state after it, the windows) in the first windows that no particle leaves.
+
+        The speeds at the start tell a window for `time` seconds; a body that is being accelerated may need the most that the time
+        step bound allows, half a cell per substep. margins: nodes beyond what the speeds ask for, of one window after the other;
+        with one alone the caller can cut what is run. falls: as `windows`; first, dt: of the substeps, for messages. Errors:
+        SimulationDiverged naming substep and particle; LeftWindow of what can be cut."""
+        for margin in margins:
+            windows = self.windows(state, time, margin, falls)
+            work = run(windows)
+            final = work.final()
+            flags = self.look(work.flags, final)
+            if not self.left_window(flags, first, dt):
+                return work, final, windows
+        raise LeftWindow if len(margins) == 1 else self._error(WINDOW, flags[WINDOW], first, dt)
 
     def piece(self, state: State, left: int, most: int, dt: float) -> int:
         """How many of the `left` substeps the next window is to serve: at most `most`, and so few that it is not much larger than
@@ -116,19 +139,6 @@ class SegmentSolver:
     def _named(self, world: int) -> str:
         return "" if self._first_world is None else f"world {self._first_world + world}: "
 
-    def _attempt(
-        self, state: State, held: dict, poses, substeps: int, margin: int, steps: Steps, kept: bool = False
-    ) -> tuple[tuple[tuple, tuple, tuple], list[int], Workspace]:
-        """((state, reactions, windows), flags, workspace), in windows for the speeds at the start and `margin` nodes more."""
-        # a few substeps that gravity takes out of the window are cheaper than nodes for it in every window
-        windows = self.windows(state, substeps * steps.dt, margin, falls=substeps > WIDENED)
-        work = self.prepare(state, held, poses, substeps, windows, with_adjoint=kept, steps=steps)
-        work.advance()
-        final = work.final()
-        flags = self.look(work.flags, final)
-        reaction = () if work.colliders is None else tuple(copies(work.colliders.reaction))
-        return (final, reaction, windows), flags, work
-
     def look(self, flags: Tensor, final: State) -> list[int]:
         """The events of a segment; the same transfer tells the host where the next one starts."""
         bounds = extent(*(self._apart(t) for t in final[:2]))
@@ -153,10 +163,6 @@ class SegmentSolver:
     def _know(self, state: State, bounds: np.ndarray) -> None:
         # aliases hold the memory, so that it does not become another tensor's, but not the graph, which holds the solver
         self._known = [t.detach() for t in state[:2]], bounds
-
-    def left_behind(self, flags: list[int], first: int, dt: float) -> SimulationDiverged:
-        """The error to raise for a particle that leaves even the widest window."""
-        return self._error(WINDOW, flags[WINDOW], first, dt)
 
     def left_window(self, flags: list[int], first: int, dt: float) -> bool:
         """Whether a particle left the grid's window; any other event raises."""

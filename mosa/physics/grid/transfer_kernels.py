@@ -8,16 +8,14 @@ The adjoint of P2G is a pure gather; the adjoint of G2P scatters three numbers p
 Stencils are nested static loops over 3: a single loop over 27 nodes compiles to a dynamic loop.
 """
 
-# ruff: noqa: UP018, RUF046
-# (Warp: `int(0)` makes a variable that a dynamic loop or branch may change, and results are unpacked whole)
-
 from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
-from mosa.physics.contact.planes import make_fade, make_plane_functions
 from mosa.physics.grid.node_access import node_access
+from mosa.physics.grid.node_kernels import node_kernels
+from mosa.physics.grid.stencil import stencil_functions
 
 # slots of the flag array: the first substep * N + particle at which the event happened
 WINDOW, NONFINITE, OUTSIDE, INVERTED = 0, 1, 2, 3
@@ -31,55 +29,17 @@ _FLIPPED = wp.constant(INVERTED)
 
 @cache
 def transfer_kernels(scalar) -> SimpleNamespace:
-    """Kernels clear, p2g, grid_update, g2p, adj_g2p, adj_grid, adj_p2g for wp.float32 or wp.float64 fields.
-
-    Those over nodes are launched with `threads` for each world and take all nodes of its window, however many threads that is."""
+    """Kernels p2g, g2p, adj_g2p, adj_p2g, and those of `node_kernels`, for wp.float32 or wp.float64 fields."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
     vec4 = wp.types.vector(length=4, dtype=scalar)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
-    collide, adj_collide = make_plane_functions(scalar)
-    fade = make_fade(scalar)
-    memory = node_access(scalar)
-    load3, load4, store3, store4, add3, add4 = (
-        memory.load3, memory.load4, memory.store3, memory.store4, memory.add3, memory.add4
-    )  # fmt: skip
+    memory, stencil = node_access(scalar), stencil_functions(scalar)
+    load3, load4, add3, add4 = memory.load3, memory.load4, memory.add3, memory.add4
+    spline, spline_slope, cell, local_cell = stencil.spline, stencil.spline_slope, stencil.cell, stencil.local_cell
     module = f"mosa.physics.transfers_{scalar.__name__}"
+    nodes = node_kernels(scalar, module)
 
     # `steps` in the kernels holds the node offsets as scalars: Warp 1.19 retypes a loop variable that is cast to float64
-
-    @wp.func
-    def spline(f: scalar):
-        """Weights of the three nodes at distances f, f - 1, f - 2 (in cells), f in [0.5, 1.5)."""
-        return vec3(
-            scalar(0.5) * (scalar(1.5) - f) * (scalar(1.5) - f),
-            scalar(0.75) - (f - scalar(1.0)) * (f - scalar(1.0)),
-            scalar(0.5) * (f - scalar(0.5)) * (f - scalar(0.5)),
-        )
-
-    @wp.func
-    def spline_slope(f: scalar):
-        return vec3(f - scalar(1.5), scalar(-2.0) * (f - scalar(1.0)), f - scalar(0.5))
-
-    @wp.func
-    def cell(x: vec3, inv_dx: scalar):
-        """Lowest node of the stencil."""
-        h = scalar(0.5)
-        return vec3(wp.floor(x[0] * inv_dx - h), wp.floor(x[1] * inv_dx - h), wp.floor(x[2] * inv_dx - h))
-
-    @wp.func
-    def local_cell(base: vec3, window: wp.array(dtype=wp.vec3i), row: int):
-        """Index of the stencil's lowest node, -1 if the stencil is not inside the window at `row` (or x is NaN)."""
-        origin = window[row]
-        dims = window[row + 1]
-        i = base[0] - scalar(origin[0])
-        j = base[1] - scalar(origin[1])
-        k = base[2] - scalar(origin[2])
-        r = int(-1)
-        z = scalar(0.0)
-        if i >= z and j >= z and k >= z:
-            if i <= scalar(dims[0] - 3) and j <= scalar(dims[1] - 3) and k <= scalar(dims[2] - 3):
-                r = window[row + 2][0] + (int(i) * dims[1] + int(j)) * dims[2] + int(k)
-        return r
 
     @wp.kernel(module=module, enable_backward=False)
     def p2g(
@@ -122,115 +82,6 @@ def transfer_kernels(scalar) -> SimpleNamespace:
                     w = wij * wz[k]
                     q = w * (qij + steps[k] * bz)
                     add4(grid, row + k, vec4(q[0], q[1], q[2], w * m))
-
-    @wp.func
-    def free_velocity(g: vec4, impulse: vec3):
-        return vec3(g[0], g[1], g[2]) / g[3] + impulse
-
-    @wp.func
-    def node_position(node: int, origin: wp.vec3i, dims: wp.vec3i, dx: scalar):
-        plane = dims[1] * dims[2]
-        i = node / plane
-        j = (node - i * plane) / dims[2]
-        k = node - i * plane - j * dims[2]
-        return dx * vec3(scalar(origin[0] + i), scalar(origin[1] + j), scalar(origin[2] + k))
-
-    @wp.func
-    def touch(y: vec3, planes: wp.array2d(dtype=scalar), i: int):
-        """Weight of plane i's contact of a node at y."""
-        normal = vec3(planes[i, 0], planes[i, 1], planes[i, 2])
-        w, _slope = fade(wp.dot(y, normal) - planes[i, 3], planes[i, 5])
-        return w
-
-    @wp.func
-    def contact(
-        u: vec3, y: vec3, planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int
-    ):
-        """Velocity after the first `count` planes."""
-        r = u
-        for i in range(count):
-            w = touch(y, planes, i)
-            if w > scalar(0.0):
-                hit = collide(r, vec3(planes[i, 0], planes[i, 1], planes[i, 2]), modes[i], planes[i, 4])
-                if w < scalar(1.0):
-                    r = r + w * (hit - r)
-                else:
-                    r = hit
-        return r
-
-    @wp.func
-    def adj_contact(
-        u: vec3, y: vec3, planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int, seed: vec3
-    ):
-        a = seed
-        for reverse in range(count):
-            i = count - 1 - reverse
-            w = touch(y, planes, i)
-            if w > scalar(0.0):
-                before = contact(u, y, planes, modes, i)
-                normal = vec3(planes[i, 0], planes[i, 1], planes[i, 2])
-                a = (scalar(1.0) - w) * a + adj_collide(before, normal, modes[i], planes[i, 4], w * a)
-        return a
-
-    @wp.func
-    def nodes_of(window: wp.array(dtype=wp.vec3i), world: int):
-        """(first, last + 1) of a world's nodes in the arrays."""
-        dims = window[3 * world + 1]
-        first = window[3 * world + 2][0]
-        return first, first + dims[0] * dims[1] * dims[2]
-
-    @wp.kernel(module=module, enable_backward=False)
-    def clear(window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4)):
-        z = scalar(0.0)
-        world = wp.tid() / threads
-        first, end = nodes_of(window, world)
-        for node in range(first + wp.tid() - world * threads, end, threads):
-            store4(grid, node, vec4(z, z, z, z))
-
-    @wp.kernel(module=module, enable_backward=False)
-    def grid_update(
-        window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4), impulses: wp.array(dtype=vec3), cutoff: scalar,
-        dx: scalar, planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int,
-        velocity: wp.array(dtype=vec4),
-    ):  # fmt: skip
-        world = wp.tid() / threads
-        origin = window[3 * world]
-        dims = window[3 * world + 1]
-        impulse = impulses[world]
-        first, end = nodes_of(window, world)
-        for node in range(first + wp.tid() - world * threads, end, threads):
-            g = load4(grid, node)
-            u = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
-            if g[3] > cutoff:
-                u = free_velocity(g, impulse)
-                if count > 0:
-                    u = contact(u, node_position(node - first, origin, dims, dx), planes, modes, count)
-            store3(velocity, node, u)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def adj_grid(
-        window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4), impulses: wp.array(dtype=vec3), cutoff: scalar,
-        dx: scalar, planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int,
-        adj_velocity: wp.array(dtype=vec4), adj_grid: wp.array(dtype=vec4),
-    ):  # fmt: skip
-        world = wp.tid() / threads
-        origin = window[3 * world]
-        dims = window[3 * world + 1]
-        impulse = impulses[world]
-        first, end = nodes_of(window, world)
-        for node in range(first + wp.tid() - world * threads, end, threads):
-            g = load4(grid, node)
-            if g[3] > cutoff:
-                u = free_velocity(g, impulse)
-                a = load3(adj_velocity, node)
-                if count > 0:
-                    a = adj_contact(u, node_position(node - first, origin, dims, dx), planes, modes, count, a)
-                a = a / g[3]
-                # v = p/m: dL/dm = -a.(p/m)/m
-                store4(adj_grid, node, vec4(a[0], a[1], a[2], -(a[0] * g[0] + a[1] * g[1] + a[2] * g[2]) / g[3]))
-            else:
-                z = scalar(0.0)
-                store4(adj_grid, node, vec4(z, z, z, z))
 
     @wp.kernel(module=module, enable_backward=False)
     def g2p(
@@ -428,7 +279,4 @@ def transfer_kernels(scalar) -> SimpleNamespace:
         adj_tau[p] = -stiffness * aB
         adj_x[p] = adj_x[p] + inv_dx * (vec3(gx, gy, gz) - wp.transpose(B) * s)
 
-    return SimpleNamespace(
-        clear=clear, p2g=p2g, grid_update=grid_update, g2p=g2p, adj_g2p=adj_g2p, adj_grid=adj_grid, adj_p2g=adj_p2g,
-        node_position=node_position, nodes_of=nodes_of, vec3=vec3, vec4=vec4, mat33=mat33,
-    )  # fmt: skip
+    return SimpleNamespace(p2g=p2g, g2p=g2p, adj_g2p=adj_g2p, adj_p2g=adj_p2g, vec3=vec3, vec4=vec4, mat33=mat33, **vars(nodes))

@@ -1,0 +1,135 @@
+"""What happens at the nodes: from momentum to velocity, gravity, contact with planes, and the adjoint of it."""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from mosa.physics.contact.planes import make_fade, make_plane_functions
+from mosa.physics.grid.node_access import node_access
+
+
+@cache
+def node_kernels(scalar, module: str) -> SimpleNamespace:
+    """Kernels clear, grid_update, adj_grid in the Warp module of that name, functions node_position, nodes_of; scalar: as
+    `transfer_kernels`.
+
+    The kernels are launched with `threads` for each world and take all nodes of its window, however many threads that is."""
+    vec3 = wp.types.vector(length=3, dtype=scalar)
+    vec4 = wp.types.vector(length=4, dtype=scalar)
+    collide, adj_collide = make_plane_functions(scalar)
+    fade, memory = make_fade(scalar), node_access(scalar)
+    load3, load4, store3, store4 = memory.load3, memory.load4, memory.store3, memory.store4
+
+    @wp.func
+    def free_velocity(g: vec4, impulse: vec3):
+        return vec3(g[0], g[1], g[2]) / g[3] + impulse
+
+    @wp.func
+    def node_position(node: int, origin: wp.vec3i, dims: wp.vec3i, dx: scalar):
+        plane = dims[1] * dims[2]
+        i = node / plane
+        j = (node - i * plane) / dims[2]
+        k = node - i * plane - j * dims[2]
+        return dx * vec3(scalar(origin[0] + i), scalar(origin[1] + j), scalar(origin[2] + k))
+
+    @wp.func
+    def touch(y: vec3, planes: wp.array2d(dtype=scalar), i: int):
+        """Weight of plane i's contact of a node at y."""
+        normal = vec3(planes[i, 0], planes[i, 1], planes[i, 2])
+        w, _slope = fade(wp.dot(y, normal) - planes[i, 3], planes[i, 5])
+        return w
+
+    @wp.func
+    def contact(
+        u: vec3, y: vec3, planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int
+    ):
+        """Velocity after the first `count` planes."""
+        r = u
+        for i in range(count):
+            w = touch(y, planes, i)
+            if w > scalar(0.0):
+                hit = collide(r, vec3(planes[i, 0], planes[i, 1], planes[i, 2]), modes[i], planes[i, 4])
+                if w < scalar(1.0):
+                    r = r + w * (hit - r)
+                else:
+                    r = hit
+        return r
+
+    @wp.func
+    def adj_contact(
+        u: vec3, y: vec3, planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int, seed: vec3
+    ):
+        a = seed
+        for reverse in range(count):
+            i = count - 1 - reverse
+            w = touch(y, planes, i)
+            if w > scalar(0.0):
+                before = contact(u, y, planes, modes, i)
+                normal = vec3(planes[i, 0], planes[i, 1], planes[i, 2])
+                a = (scalar(1.0) - w) * a + adj_collide(before, normal, modes[i], planes[i, 4], w * a)
+        return a
+
+    @wp.func
+    def nodes_of(window: wp.array(dtype=wp.vec3i), world: int):
+        """(first, last + 1) of a world's nodes in the arrays."""
+        dims = window[3 * world + 1]
+        first = window[3 * world + 2][0]
+        return first, first + dims[0] * dims[1] * dims[2]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def clear(window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4)):
+        z = scalar(0.0)
+        world = wp.tid() / threads
+        first, end = nodes_of(window, world)
+        for node in range(first + wp.tid() - world * threads, end, threads):
+            store4(grid, node, vec4(z, z, z, z))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def grid_update(
+        window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4), impulses: wp.array(dtype=vec3), cutoff: scalar,
+        dx: scalar, planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int,
+        velocity: wp.array(dtype=vec4),
+    ):  # fmt: skip
+        world = wp.tid() / threads
+        origin = window[3 * world]
+        dims = window[3 * world + 1]
+        impulse = impulses[world]
+        first, end = nodes_of(window, world)
+        for node in range(first + wp.tid() - world * threads, end, threads):
+            g = load4(grid, node)
+            u = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
+            if g[3] > cutoff:
+                u = free_velocity(g, impulse)
+                if count > 0:
+                    u = contact(u, node_position(node - first, origin, dims, dx), planes, modes, count)
+            store3(velocity, node, u)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def adj_grid(
+        window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4), impulses: wp.array(dtype=vec3), cutoff: scalar,
+        dx: scalar, planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int,
+        adj_velocity: wp.array(dtype=vec4), adj_grid: wp.array(dtype=vec4),
+    ):  # fmt: skip
+        world = wp.tid() / threads
+        origin = window[3 * world]
+        dims = window[3 * world + 1]
+        impulse = impulses[world]
+        first, end = nodes_of(window, world)
+        for node in range(first + wp.tid() - world * threads, end, threads):
+            g = load4(grid, node)
+            if g[3] > cutoff:
+                u = free_velocity(g, impulse)
+                a = load3(adj_velocity, node)
+                if count > 0:
+                    a = adj_contact(u, node_position(node - first, origin, dims, dx), planes, modes, count, a)
+                a = a / g[3]
+                # v = p/m: dL/dm = -a.(p/m)/m
+                store4(adj_grid, node, vec4(a[0], a[1], a[2], -(a[0] * g[0] + a[1] * g[1] + a[2] * g[2]) / g[3]))
+            else:
+                z = scalar(0.0)
+                store4(adj_grid, node, vec4(z, z, z, z))
+
+    return SimpleNamespace(
+        clear=clear, grid_update=grid_update, adj_grid=adj_grid, node_position=node_position, nodes_of=nodes_of
+    )
