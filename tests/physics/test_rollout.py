@@ -374,7 +374,7 @@ def test_a_tape_of_many_more_nodes_than_particles_is_not_kept_beyond_its_room(ma
     kept, forward = [], SegmentSolver.advance
 
     def spied(self, *args, **more):
-        kept.append(self.room)
+        kept.append(self.budget.room)
         return forward(self, *args, **more)
 
     monkeypatch.setattr(SegmentSolver, "advance", spied)

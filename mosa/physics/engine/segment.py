@@ -46,11 +46,7 @@ class HeldSegment(Stretch):
             final, reaction, windows, tape = solver.advance(
                 state, held, poses or None, self.substeps, self.first, self.steps, kept
             )
-            size = sum(t.nbytes for t in tape)
-            if size > solver.room:  # windows of more nodes than `substep_bytes` knows of
-                tape, size = [], 0
-            solver.room -= size
-            return final, reaction, Kept(windows, tape)
+            return final, reaction, Kept(windows, solver.budget.keep(tape))
 
         finals, reactions, kept = zip(*self.lanes.each(_kind("advance", others), run, *self._parts(state, others)))
         states = [final if self.plastic else final[:-1] for final in finals]
@@ -64,7 +60,7 @@ class HeldSegment(Stretch):
             poses = poses or None
             work = solver.prepare(state, held, poses, self.substeps, kept.windows, with_adjoint=True, steps=self.steps)
             tape = kept.take()
-            solver.room += sum(t.nbytes for t in tape)
+            solver.budget.used(tape)
             if tape:
                 work.rewind(tape)
             else:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import SimulationDiverged
-from mosa.physics.engine.budget import substep_bytes
+from mosa.physics.engine.budget import Budget, substep_bytes
 from mosa.physics.engine.numerics import Numerics, State, Steps
 from mosa.physics.engine.workspace import Workspace
 from mosa.physics.grid.transfer_kernels import INVERTED, NO_EVENT, NONFINITE, OUTSIDE, WINDOW
@@ -29,7 +29,7 @@ class SegmentSolver:
     (N,) [kg/m^3]; cutoff: node mass [kg].
 
     workspaces: by shape, those that it has while it runs (`Buffers.workspaces`).
-    room: bytes for the states of all substeps, between the passes; segments that do not fit are run again in the backward pass.
+    budget: for the states of all substeps, between the passes; segments that do not fit are run again in the backward pass.
     gravities: of every world [m/s^2], among which the particles are shared in equal parts; None: one world with the numerics' own.
     first_world: number of the first one, for messages, None where there is but one.
     """
@@ -41,7 +41,7 @@ class SegmentSolver:
         self.numerics, self.volume, self.cutoff = numerics, volume, cutoff
         self.mass = density * volume
         self.workspaces: dict[tuple, Workspace] = {}
-        self.room = 0.0
+        self.budget = Budget()
         self.gravities = tuple(gravities) if gravities is not None else (numerics.gravity,)
         self._first_world = first_world
         self._known: tuple | None = None
@@ -71,9 +71,8 @@ class SegmentSolver:
         return work
 
     def advance(
-        self, state: State, held: dict, poses, substeps: int, first: int, steps: Steps | None = None,
-        kept: bool = False,
-    ) -> tuple[tuple, tuple, tuple, list[Tensor]]:  # fmt: skip
+        self, state: State, held: dict, poses, substeps: int, first: int, steps: Steps | None = None, kept: bool = False
+    ) -> tuple[State, tuple, tuple, list[Tensor]]:
         """(state after `substeps`, reactions (force, torque) of the colliders or (), grid windows used, `Workspace.tape`).
 
         first: number of the first substep, for messages; steps: their times, the numerics' dt by default; kept: whether to make
@@ -152,7 +151,7 @@ class SegmentSolver:
 
     def has_room(self, substeps: int) -> bool:
         """Whether the states of so many substeps may be kept."""
-        return substeps * substep_bytes(self.numerics, len(self.volume)) <= self.room
+        return substeps * substep_bytes(self.numerics, len(self.volume)) <= self.budget.room
 
     def bounds(self, state: State) -> np.ndarray:
         """`extent` (W, 12) of every world's x and v, without a transfer where `look` has told it."""
