@@ -108,12 +108,24 @@ def _round_robin(windows: Windows, frames: list[int], generator: torch.Generator
     return draw
 
 
-class _Objective:
-    """Loss of a batch: images of the carriers, elastic energy of the scaffold, bending energy of the amplitudes."""
+@dataclass(frozen=True)
+class Predicted:
+    """A motion from which energies are counted. coefficients: (T, K, 3) [m] of the modes; inverse: (T, N, 3, 3) of its deformation
+    gradients at the scaffold's particles."""
 
-    def __init__(self, motion: Motion, carried: Scaffold, scaffold: Scaffold, background: Tensor, settings: DynamicSettings):
+    coefficients: Tensor
+    inverse: Tensor
+
+
+class Objective:
+    """Loss of a batch: images of the carriers, elastic energy of the scaffold, bending energy of the amplitudes.
+
+    predicted: a motion in which neither energy is stored; None: the body at rest."""
+
+    def __init__(self, motion: Motion, carried: Scaffold, scaffold: Scaffold, background: Tensor, settings: DynamicSettings,
+                 predicted: Predicted | None = None):
         self.motion, self.carried, self.scaffold = motion, carried, scaffold
-        self.background, self.settings = background, settings
+        self.background, self.settings, self.predicted = background, settings, predicted
         self.refining = False
 
     def __call__(self, frames: Tensor, batch: Windows, state: Tensor) -> Tensor:
@@ -133,7 +145,8 @@ class _Objective:
         if settings.elastic > 0:
             loss = loss + settings.elastic * elastic_energy(self._deformation(frames, sample), settings.poisson)
         if settings.bending > 0 and isinstance(self.motion, ModalMotion):
-            c = self.motion.coefficients(frames) / self.motion.reach
+            c = self.motion.coefficients(frames)
+            c = (c if self.predicted is None else c - self.predicted.coefficients[frames]) / self.motion.reach
             curvature = (self.scaffold.modes.energy[:, None] * c**2).sum((-2, -1))
             if self.refining and settings.bending_scale > 0:  # what a frame shows sets its own weight
                 curvature = settings.bending_scale * torch.log1p(curvature / settings.bending_scale)
@@ -141,15 +154,16 @@ class _Objective:
         return loss
 
     def _deformation(self, frames: Tensor, sample: MotionSample) -> Tensor:
-        if self.carried is self.scaffold:
+        if self.carried is self.scaffold and self.predicted is None:
             return sample.deformation
         if isinstance(self.motion, ModalMotion):
-            return self.motion.displacement(frames, self.scaffold.modes)[1]
+            deformation = self.motion.displacement(frames, self.scaffold.modes)[1]
+            return deformation if self.predicted is None else deformation @ self.predicted.inverse[frames]
         return self.motion(frames, self.scaffold.splats, None, self.scaffold.around).deformation
 
 
-def _minimise(
-    objective: _Objective,
+def minimise(
+    objective: Objective,
     optimizer: torch.optim.Optimizer,
     frames: list[int],
     windows: Windows,
@@ -196,13 +210,13 @@ def fit_motion(
     moving = list(range(1, len(offsets)))
     if settings.model == "modes":
         motion = ModalMotion(offsets, scaffold.modes.energy, reach=reach, free_shape=settings.free_shape)
-        objective = _Objective(motion, carried, scaffold, background, settings)
+        objective = Objective(motion, carried, scaffold, background, settings)
         for t in moving:
             with torch.no_grad():
                 motion.amplitude[t] = motion.amplitude[t - 1]
             # a fresh optimiser per frame: frames without a gradient and without momentum stay where they are
             optimizer = UniformAdam(motion.parameters(), lr=settings.lr_track, betas=(0.8, 0.95))
-            _minimise(
+            minimise(
                 objective,
                 optimizer,
                 [t],
@@ -226,9 +240,9 @@ def fit_motion(
                 basis_layers=settings.basis_layers,
                 coefficient_layers=settings.coefficient_layers,
             ).to(background.device)
-        objective = _Objective(motion, carried, scaffold, background, settings)
+        objective = Objective(motion, carried, scaffold, background, settings)
         rate = settings.lr_network
         optimizer = torch.optim.Adam(motion.parameters(), lr=rate, betas=(0.9, 0.99), eps=1e-12)
     objective.refining = True
-    _minimise(objective, optimizer, moving, windows, settings.iterations, settings.views, rate, generator, progress)
+    minimise(objective, optimizer, moving, windows, settings.iterations, settings.views, rate, generator, progress)
     return motion

@@ -23,6 +23,7 @@ from mosa.reconstruction.dynamic import Scaffold, fit_motion
 from mosa.reconstruction.filling import Particles, body_volume, fill
 from mosa.reconstruction.geometry import Geometry, find_geometry
 from mosa.reconstruction.hull import Volume, hull_bounds, hull_centroid, visual_hull
+from mosa.reconstruction.informed import informed_motion
 from mosa.reconstruction.initial import inherited_colors
 from mosa.reconstruction.modes import deformation_modes
 from mosa.reconstruction.observed import Windows, object_windows
@@ -147,7 +148,7 @@ def _tensors(splats: Splats) -> dict[str, Tensor]:
 
 def _motion_settings(settings: ReconstructionSettings) -> dict[str, Any]:
     """What particles and their motion depend on."""
-    return {name: value for name, value in asdict(settings).items() if name != "carried"}
+    return {name: value for name, value in asdict(settings).items() if name not in ("carried", "informed")}
 
 
 def imported_splats(path: str, scene: Scene) -> Appearance:
@@ -255,7 +256,7 @@ def reconstruct(
     elif settings.carried.iterations == 0:
         appearance = Appearance(static, constant_coefficients(static.colors))
     else:  # a folder of its own: nothing else depends on its settings
-        apart = _open_cache(cache_dir, scene, asdict(settings), seed, **more)
+        apart = _open_cache(cache_dir, scene, _motion_settings(settings) | {"carried": asdict(settings.carried)}, seed, **more)
         parts = apart.stage("carried", carried_stage)
         colored = {name: parts.pop(name) for name in ("harmonics", "normals", "light")}
         appearance = Appearance(Splats(**parts), **colored)
@@ -336,6 +337,50 @@ def scaffold_splats(particles: Particles, static: Splats, device: torch.device |
     )
 
 
+def _moving_parts(
+    scene: Scene, splats: Splats, static: Splats, settings: ReconstructionSettings
+) -> tuple[Tensor, Scaffold, Scaffold, float]:
+    """What the motion of particles is fitted with: (T, 3) hulls' centres [m], the particles and what carries their images with
+    the modes at both, and the body's radius [m]."""
+    views, frames, dynamic = scene.training_cameras, scene.training_frames, settings.dynamic
+    cameras = scene.cameras.select(views)
+    centres = list(threaded(lambda t: hull_centroid(scene.mattes[views, t], cameras, scene.box), frames))
+    around = neighbourhood(splats.means, neighbours=settings.neighbours)
+    modes = deformation_modes(splats.means, around, count=dynamic.modes)
+    reach = float((splats.means - splats.means.mean(0)).norm(dim=1).max())
+    scaffold = carried = Scaffold(splats, modes, around)
+    if dynamic.carriers == "static":
+        carried = Scaffold(static, modes.at(static.means, splats.means))
+    return torch.stack(centres).to(splats.means), scaffold, carried, reach
+
+
+def inform(
+    scene: Scene,
+    reconstruction: Reconstruction,
+    predicted: Tensor,
+    *,
+    settings: ReconstructionSettings,
+    seed: int = 0,
+    device: torch.device | str = "cpu",
+    progress: bool = True,
+) -> MotionCues:
+    """Cues of the training frames once more, about what a simulation predicts (`informed`).
+
+    reconstruction: of `scene`; predicted: (T, N, 3) [m] of its particles. Nothing is cached: the prediction is a run's own.
+    """
+    splats, static = reconstruction.splats.to(device), reconstruction.static.to(device)
+    windows = object_windows(scene, scene.training_cameras, scene.training_frames, margin=settings.margin).to(device)
+    centres, scaffold, carried, reach = _moving_parts(scene, splats, static, settings)
+    seen, background = reconstruction.cues.positions.to(splats.means), scene.background.to(device)
+    title = f"motion of {scene.sequence} about the prediction"
+    with tqdm(total=settings.informed.iterations, desc=title, disable=not progress, leave=False) as steps:
+        motion = informed_motion(scaffold, carried, windows, centres, background, predicted.to(seen), seen, settings.informed,
+                                 settings.dynamic, reach=reach, seed=seed, progress=steps.update)
+    with torch.no_grad():
+        sample = motion(torch.arange(len(centres), device=splats.means.device), splats, scaffold.modes, scaffold.around)
+    return neighbourhood_cues(sample.positions, sample.covariances, scaffold.around)
+
+
 def _motion(
     scene: Scene,
     splats: Splats,
@@ -348,17 +393,10 @@ def _motion(
     cache: StageCache,
 ) -> dict[str, Tensor]:
     """Positions, covariances and, where free, shapes of the particles in every training frame."""
-    views, frames = scene.training_cameras, scene.training_frames
-    cameras, dynamic = scene.cameras.select(views), settings.dynamic
-    centres = list(threaded(lambda t: hull_centroid(scene.mattes[views, t], cameras, scene.box), frames))
-    centres = torch.stack(centres).to(splats.means)
-    around = neighbourhood(splats.means, neighbours=settings.neighbours)
-    modes = deformation_modes(splats.means, around, count=dynamic.modes)
-    reach = float((splats.means - splats.means.mean(0)).norm(dim=1).max())
+    frames, dynamic = scene.training_frames, settings.dynamic
+    centres, scaffold, carried, reach = _moving_parts(scene, splats, static, settings)
+    modes, around = scaffold.modes, scaffold.around
     total = dynamic.iterations + (dynamic.track_iterations * (len(frames) - 1) if dynamic.model == "modes" else 0)
-    scaffold = carried = Scaffold(splats, modes, around)
-    if dynamic.carriers == "static":
-        carried = Scaffold(static, modes.at(static.means, splats.means))
     with bar("motion", total) as steps:
         motion = fit_motion(
             scaffold, carried, windows, centres, background, dynamic, reach=reach, seed=seed, progress=steps.update

@@ -10,6 +10,7 @@ from mosa.errors import ConfigError
 from mosa.reconstruction.carried import CarriedSettings
 from mosa.reconstruction.dynamic import DynamicSettings
 from mosa.reconstruction.geometry import GeometrySettings
+from mosa.reconstruction.informed import InformedSettings
 from mosa.reconstruction.static import FitSettings, StaticSettings
 
 
@@ -33,6 +34,7 @@ class ReconstructionSettings:
     appearance: FitSettings = field(default_factory=lambda: FitSettings(keep=1.0))
     dynamic: DynamicSettings = field(default_factory=DynamicSettings)
     carried: CarriedSettings = field(default_factory=CarriedSettings)
+    informed: InformedSettings = field(default_factory=InformedSettings)
 
     def __post_init__(self) -> None:
         if self.cue not in ("neighbourhood", "gaussian"):
@@ -62,7 +64,7 @@ def build_settings(**keys: Any) -> ReconstructionSettings:
     """Settings from the plain keys of conf/reconstruction; ConfigError names an unknown key."""
     keys = dict(keys)
     sections = {"geometry": GeometrySettings, "static": StaticSettings, "appearance": FitSettings, "dynamic": DynamicSettings,
-                "carried": CarriedSettings}  # fmt: skip
+                "carried": CarriedSettings, "informed": InformedSettings}  # fmt: skip
     for name, cls in sections.items():
         if name in keys:
             keys[name] = _section(cls, keys[name] or {}, f"reconstruction.{name}")

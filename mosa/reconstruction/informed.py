@@ -1,0 +1,90 @@
+"""The motion once more, informed by a simulation: where images do not say how a body moved, it moved as the law predicts.
+
+The first reconstruction knows no mechanics. Its elastic and bending energies pull every frame towards the body at rest, which is
+wrong wherever images are too weak to answer: limbs that truly bend come out straighter, and a law that is identified from them
+too stiff. Once a backbone is calibrated, its rollout is the better guess: the motion starts from the predicted shapes, each laid
+rigidly onto what was seen of its frame, and the same energies are counted from there. What images do say is followed as before;
+what they do not say then tells nothing against the backbone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from mosa.errors import ConfigError
+from mosa.reconstruction.cues import polar
+from mosa.reconstruction.dynamic import DynamicSettings, Objective, Predicted, Scaffold, minimise
+from mosa.reconstruction.motion import ModalMotion
+from mosa.reconstruction.observed import Windows
+from mosa.reconstruction.uniform_adam import UniformAdam
+
+
+@dataclass(frozen=True)
+class InformedSettings:
+    """iterations: 0 for never; views: of every frame in each; lr: its step in units of the object's radius; elastic, bending:
+    weights of the energies, counted from the prediction, as in `DynamicSettings`."""
+
+    iterations: int = 150
+    views: int = 1
+    lr: float = 0.01
+    elastic: float = 0.3
+    bending: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.iterations < 0:
+            raise ConfigError(f"reconstruction.informed.iterations: expected a number >= 0, found {self.iterations}")
+
+
+def laid_onto(predicted: Tensor, seen: Tensor) -> Tensor:
+    """Positions (T, N, 3) [m], moved rigidly, frame by frame, to where they are nearest to `seen` (Kabsch's rotation)."""
+    centre, target = predicted.mean(1, keepdim=True), seen.mean(1, keepdim=True)
+    rotation, _ = polar((seen - target).mT @ (predicted - centre))
+    return (predicted - centre) @ rotation.mT + target
+
+
+def project(motion: ModalMotion, scaffold: Scaffold, positions: Tensor) -> None:
+    """Set the amplitudes to those whose particles are nearest to positions (T, N, 3) [m], frame by frame."""
+    values, rest = scaffold.modes.values, scaffold.splats.means
+    away = positions - rest - motion.offsets[:, None]
+    # columns of the modes are orthogonal, of squared length N
+    coefficients = torch.einsum("nk,tnd->tkd", values, away) / len(rest)
+    with torch.no_grad():
+        motion.amplitude.copy_(coefficients / motion.unit[:, None])
+
+
+def informed_motion(
+    scaffold: Scaffold,
+    carried: Scaffold,
+    windows: Windows,
+    offsets: Tensor,
+    background: Tensor,
+    predicted: Tensor,
+    seen: Tensor,
+    settings: InformedSettings,
+    dynamic: DynamicSettings,
+    *,
+    reach: float,
+    seed: int,
+    progress: Callable[[int], None] | None = None,
+) -> ModalMotion:
+    """Motion through all frames of `windows`, about predicted shapes of the body; else as `fit_motion`.
+
+    predicted, seen: (T, N, 3) [m] positions of the particles, a simulation's and those that were found without one.
+    """
+    motion = ModalMotion(offsets, scaffold.modes.energy, reach=reach)
+    project(motion, scaffold, laid_onto(predicted, seen))
+    every = torch.arange(len(offsets), device=offsets.device)
+    with torch.no_grad():
+        deformation = motion.displacement(every, scaffold.modes)[1]
+        about = Predicted(motion.coefficients(every).clone(), torch.linalg.inv(deformation))
+    weights = replace(dynamic, elastic=settings.elastic, bending=settings.bending, bending_scale=0.0)
+    objective = Objective(motion, carried, scaffold, background, weights, about)
+    optimizer = UniformAdam(motion.parameters(), lr=settings.lr)
+    generator = torch.Generator().manual_seed(seed)
+    minimise(objective, optimizer, every[1:].tolist(), windows, settings.iterations, settings.views, settings.lr, generator,
+             progress)
+    return motion
