@@ -90,7 +90,7 @@ def checkpoints(folder: Path) -> Iterator[Attack]:
         torch.save(content, folder / "a.ckpt")
         Twin.load(folder / "a.ckpt").simulate(frames=2)
 
-    bad = {"subprocess.Popen", "os.system", "builtins.eval", "mosa.twin.save_parts", "mosa.modules.body.Body", 5, ("a",)}
+    bad = {"subprocess.Popen", "os.system", "builtins.eval", "mosa.rollout_file.save_parts", "mosa.modules.body.Body", 5, ("a",)}
     changes = [(f"{config}.cfg.adapter", {"_target_": name, "args": ["touch", str(target)]}) for name in bad]
     changes += [(f"{config}.cfg.{key}", "${oc.env:HOME}/x") for key in ("scene.cache", "scene.path", "prior.law", "seed")]
     changes += [(f"{config}.{key}", ...) for key in ("cfg", "world", "density", "dx", "frame_dt", "cfg.prior", "cfg.adapter",

@@ -15,12 +15,14 @@ from mosa import metrics
 from mosa.analysis.anisotropy import stiffest_axis
 from mosa.analysis.stiffness import angle_between, stiffest
 from mosa.analysis.vibration import GROWTH_LIMIT, vibration_growth
+from mosa.data.sequences import load_sequences
 from mosa.errors import SimulationDiverged
 from mosa.modules.body import VARIANTS, Body, Start, World
 from mosa.modules.carried_splats import seen
 from mosa.modules.hyperelastic import HyperelasticAdapter
 from mosa.modules.material import material_states
 from mosa.progress import tqdm
+from mosa.reconstruction.starts import first_contact
 from mosa.rendering.cameras import crop_boxes
 from mosa.threads import threaded
 from mosa.types import Rollout, Scene
@@ -37,6 +39,17 @@ class Sequence:
     scene: Scene
     start: Start
     contact: int
+
+
+def sequences(body: Body, training: Scene, others: list[Scene], found: Mapping[str, Start]) -> list[Sequence]:
+    """found: start by prefix, in the order of the sequences."""
+    return [Sequence(p, s, start, first_contact(body, start, s)) for (p, start), s in zip(found.items(), [training, *others])]
+
+
+def run_sequences(config: Mapping, body: Body) -> list[Sequence]:
+    """The sequences that the run of a checkpoint's `config` was evaluated on, read again. Errors: ConfigError, DataError."""
+    found = {prefix: Start.read(written, body.rest) for prefix, written in config["starts"].items()}
+    return sequences(body, *load_sequences(config["cfg"]["scene"]), found)
 
 
 @torch.no_grad()

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from mosa import losses, parallel
+from mosa.config import build_criterion, build_identification, build_stages, build_world
 from mosa.data.datamodule import Observations
 from mosa.errors import ConfigError, MosaError, SimulationDiverged
-from mosa.modules.adapter import pool
+from mosa.modules.adapter_base import pool
 from mosa.modules.body import Body, Start, World
 from mosa.modules.criteria import Criterion
 from mosa.modules.gauss_newton import Posterior
@@ -80,6 +81,16 @@ class LitMosa(Restorable, L.LightningModule):
         self.saved_identification: dict | None = None  # its state in the checkpoint that the fit goes on from
         self.posterior: Posterior | None = None
         self.compared: dict[str, float] = {}  # mean distance [m] of the calibrated candidates for the backbone
+
+    @classmethod
+    def from_config(cls, config: dict, body: Body, *, takes: Sequence[Take | None], background: Tensor) -> LitMosa:
+        """The module that fits `body` in the stages of a run. config: what a checkpoint keeps (`mosa.config.run_config`); takes:
+        what it learns from, none where it is only used. Errors: ConfigError naming the key."""
+        cfg = config["cfg"]
+        stages = build_stages(cfg["fit"], body.heterogeneity, body.adapter)
+        return cls(body, takes=takes, world=build_world(config["world"]), background=background, stages=stages,
+                   weights=cfg["losses"], clip=cfg["fit"]["clip"], config=config, criterion=build_criterion(cfg),
+                   settings=build_identification(cfg))
 
     # ---------------------------------------------------------------- state
     @property
