@@ -21,6 +21,7 @@ from mosa.modules.identification import IdentificationSettings, few_numbers
 from mosa.modules.material import Material
 from mosa.modules.stages import Stage
 from mosa.modules.stiffness_modes import StiffnessModes
+from mosa.modules.terms import check_terms
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.contact.colliders import colliders_from_config, domain_walls
 from mosa.physics.contact.motion import Motion
@@ -146,6 +147,7 @@ def rehearse(cfg: Mapping[str, Any]) -> None:
     build_stages(cfg["fit"], heterogeneity, adapter, bool(material.candidates))
     build_criterion(cfg)
     build_identification(cfg)
+    check_terms(cfg["losses"])
     if not any(cfg["losses"].get(name) for name in ("image", "mask", "flow", "rotation", "stretch", "position")):
         raise ConfigError("losses: expected a weight above 0 for image, mask, flow, rotation, stretch or position: nothing else "
                           "tells the prior anything")

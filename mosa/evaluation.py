@@ -95,6 +95,8 @@ def image_metrics(images: Tensor, scene: Scene, cameras: list[int], frames: list
         for name, pair in (("crop", (seen[crop], real[crop])), ("full", (seen, real))):
             found[f"psnr_{name}"].append(metrics.psnr(*pair))
             found[f"ssim_{name}"].append(metrics.ssim(*pair))
+            for own, metric in metrics.IMAGE_METRICS.items():
+                found.setdefault(f"{own}_{name}", []).append(metric.function(*pair))
     return {name: float(np.mean(values)) for name, values in found.items()}
 
 
@@ -118,6 +120,7 @@ def motion_metrics(
     else:
         target = true_motion(body, sequence.scene) if target is None else target
         result = {"rms_m": metrics.rms(x[after], target[after])}
+        result |= {name: metric.function(x[after], target[after]) for name, metric in metrics.MOTION_METRICS.items()}
         pairs = [(x[t], truth.positions[t]) for t in after]
     each = list(threaded(lambda pair: metrics.chamfer_distances(*pair, samples=samples), pairs))
     result |= {name: float(np.mean([found[name] for found in each])) for name in each[0]}

@@ -12,6 +12,7 @@ from mosa.config import plain, rehearse
 from mosa.data.agreement import lines_of_sight, misses
 from mosa.data.splat_files import check_formats
 from mosa.errors import ConfigError, DataError
+from mosa.extensions import registered_keys
 from mosa.known import check_known, conf_folder
 from mosa.limits import machine_memory
 from mosa.modules.body import Body, Start, World
@@ -29,7 +30,7 @@ FEWEST = 8
 def check_configuration(values: Mapping[str, Any]) -> None:
     """All that train.py's configuration says by itself. Errors: ConfigError naming the key."""
     if (conf := conf_folder()) is not None:
-        check_known(values, conf, "train", TRAINING, EVALUATION)
+        check_known(values, conf, "train", TRAINING, EVALUATION, registered_keys(values))
     check(values, TRAINING, EVALUATION)
     if values["simulation"]["particles"] != "auto":
         check_particles("simulation.particles", values["simulation"]["particles"])
@@ -46,7 +47,7 @@ def check_evaluation(values: Mapping[str, Any]) -> None:
 def check_splats(values: Mapping[str, Any]) -> None:
     """All that the configuration of `python -m mosa.splats` says by itself. Errors: ConfigError naming the key."""
     if (conf := conf_folder()) is not None:
-        check_known(values, conf, "splats", SPLATS)
+        check_known(values, conf, "splats", SPLATS, registered_keys(values))
     check(values, SPLATS)
     check_formats(values["formats"])
     if values["simulation"]["particles"] != "auto":

@@ -17,6 +17,7 @@ from mosa.config import build_world, plain, world_config
 from mosa.costs import Costs, before_data, estimate
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation import sequences
+from mosa.extensions import load_extensions
 from mosa.fitting import fit, fit_estimate
 from mosa.guards import check_begin, check_configuration, check_evaluation, check_seen, check_starts, evaluated_scene
 from mosa.loggers import chosen, log_outcome
@@ -62,6 +63,7 @@ class Clock:
 def train(cfg: DictConfig) -> float | None:
     """Run everything `cfg` asks for; returns the figure a sweep optimises. Errors: MosaError of whatever was wrong."""
     quiet()
+    load_extensions(plain(cfg).get("extensions"))
     check_configuration(plain(cfg))
     chosen(plain(cfg.logger))
     L.seed_everything(cfg.seed, verbose=False)
@@ -128,6 +130,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     if OmegaConf.is_missing(cfg, "ckpt_path"):
         raise ConfigError("ckpt_path: expected the checkpoint of a run, found none; "
                           "python eval.py ckpt_path=<run folder>/checkpoints/last.ckpt")
+    load_extensions(plain(cfg).get("extensions"))
     check_evaluation(plain(cfg))
     folder = run_folder()
     twin = Twin.load(cfg.ckpt_path, named_device(cfg.device))

@@ -83,6 +83,7 @@ FIGURES = ("train", "test", "camera", "prior", "prior_eta", "id", "id_prior", "f
 TRAINING: dict[str, Kind] = {
     **{name: SECTION for name in SECTIONS},
     "seed": whole(0, 2**32 - 1),
+    "extensions": or_null(NAMES),
     "scene.also_train": or_null(SEQUENCES),
     "scene.test": or_null(SEQUENCES),
     "fit.views": COUNT,
@@ -213,6 +214,7 @@ EVALUATION: dict[str, Kind] = {
 }
 SIMULATION: dict[str, Kind] = {
     **{name: SECTION for name in ("simulate", "evaluation")},
+    "extensions": or_null(NAMES),
     "ckpt_path": TEXT,
     "cache": or_null(TEXT),
     "plan": or_null(whole(2)),
@@ -228,6 +230,7 @@ SIMULATION: dict[str, Kind] = {
 }
 SPLATS: dict[str, Kind] = {
     **{key: kind for key, kind in BODY.items() if key.split(".")[0] in ("seed", "prior", "simulation", "adapter", "heterogeneity")},
+    "extensions": or_null(NAMES),
     "ply": TEXT,
     "ckpt_path": or_null(TEXT),
     "device": TEXT,

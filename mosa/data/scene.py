@@ -19,7 +19,16 @@ FORMATS = {
     "transforms": "mosa.data.transforms:load_transforms",
     "builtin": "mosa.data.builtin:load_builtin",
 }
-"""Format -> module:function. A new format is one function (path=..., the keys it needs) -> Scene and one line here."""
+"""Format -> module:function. A new format is one function (path=..., the keys it needs) -> Scene and one line here, or a call of
+`register_format` from another package."""
+
+
+def register_format(name: str, place: str) -> None:
+    """Make a data format known by the name in scene.format. place: module:function, imported when a configuration asks for it.
+
+    Errors: ConfigError if another format has the name."""
+    if FORMATS.setdefault(name, place) != place:
+        raise ConfigError(f"scene.format: there is a format {name!r} already; choose another name")
 
 
 def load_scene(

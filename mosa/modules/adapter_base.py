@@ -18,7 +18,8 @@ class OperatorStatistics(NamedTuple):
     """Of one or more evaluations, with gradients: what penalties and reports are made of.
 
     mean_abs_C: over particles, the four matrices and all entries of |C|. mean, within: (48,) mean and variance over particles
-    (after `pool`: over evaluations too) of each entry of C_x, C_y, C_z, C_xyz (36), L_pre (6), L_post (6).
+    (after `pool`: over evaluations too) of each entry of C_x, C_y, C_z, C_xyz (36), L_pre (6), L_post (6). Of an adapter without
+    these: of the entries that it notes.
     """
 
     mean_abs_C: Tensor
@@ -57,7 +58,7 @@ class Adapter(nn.Module):
         super().__init__()
         self.register_buffer("E_ref", torch.tensor(float("nan")))
         self.register_buffer("poisson", torch.tensor(float("nan")))
-        self._last: tuple[Tensor, Tensor, Tensor] | None = None
+        self._last: tuple[Tensor, Tensor, Tensor] | Tensor | None = None
 
     replaces_law = False
     """Whether nothing of the prior is left in the answer: its stage then holds the prior's parameters, which would only drift."""
@@ -108,10 +109,18 @@ class Adapter(nn.Module):
         if not self.is_on:
             raise ConfigError("adapter: no reference modulus; call switch_on(E) with the calibrated prior's before simulating")
 
+    def note(self, entries: Tensor) -> None:
+        """Keep what the answer departs from the prior by, (N, K) dimensionless numbers that are 0 at the prior: penalties and
+        reports (`statistics`) are made of them."""
+        self._last = entries
+
     def statistics(self) -> OperatorStatistics:
         """Of the last `forward`, with its graph. Errors: ConfigError before the first."""
         if self._last is None:
             raise ConfigError("adapter: statistics are those of the last evaluation, and there was none yet")
+        if isinstance(self._last, Tensor):
+            mean = self._last.mean(0)
+            return OperatorStatistics(self._last.abs().mean(), mean, (self._last - mean).square().mean(0))
         C, pre, post = self._last
         if C.shape[-1] == 12:  # the fused kernels leave the numbers that the matrices are made of
             C = microplane.correction(C)

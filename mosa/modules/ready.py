@@ -80,7 +80,12 @@ class Ready:
         if len(counts) > 1 or any(part.timing for part in parts):
             raise ConfigError(f"worlds: expected the same fixed substeps in all, found {counts}; give substeps")
         each = [part.arguments for part in parts]
-        parameters = {name: torch.stack([own["parameters"][name].expand(n) for own in each]) for name in each[0]["parameters"]}
+        sizes = first.simulator.law.parameters
+        parameters = {
+            name: torch.stack([value.expand(n) if sizes[name] == 1 else value.reshape(-1, sizes[name]).expand(n, -1)
+                               for value in (own["parameters"][name] for own in each)])
+            for name in each[0]["parameters"]
+        }  # fmt: skip
         adapters = None if each[0]["adapter"] is None else [own["adapter"] for own in each]
         return replace(
             first, state=ParticleState.stack([part.state for part in parts]), lift=torch.stack([part.lift for part in parts]),

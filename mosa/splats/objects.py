@@ -21,6 +21,7 @@ from torch import Tensor
 from mosa.config import build_body, build_world, plain
 from mosa.data.splats import load_ply
 from mosa.errors import ConfigError, DataError
+from mosa.extensions import load_extensions
 from mosa.guards import check_splats
 from mosa.modules.body import Body, Start
 from mosa.modules.carried_splats import CarriedSplats
@@ -174,6 +175,7 @@ def drop(cfg: DictConfig) -> None:
     if OmegaConf.is_missing(cfg, "ply"):
         raise ConfigError("ply: expected a 3DGS PLY file of an object, found none; python -m mosa.splats ply=object.ply")
     values, folder = plain(cfg), run_folder()
+    load_extensions(values.get("extensions"))
     check_splats(values)
     found = read_object(cfg.ply, box=values["box"], opacity=cfg.opacity, size=cfg.size)
     law = values if cfg.ckpt_path is None else Twin.load(cfg.ckpt_path)
