@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
+from mosa.keys import EVALUATION, TRAINING
 from omegaconf import OmegaConf
 
 from mosa.config import build_body, build_world, rehearse
@@ -30,7 +31,7 @@ from mosa.modules.body import Start
 from mosa.npz import read_npz, write_npz
 from mosa.physics.contact.mesh import field_of_mesh
 from mosa.reconstruction.cache import StageCache
-from mosa.schema import EVALUATION, TRAINING, check
+from mosa.schema import check
 from mosa.twin import Twin
 
 ROOT = Path(__file__).parents[1]

@@ -33,6 +33,8 @@ LAW_OPTIONS = ("yield_convention", "norm_eps", "rebuild", "on_inversion", "init_
 """Arguments of `Simulator` that say how a law is taken."""
 
 
+SIZES = ("particles", "particles_per_cell", "dx")
+"""Keys of `simulation` that say how fine the body is: the reconstruction's."""
 HETEROGENEITY = {"modes": StiffnessModes, "network": HeterogeneityField}
 """heterogeneity.kind."""
 
@@ -103,9 +105,8 @@ def build_simulation(config: Mapping[str, Any], dx: float) -> SimulationSettings
     if config["stride"] > config["max_substeps"]:
         raise ConfigError(f"simulation.stride: expected at most simulation.max_substeps={config['max_substeps']}, as a frame has "
                           f"whole strides, found {config['stride']}")
-    names = ("stride", "max_substeps", "courant", "precision", "contact_offset")
-    newer = (name for name in ("adaptive", "min_substeps") if name in config)  # than some checkpoints
-    return SimulationSettings(dx=dx, **{name: config[name] for name in (*names, *newer)})
+    # whose grid is given as dx
+    return known_keys("simulation", SimulationSettings, {k: v for k, v in config.items() if k not in SIZES} | {"dx": dx})
 
 
 def build_prior(config: Mapping[str, Any]) -> tuple[Material, dict[str, Any]]:

@@ -13,12 +13,13 @@ from mosa.data.agreement import lines_of_sight, misses
 from mosa.data.splat_files import check_formats
 from mosa.errors import ConfigError, DataError
 from mosa.extensions import registered_keys
+from mosa.keys import EVALUATION, SIMULATION, SPLATS, TRAINING
 from mosa.known import check_known, conf_folder
 from mosa.limits import machine_memory
 from mosa.modules.body import Body, Start, World
 from mosa.physics.contact.colliders import colliders_from_config
 from mosa.physics.contact.overlap import check_clear
-from mosa.schema import EVALUATION, SIMULATION, SPLATS, TRAINING, check
+from mosa.schema import check
 from mosa.twin import Twin
 from mosa.types import Scene
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mosa import losses, parallel
+from mosa.checkpoints import VERSION
 from mosa.config import build_criterion, build_identification, build_stages, build_world
 from mosa.data.datamodule import Observations
 from mosa.errors import ConfigError, MosaError, SimulationDiverged
@@ -94,7 +95,7 @@ class LitMosa(Restorable, L.LightningModule):
         return self.stages[self.stage_index] if self.stage_index < len(self.stages) else None
 
     def on_save_checkpoint(self, checkpoint: dict) -> None:
-        checkpoint["mosa"] = {"config": self.config, "stage": self.stage_index, "losses": list(self.losses),
+        checkpoint["mosa"] = {"version": VERSION, "config": self.config, "stage": self.stage_index, "losses": list(self.losses),
                               "steps_done": self.steps_done, "particles": len(self.body.rest), "misfit": self.misfit,
                               "start": self.takes[0].start.written(),
                               "identification": self.identification.state() if self.identification else None,

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass
 
-from mosa.errors import ConfigError
+from mosa.schema import FLAG, POSITIVE, Kind, check_knobs, is_number, knob, number, whole
+
+PRECISION = Kind("32 or 64 (16 bits cannot carry an MPM)", lambda v: is_number(v) and v in (32, 64))
 
 
 @dataclass(frozen=True)
@@ -12,27 +14,18 @@ class SimulationSettings:
     """dx [m]; `stride`: substeps between evaluations of the networks; `max_substeps` per frame; `precision`: 32 | 64;
     `adaptive`: choose the substeps of each frame from the state at its start, at least `min_substeps` (`adaptive_steps.py`)."""
 
-    dx: float
-    stride: int = 8
-    max_substeps: int = 400
-    courant: float = 0.6
-    precision: int = 32
-    contact_offset: bool = True
-    adaptive: bool = False
-    min_substeps: int = 1
+    dx: float = knob(MISSING, POSITIVE)
+    stride: int = knob(8, whole(1, 10**6))
+    max_substeps: int = knob(400, whole(1, 10**6))
+    courant: float = knob(0.6, number(0, 1, above=True))  # beyond, an explicit step is unstable
+    precision: int = knob(32, PRECISION)
+    contact_offset: bool = knob(True, FLAG)
+    adaptive: bool = knob(False, FLAG)
+    min_substeps: int = knob(1, whole(1, 10**6))
 
     def strides(self, least: int) -> int:
         """Substeps of the fewest whole strides that are at least `least`."""
         return self.stride * -(-least // self.stride)
 
     def __post_init__(self) -> None:
-        if self.precision not in (32, 64):
-            raise ConfigError(f"simulation.precision: expected 32 or 64, found {self.precision!r}: 16 bits cannot carry an MPM")
-        for name, low in (("stride", 1), ("max_substeps", 1), ("min_substeps", 1)):
-            value = getattr(self, name)
-            if not (isinstance(value, int) and not isinstance(value, bool) and value >= low):
-                raise ConfigError(f"simulation.{name}: expected a whole number of at least {low}, found {value!r}")
-        for name in ("dx", "courant"):
-            value = getattr(self, name)
-            if not (isinstance(value, (int, float)) and value > 0):
-                raise ConfigError(f"simulation.{name}: expected a positive number, found {value!r}")
+        check_knobs(self, "simulation")

@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from mosa.checkpoints import VERSION
 from mosa.config import build_body, build_world, plain
 from mosa.data.splats import load_ply
 from mosa.errors import ConfigError, DataError
@@ -163,8 +164,9 @@ def save_twin(twin: Twin, path: str | Path) -> Path:
     splats = twin.body.splats
     torch.save({
         "state_dict": {f"body.{k}": v.cpu() for k, v in twin.body.state_dict().items()},
-        "mosa": {"config": {**twin.config, "starts": {"train": written}}, "stage": 0, "losses": [], "steps_done": 0,
-                 "particles": len(twin.body.rest), "start": written, "splats": None if splats is None else splats.written()},
+        "mosa": {"version": VERSION, "config": {**twin.config, "starts": {"train": written}}, "stage": 0, "losses": [],
+                 "steps_done": 0, "particles": len(twin.body.rest), "start": written,
+                 "splats": None if splats is None else splats.written()},
     }, path)  # fmt: skip
     return path
 
