@@ -41,21 +41,31 @@ def assembled(overrides: list[str], device: str):
     import lightning
     from hydra import compose, initialize_config_dir
 
+    with initialize_config_dir(str(Path.cwd() / "conf"), version_base="1.3"):
+        cfg = compose("train", overrides=overrides)
+    lightning.seed_everything(cfg.seed, verbose=False)
+    try:
+        from mosa.assembly import assemble
+    except ModuleNotFoundError:  # a commit to compare with that has no such seam
+        module = assembled_from_parts(cfg, device)
+    else:
+        module = assemble(cfg, device, held_out=False).module
+    return module, list(range(min(cfg.fit.views, len(module.takes[0].observations.cameras))))
+
+
+def assembled_from_parts(cfg, device: str):
+    """The module of f7484c1 and later commits without `mosa.assembly`, by their functions."""
     from mosa import pipeline
     from mosa.config import plain, run_config
     from mosa.rendering.rasterizer import use_backend
 
-    with initialize_config_dir(str(Path.cwd() / "conf"), version_base="1.3"):
-        cfg = compose("train", overrides=overrides)
-    lightning.seed_everything(cfg.seed, verbose=False)
     use_backend(cfg.rendering.backend)
     scene, _ = pipeline.scenes(cfg)
     reconstruction, dx = pipeline.reconstruct_scene(cfg, scene, device)
     config = run_config(plain(cfg), scene, dx)
     body = pipeline.body_of(reconstruction, config).to(device)
     start = pipeline.starts(body, reconstruction, scene, [])["train"]
-    module, _ = pipeline.assemble_fit(cfg, scene, reconstruction, body, start, config, device)
-    return module, list(range(min(cfg.fit.views, len(module.takes[0].observations.cameras))))
+    return pipeline.assemble_fit(cfg, scene, reconstruction, body, start, config, device)[0]
 
 
 class Steps:

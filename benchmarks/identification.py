@@ -22,25 +22,16 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from mosa import pipeline
 from mosa.analysis.stiffness import angle_between, stiffest
-from mosa.config import (
-    build_body,
-    build_criterion,
-    build_identification,
-    build_stages,
-    build_world,
-    plain,
-    run_config,
-)
+from mosa.assembly import assemble
+from mosa.config import build_body
 from mosa.data.builtin.floor import floor_rollout, hidden_of
 from mosa.errors import MosaError
 from mosa.evaluation import true_motion
 from mosa.modules.body import Start
 from mosa.modules.identification import Identification
+from mosa.modules.lit_mosa import LitMosa, Take
 from mosa.modules.residuals import sampled
-from mosa.reconstruction.starts import first_contact
-from mosa.rendering.rasterizer import use_backend
 from mosa.types import MotionCues
 
 CONF = Path(__file__).parents[1] / "conf"
@@ -60,25 +51,20 @@ def rms_mm(away: Tensor) -> float:
 def make(overrides: list[str], folder: Path, device: str) -> Path:
     """The problem of one scene."""
     cfg = configuration(overrides)
-    use_backend(cfg.rendering.backend)
-    torch.manual_seed(cfg.seed)
-    scene, held_out = pipeline.scenes(cfg)
-    reconstruction, dx = pipeline.reconstruct_scene(cfg, scene, device)
-    config = run_config(plain(cfg), scene, dx)
-    body = pipeline.body_of(reconstruction, config).to(device)
-    found = pipeline.starts(body, reconstruction, scene, held_out)
-    chosen, world = sampled(len(body.rest), torch.device("cpu")), build_world(config["world"])
-    sequences = {}
-    for (prefix, start), s in zip(found.items(), [scene, *held_out]):
-        sequences[prefix] = {
-            "start": start.written(), "contact": first_contact(body, start, s), "frames": s.frames,
+    made = assemble(cfg, device)
+    scene, body = made.scene, made.body
+    chosen, sequences = sampled(len(body.rest), torch.device("cpu")), {}
+    for each in made.sequences:
+        s = each.scene
+        sequences[each.prefix] = {
+            "start": each.start.written(), "contact": each.contact, "frames": s.frames,
             "frame_dt": float(s.times[1] - s.times[0]), "truth": true_motion(body, s)[:, chosen].cpu(),
-            "floor": floor_rollout(body, s, world)[:, chosen].cpu(),
+            "floor": floor_rollout(body, s, made.world)[:, chosen].cpu(),
         }  # fmt: skip
-    cues, T, hidden = reconstruction.cues, len(scene.training_frames), hidden_of(scene)
+    cues, T, hidden = made.reconstruction.cues, len(scene.training_frames), hidden_of(scene)
     kept = {name: getattr(cues, name)[:T].cpu() for name in ("positions", "rotation", "stretch", "weight")}
     problem = {
-        "config": config, "rest": body.rest.cpu(), "volume": body.volume.cpu(), "sequences": sequences, "cues": kept,
+        "config": made.config, "rest": body.rest.cpu(), "volume": body.volume.cpu(), "sequences": sequences, "cues": kept,
         "fibre": getattr(hidden, "fibre", None) if getattr(hidden, "ratio", 1) > 1 else None,
         "factor": hidden.factor(body.rest.cpu().float()),
     }  # fmt: skip
@@ -93,7 +79,7 @@ def make(overrides: list[str], folder: Path, device: str) -> Path:
 
 
 def read(path: Path, overrides: list[str], device: str) -> SimpleNamespace:
-    """The body of a problem with the law and the settings of `overrides`, its take and its sequences."""
+    """The module that fits the body of a problem with the law and the settings of `overrides`, and its sequences."""
     problem = torch.load(path, weights_only=True)
     cfg = OmegaConf.to_container(configuration(overrides), resolve=True)
     config = problem["config"] | {"cfg": problem["config"]["cfg"] | {name: cfg[name] for name in LAW}}
@@ -104,9 +90,10 @@ def read(path: Path, overrides: list[str], device: str) -> SimpleNamespace:
     for own in problem["sequences"].values():
         own["start"] = Start.read(own["start"], body.rest)
     train, cues = problem["sequences"]["train"], {k: v.float().to(device) for k, v in problem["cues"].items()}
-    take = SimpleNamespace(start=train["start"], frame_dt=train["frame_dt"], first_contact=train["contact"],
-                           cues=MotionCues(**cues, covariances=torch.zeros(1, device=device)))  # fmt: skip
-    return SimpleNamespace(problem=problem, cfg=config["cfg"], body=body, world=build_world(config["world"]), take=take)
+    take = Take(train["start"], None, MotionCues(**cues, covariances=torch.zeros(1, device=device)), train["frame_dt"],
+                train["contact"])  # without images  # fmt: skip
+    module = LitMosa.from_config(config, body, takes=[take], background=torch.ones(3, device=device))
+    return SimpleNamespace(problem=problem, module=module, body=body)
 
 
 @torch.no_grad()
@@ -114,7 +101,7 @@ def errors(case: SimpleNamespace, **switches: bool) -> dict[str, float]:
     """By sequence, [mm]."""
     chosen, found = sampled(len(case.body.rest), torch.device("cpu")), {}
     for prefix, s in case.problem["sequences"].items():
-        x = case.body.simulate(s["start"], case.world, s["frames"], s["frame_dt"], **switches).x[:, chosen].cpu()
+        x = case.body.simulate(s["start"], case.module.world, s["frames"], s["frame_dt"], **switches).x[:, chosen].cpu()
         found[prefix] = rms_mm((x - s["truth"])[s["contact"] :])
     return found
 
@@ -127,15 +114,14 @@ def held_out(by_sequence: dict[str, float]) -> float:
 def fit(path: Path, overrides: list[str], device: str) -> dict:
     """Calibration and joint stage; the figures of both."""
     began, case = time.perf_counter(), read(path, overrides, device)
-    body, cfg = case.body, case.cfg
-    stages = build_stages(cfg["fit"], body.heterogeneity, body.adapter)
-    arguments = build_criterion(cfg), build_identification(cfg)
-    calibration = Identification(body, [case.take], case.world, stages[0], *arguments)
+    module, body = case.module, case.body
+    stages = module.stages
+    calibration = module.identifying(stages[0])
     calibration.search()
     run(calibration, stages[0].iterations)
     prior = errors(case, with_adapter=False, with_heterogeneity=False)
     body.adapter.switch_on(body.material.reference_modulus(), body.material.poisson())
-    joint = Identification(body, [case.take], case.world, stages[-1], *arguments)
+    joint = module.identifying(stages[-1])
     taken = run(joint, stages[-1].iterations)
     learned = errors(case)
     floor = {k: rms_mm((s["floor"] - s["truth"])[s["contact"] :]) for k, s in case.problem["sequences"].items()}

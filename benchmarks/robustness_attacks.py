@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
+from mosa.keys import EVALUATION, TRAINING
 from omegaconf import OmegaConf
 
 from mosa.config import build_body, build_world, rehearse
@@ -30,7 +31,7 @@ from mosa.modules.body import Start
 from mosa.npz import read_npz, write_npz
 from mosa.physics.contact.mesh import field_of_mesh
 from mosa.reconstruction.cache import StageCache
-from mosa.schema import EVALUATION, TRAINING, check
+from mosa.schema import check
 from mosa.twin import Twin
 
 ROOT = Path(__file__).parents[1]
@@ -90,7 +91,7 @@ def checkpoints(folder: Path) -> Iterator[Attack]:
         torch.save(content, folder / "a.ckpt")
         Twin.load(folder / "a.ckpt").simulate(frames=2)
 
-    bad = {"subprocess.Popen", "os.system", "builtins.eval", "mosa.twin.save_parts", "mosa.modules.body.Body", 5, ("a",)}
+    bad = {"subprocess.Popen", "os.system", "builtins.eval", "mosa.rollout_file.save_parts", "mosa.modules.body.Body", 5, ("a",)}
     changes = [(f"{config}.cfg.adapter", {"_target_": name, "args": ["touch", str(target)]}) for name in bad]
     changes += [(f"{config}.cfg.{key}", "${oc.env:HOME}/x") for key in ("scene.cache", "scene.path", "prior.law", "seed")]
     changes += [(f"{config}.{key}", ...) for key in ("cfg", "world", "density", "dx", "frame_dt", "cfg.prior", "cfg.adapter",

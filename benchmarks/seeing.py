@@ -37,18 +37,17 @@ from torch import Tensor
 
 from mosa.analysis.figures import label, to_uint8
 from mosa.analysis.flow_colors import color_wheel, flow_colors
-from mosa.config import plain, run_config
+from mosa.assembly import Run, assemble
 from mosa.data.footage import read_json
 from mosa.data.scene import under
 from mosa.errors import MosaError
 from mosa.evaluation import image_metrics
 from mosa.modules.observer import Views, observe
-from mosa.pipeline import body_of, reconstruct_scene, scenes
 from mosa.reconstruction.cues import neighbourhood, polar
 from mosa.reconstruction.filling import body_volume
 from mosa.reconstruction.hull import hull_bounds, visual_hull
 from mosa.reconstruction.pipeline import object_geometry
-from mosa.reconstruction.settings import ReconstructionSettings, build_settings
+from mosa.reconstruction.settings import ReconstructionSettings
 from mosa.reconstruction.starts import first_contact, sequence_start
 from mosa.rendering.cameras import crop_boxes, crop_images, project
 from mosa.rendering.covariance import covariance_from
@@ -70,6 +69,7 @@ ASKED = {"iou": 0.97, "volume": 0.05, "gravity": 0.01, "velocity_m_s": 0.01}
 class Seen:
     """A reconstruction and what the held-out camera sees of it. views: one camera; silhouette: (T, H, W) of the bare particles."""
 
+    run: Run
     scene: Scene
     settings: ReconstructionSettings
     result: Reconstruction
@@ -85,14 +85,13 @@ def configuration(overrides: list[str], out: Path, scene: str = BIRD) -> DictCon
 
 def see(cfg: DictConfig) -> Seen:
     """Reconstruct (or take from the cache) and render from the held-out camera."""
-    scene = scenes(cfg)[0]
-    settings = build_settings(**plain(cfg.reconstruction))
-    result, _ = reconstruct_scene(cfg, scene, "cpu")
+    run = assemble(cfg)
+    scene, result = run.scene, run.reconstruction
     camera = scene.cameras.names.index(HELD)
     splats, cues, view = result.splats, result.cues, scene.cameras.select([camera])
     with torch.no_grad():
         views = observe(cues.positions, cues.covariances, splats.opacities, splats.colors, view, scene.background, flow=True)
-    return Seen(scene, settings, result, views, balls(cues.positions, result.volume, view), camera)
+    return Seen(run, scene, run.reconstruction_settings, result, views, balls(cues.positions, result.volume, view), camera)
 
 
 def balls(positions: Tensor, volume: Tensor, view: Cameras, finer: int = 8) -> Tensor:
@@ -180,10 +179,9 @@ def volume_figures(seen: Seen, published: dict) -> dict:
     return result
 
 
-def flight_figures(seen: Seen, cfg: DictConfig, published: dict) -> dict:
+def flight_figures(seen: Seen, published: dict) -> dict:
     """Parabola through the centre of mass over the free frames, and the velocity that learning starts from."""
-    scene, result = seen.scene, seen.result
-    body = body_of(result, run_config(plain(cfg), scene, 2 * result.spacing))
+    scene, result, body = seen.scene, seen.result, seen.run.body
     start = sequence_start(body, result.splats, scene, register=False)
     free = first_contact(body, start, scene)
     weight = (result.volume / result.volume.sum()).double()
@@ -229,7 +227,7 @@ def measure(overrides: list[str], out: Path) -> dict:
     return {
         "overrides": overrides, "width_px": seen.scene.cameras.width, "particles": len(seen.result.volume),
         "spacing_m": seen.result.spacing, "seed": cfg.seed, "held_out": held_out_figures(seen),
-        "volume": volume_figures(seen, published), "flight": flight_figures(seen, cfg, published), "flow": flow_figures(seen),
+        "volume": volume_figures(seen, published), "flight": flight_figures(seen, published), "flow": flow_figures(seen),
         "shadow": shadow_figures(seen),
     }  # fmt: skip
 

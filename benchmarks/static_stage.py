@@ -17,10 +17,10 @@ import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
 
+from mosa.assembly import scenes
 from mosa.config import plain
 from mosa.evaluation import image_metrics
 from mosa.modules.observer import observe
-from mosa.pipeline import scenes
 from mosa.reconstruction.hull import Volume
 from mosa.reconstruction.observed import object_windows
 from mosa.reconstruction.pipeline import object_geometry

@@ -17,10 +17,11 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError, DataError
+from mosa.keys import BODY
 from mosa.limits import machine_memory
 from mosa.rendering.lighting import LIGHT
 from mosa.rendering.spherical_harmonics import DEGREES
-from mosa.schema import BODY, POSITIVE, THREE, WEIGHT, Kind, check, is_number, one_of, or_null, whole
+from mosa.schema import POSITIVE, THREE, WEIGHT, Kind, check, is_number, one_of, or_null, whole
 
 TENSORS = {"rest": (3,), "volume": (), "colors": (3,), "opacities": (), "covariances": (3, 3)}
 """What a body is made of, with the shape for each particle."""
@@ -28,6 +29,8 @@ SPLATS = {"means": (3,), "scales": (3,), "rotations": (4,), "opacities": (), "co
           "normals": (3,)}  # fmt: skip
 BOUND_BYTES = 4000
 """Of a splat while it is bound to its neighbours."""
+VERSION = 1
+"""Of what a run keeps under `mosa` in its checkpoint; grows when a program that knows the one before could not read it."""
 RESUMED = ("epoch", "global_step", "pytorch-lightning_version", "loops", "callbacks", "optimizer_states", "lr_schedulers")
 """What Lightning reads where a fit goes on."""
 NAMED = {"collections OrderedDict", "torch Size", "torch._utils _rebuild_tensor_v2", "torch._utils _rebuild_parameter",
@@ -77,6 +80,11 @@ def read_checkpoint(path: str | Path) -> dict:
     check_containers(checkpoint, path)
     if not isinstance(checkpoint, dict) or "mosa" not in checkpoint:
         raise DataError(f"ckpt_path: {path} was not written by this program (no entry 'mosa')")
+    saved = checkpoint["mosa"]
+    version = saved.get("version", 0) if isinstance(saved, dict) else 0  # 0: of before there were numbers
+    if not whole(0).fits(version) or version > VERSION:
+        raise DataError(f"ckpt_path: {path}: mosa.version: expected at most {VERSION}, found {version!r}: it is of a newer "
+                        "version of this program")
     return checkpoint
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import inspect
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -21,19 +21,20 @@ from mosa.modules.identification import IdentificationSettings, few_numbers
 from mosa.modules.material import Material
 from mosa.modules.stages import Stage
 from mosa.modules.stiffness_modes import StiffnessModes
+from mosa.modules.terms import check_terms
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.contact.colliders import colliders_from_config, domain_walls
 from mosa.physics.contact.motion import Motion
 from mosa.physics.contact.planes import Plane
+from mosa.reconstruction.settings import build_settings
 from mosa.types import Ground, Scene
-
-if TYPE_CHECKING:
-    from mosa.modules.lit_mosa import LitMosa
 
 LAW_OPTIONS = ("yield_convention", "norm_eps", "rebuild", "on_inversion", "init_affine")
 """Arguments of `Simulator` that say how a law is taken."""
 
 
+SIZES = ("particles", "particles_per_cell", "dx")
+"""Keys of `simulation` that say how fine the body is: the reconstruction's."""
 HETEROGENEITY = {"modes": StiffnessModes, "network": HeterogeneityField}
 """heterogeneity.kind."""
 
@@ -104,9 +105,8 @@ def build_simulation(config: Mapping[str, Any], dx: float) -> SimulationSettings
     if config["stride"] > config["max_substeps"]:
         raise ConfigError(f"simulation.stride: expected at most simulation.max_substeps={config['max_substeps']}, as a frame has "
                           f"whole strides, found {config['stride']}")
-    names = ("stride", "max_substeps", "courant", "precision", "contact_offset")
-    newer = (name for name in ("adaptive", "min_substeps") if name in config)  # than some checkpoints
-    return SimulationSettings(dx=dx, **{name: config[name] for name in (*names, *newer)})
+    # whose grid is given as dx
+    return known_keys("simulation", SimulationSettings, {k: v for k, v in config.items() if k not in SIZES} | {"dx": dx})
 
 
 def build_prior(config: Mapping[str, Any]) -> tuple[Material, dict[str, Any]]:
@@ -136,8 +136,6 @@ def build_heterogeneity(config: Mapping[str, Any], low: Tensor, high: Tensor) ->
 
 def rehearse(cfg: Mapping[str, Any]) -> None:
     """Build what needs no data and drop it: a mistake then shows before the reconstruction. Errors: ConfigError naming the key."""
-    from mosa.reconstruction.settings import build_settings
-
     build_settings(**cfg["reconstruction"])
     low, high = torch.zeros(3), torch.ones(3)
     with torch.random.fork_rng(devices=[]):
@@ -150,6 +148,7 @@ def rehearse(cfg: Mapping[str, Any]) -> None:
     build_stages(cfg["fit"], heterogeneity, adapter, bool(material.candidates))
     build_criterion(cfg)
     build_identification(cfg)
+    check_terms(cfg["losses"])
     if not any(cfg["losses"].get(name) for name in ("image", "mask", "flow", "rotation", "stretch", "position")):
         raise ConfigError("losses: expected a weight above 0 for image, mask, flow, rotation, stretch or position: nothing else "
                           "tells the prior anything")
@@ -176,17 +175,6 @@ def build_adapter(config: Mapping[str, Any]) -> torch.nn.Module | None:
     if build is None:
         return None
     return known_keys("adapter", build, {k: v for k, v in config.items() if k not in ("name", "_target_")})
-
-
-def build_fit(config: Mapping[str, Any], body: Body, *, takes: Sequence, background: Tensor) -> LitMosa:
-    """The module that fits `body` in the stages of a run. takes: what it learns from (`LitMosa`), none where it is only used."""
-    from mosa.modules.lit_mosa import LitMosa
-
-    cfg = config["cfg"]
-    stages = build_stages(cfg["fit"], body.heterogeneity, body.adapter)
-    return LitMosa(body, takes=takes, world=build_world(config["world"]), background=background, stages=stages,
-                   weights=cfg["losses"], clip=cfg["fit"]["clip"], config=config, criterion=build_criterion(cfg),
-                   settings=build_identification(cfg))
 
 
 def build_criterion(cfg: Mapping[str, Any]) -> Criterion:

@@ -13,24 +13,22 @@ import resource
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
-from mosa.config import build_body, build_fit, run_config
+from mosa.config import build_body, run_config
 from mosa.data.agreement import lines_of_sight, misses
 from mosa.errors import ConfigError, MosaError
 from mosa.limits import machine_memory
 from mosa.modules.body import Body, Start, World
+from mosa.modules.lit_mosa import LitMosa
 from mosa.physics.engine.budget import KEPT_ON_CPU
 from mosa.prediction import DRAWS
 from mosa.reconstruction.observed import object_windows
 from mosa.reconstruction.resolution import grid_spacing
 from mosa.rendering.rasterizer import rasterize
 from mosa.types import Cameras, Scene
-
-if TYPE_CHECKING:
-    from mosa.modules.lit_mosa import LitMosa
 
 BASE = 1.15e9
 """Bytes of a process on a CPU with its libraries and kernels, without data."""
@@ -287,7 +285,8 @@ def estimate(cfg: Mapping[str, Any], scene: Scene, others: int, taught: int, dev
     window = windows.images.shape[1] * windows.images.shape[2]
     with torch.random.fork_rng(devices=[]):
         body = body_like(cfg, scene, min(size.particles, MEASURED), radius)
-        module = build_fit(run_config(dict(cfg), scene, body.settings.dx), body, takes=[None] * taught, background=scene.background)
+        config = run_config(dict(cfg), scene, body.settings.dx)
+        module = LitMosa.from_config(config, body, takes=[None] * taught, background=scene.background)
         try:
             frame_dt = float(scene.times[1] - scene.times[0])
             frame = speed_of_rollouts(body.to(device), frame_dt, scene.gravity, scene.up) * max(1.0, size.particles / MEASURED)

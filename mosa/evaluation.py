@@ -15,12 +15,14 @@ from mosa import metrics
 from mosa.analysis.anisotropy import stiffest_axis
 from mosa.analysis.stiffness import angle_between, stiffest
 from mosa.analysis.vibration import GROWTH_LIMIT, vibration_growth
+from mosa.data.sequences import load_sequences
 from mosa.errors import SimulationDiverged
 from mosa.modules.body import VARIANTS, Body, Start, World
 from mosa.modules.carried_splats import seen
 from mosa.modules.hyperelastic import HyperelasticAdapter
 from mosa.modules.material import material_states
 from mosa.progress import tqdm
+from mosa.reconstruction.starts import first_contact
 from mosa.rendering.cameras import crop_boxes
 from mosa.threads import threaded
 from mosa.types import Rollout, Scene
@@ -37,6 +39,17 @@ class Sequence:
     scene: Scene
     start: Start
     contact: int
+
+
+def sequences(body: Body, training: Scene, others: list[Scene], found: Mapping[str, Start]) -> list[Sequence]:
+    """found: start by prefix, in the order of the sequences."""
+    return [Sequence(p, s, start, first_contact(body, start, s)) for (p, start), s in zip(found.items(), [training, *others])]
+
+
+def run_sequences(config: Mapping, body: Body) -> list[Sequence]:
+    """The sequences that the run of a checkpoint's `config` was evaluated on, read again. Errors: ConfigError, DataError."""
+    found = {prefix: Start.read(written, body.rest) for prefix, written in config["starts"].items()}
+    return sequences(body, *load_sequences(config["cfg"]["scene"]), found)
 
 
 @torch.no_grad()
@@ -82,6 +95,8 @@ def image_metrics(images: Tensor, scene: Scene, cameras: list[int], frames: list
         for name, pair in (("crop", (seen[crop], real[crop])), ("full", (seen, real))):
             found[f"psnr_{name}"].append(metrics.psnr(*pair))
             found[f"ssim_{name}"].append(metrics.ssim(*pair))
+            for own, metric in metrics.IMAGE_METRICS.items():
+                found.setdefault(f"{own}_{name}", []).append(metric.function(*pair))
     return {name: float(np.mean(values)) for name, values in found.items()}
 
 
@@ -105,6 +120,7 @@ def motion_metrics(
     else:
         target = true_motion(body, sequence.scene) if target is None else target
         result = {"rms_m": metrics.rms(x[after], target[after])}
+        result |= {name: metric.function(x[after], target[after]) for name, metric in metrics.MOTION_METRICS.items()}
         pairs = [(x[t], truth.positions[t]) for t in after]
     each = list(threaded(lambda pair: metrics.chamfer_distances(*pair, samples=samples), pairs))
     result |= {name: float(np.mean([found[name] for found in each])) for name in each[0]}

@@ -12,12 +12,14 @@ from mosa.config import plain, rehearse
 from mosa.data.agreement import lines_of_sight, misses
 from mosa.data.splat_files import check_formats
 from mosa.errors import ConfigError, DataError
+from mosa.extensions import registered_keys
+from mosa.keys import EVALUATION, SIMULATION, SPLATS, TRAINING
 from mosa.known import check_known, conf_folder
 from mosa.limits import machine_memory
 from mosa.modules.body import Body, Start, World
 from mosa.physics.contact.colliders import colliders_from_config
 from mosa.physics.contact.overlap import check_clear
-from mosa.schema import EVALUATION, SIMULATION, SPLATS, TRAINING, check
+from mosa.schema import check
 from mosa.twin import Twin
 from mosa.types import Scene
 
@@ -29,7 +31,7 @@ FEWEST = 8
 def check_configuration(values: Mapping[str, Any]) -> None:
     """All that train.py's configuration says by itself. Errors: ConfigError naming the key."""
     if (conf := conf_folder()) is not None:
-        check_known(values, conf, "train", TRAINING, EVALUATION)
+        check_known(values, conf, "train", TRAINING, EVALUATION, registered_keys(values))
     check(values, TRAINING, EVALUATION)
     if values["simulation"]["particles"] != "auto":
         check_particles("simulation.particles", values["simulation"]["particles"])
@@ -46,7 +48,7 @@ def check_evaluation(values: Mapping[str, Any]) -> None:
 def check_splats(values: Mapping[str, Any]) -> None:
     """All that the configuration of `python -m mosa.splats` says by itself. Errors: ConfigError naming the key."""
     if (conf := conf_folder()) is not None:
-        check_known(values, conf, "splats", SPLATS)
+        check_known(values, conf, "splats", SPLATS, registered_keys(values))
     check(values, SPLATS)
     check_formats(values["formats"])
     if values["simulation"]["particles"] != "auto":

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 import torch
@@ -11,9 +15,41 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
+from mosa.errors import ConfigError
+
 CHAMFER_SAMPLES, ASSIGNMENT_SAMPLES = 8192, 2048
 RIDGE = 1e-3
 """Of the local fit's slopes, relative to the neighbourhood's own size."""
+
+
+class Metric(NamedTuple):
+    """A figure of every model on every sequence. function: of (T, N, 3) and (T, N, 3) [m], a model's and the true positions after
+    first contact; or of (T, H, W, 3) and (T, H, W, 3), its images and the real ones of one camera. label: of its rows in
+    results.md, which show it times `scale` with so many digits."""
+
+    function: Callable[[Tensor, Tensor], float]
+    label: str
+    scale: float = 1.0
+    digits: int = 3
+
+
+MOTION_METRICS: dict[str, Metric] = {}
+"""Figure `<part>/<name>` -> metric of the motion, beside those that `mosa.evaluation` always has."""
+IMAGE_METRICS: dict[str, Metric] = {}
+"""Figures `<part>/<name>_crop` and `<part>/<name>_full` -> metric of the images, likewise."""
+
+
+def register_metric(name: str, metric: Metric, *, images: bool = False) -> None:
+    """Make a metric known; it is evaluated with the others, and has its rows in results.md. images: of images, not of the motion.
+
+    Errors: ConfigError if another metric has the name."""
+    known = IMAGE_METRICS if images else MOTION_METRICS
+    if re.fullmatch(r"\w+", name) is None or name in RESERVED or known.setdefault(name, metric) != metric:
+        raise ConfigError(f"metric {name!r}: expected a name of letters and digits that no figure has yet; choose another one")
+
+
+RESERVED = ("rms_m", "cd_m", "emd_m", "psnr", "ssim", "mean_abs_C")
+"""What `mosa.evaluation` computes itself."""
 
 
 # --- motion ---------------------------------------------------------------------------------------------------------

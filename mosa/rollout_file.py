@@ -1,4 +1,4 @@
-"""Rollouts as npz files of plain numbers: motion, velocities, and what colliders did and felt (docs/figures.md)."""
+"""Motions as npz files of plain numbers: rollouts, what colliders did and felt, what was seen, what is true (docs/figures.md)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from mosa.npz import write_npz
 from mosa.physics.contact.colliders import Collider
 from mosa.physics.contact.motion import Motion, Trajectory, rotation_matrices
-from mosa.types import Rollout
+from mosa.types import MotionCues, Rollout
 
 
 def save_rollout(path: str | Path, parts: Mapping[str, Rollout], colliders: Sequence[Collider] = ()) -> None:
@@ -48,3 +48,24 @@ def pose(motion: Motion | Trajectory, frames: int, frame_dt: float) -> tuple[Ten
         index = (torch.arange(frames) * (len(motion.position) // max(frames - 1, 1))).clamp(max=len(motion.position) - 1)
         return motion.position.detach().double().cpu()[index], rotation_matrices(motion.rotation, 1).detach().double().cpu()[index]
     return motion.timed(max(frames - 1, 1), frame_dt).sample(frames, 1, frame_dt)[:2]
+
+
+def save_observed(path: str | Path, parts: Mapping[str, MotionCues]) -> None:
+    """npz with x [T, N, 3] and covariances [T, N, 3, 3] of the motions learned from, under `<name>/...` as `save_rollout`."""
+    save_parts(path, {name: {"x": cues.positions, "covariances": cues.covariances} for name, cues in parts.items()})
+
+
+def save_spread(path: str | Path, parts: Mapping[str, Tensor]) -> None:
+    """npz with sd [T, N], the predicted standard deviation of every particle's position [m], under `<name>/sd`."""
+    save_parts(path, {name: {"sd": sd.float()} for name, sd in parts.items()})
+
+
+def save_truth(path: str | Path, parts: Mapping[str, Tensor]) -> None:
+    """npz with x [T, N, 3], single precision, where the body's particles would truly be, under `<name>/...` as `save_rollout`."""
+    save_parts(path, {name: {"x": x.float()} for name, x in parts.items()})
+
+
+def save_parts(path: str | Path, parts: Mapping[str, dict[str, Tensor]]) -> None:
+    """npz of the tensors under `<name>/<key>`."""
+    arrays = {f"{name}/{key}": t for name, tensors in parts.items() for key, t in tensors.items()}
+    write_npz(path, {key: t.detach().cpu().numpy() for key, t in arrays.items()})

@@ -7,6 +7,7 @@ import logging
 import math
 import platform
 import resource
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,8 +23,22 @@ from mosa.modules.body import Body, Start
 
 log = logging.getLogger(__name__)
 
+MOST_PARTICLES = {"cpu": 6000, "cuda": 30000}
+"""Of simulation.particles=auto: what a machine identifies in the time that a user waits for a first result."""
 SPECIAL = {"Infinity": math.inf, "-Infinity": -math.inf, "NaN": math.nan}
 """Figures that JSON has no numbers for, as strings that float() and JavaScript's Number() read."""
+
+
+def run_folder() -> Path:
+    """Of the job that Hydra runs."""
+    return Path(HydraConfig.get().runtime.output_dir)
+
+
+def quiet() -> None:
+    """Keep library chatter off the screen; errors and our own output stay."""
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", module="lightning.*")
 
 
 def write_figures(folder: Path, figures: dict[str, float | str]) -> None:
@@ -93,6 +108,11 @@ def named_device(name: str) -> str:
         reason = str(error).splitlines()[0]
         raise ConfigError(f"device: expected cpu, or cuda on a machine with a GPU, found {name!r} ({reason})") from error
     return name
+
+
+def most_particles(device: torch.device | str) -> int:
+    """Of simulation.particles=auto."""
+    return MOST_PARTICLES["cpu" if str(device) == "cpu" else "cuda"]
 
 
 def device_label(name: str) -> str:

@@ -1,5 +1,7 @@
 """Every combination of the config groups composes, and a switch changes what it names and nothing else."""
 
+import re
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -10,8 +12,13 @@ from omegaconf import OmegaConf
 
 from mosa.config import build_adapter, build_stages, rehearse
 from mosa.errors import ConfigError
-from mosa.modules.body import SimulationSettings
-from mosa.schema import EVALUATION, SIMULATION, TRAINING, check
+from mosa.keys import EVALUATION, SIMULATION, TRAINING
+from mosa.modules.simulation_settings import SimulationSettings
+from mosa.modules.stages import Stage
+from mosa.reconstruction.carried import CarriedSettings
+from mosa.reconstruction.geometry import GeometrySettings
+from mosa.reconstruction.static import FitSettings, StaticSettings
+from mosa.schema import check
 
 ROOT = Path(__file__).parents[1]
 
@@ -195,3 +202,20 @@ def test_an_ablation_changes_the_switch_it_names_and_nothing_else(name):
 def test_an_experiment_is_what_its_overrides_are(name, overrides):
     assert composed(f"experiment={name}") == composed(*overrides) != composed()
     assert composed(f"experiment={name}", "seed=3", "prior=stvk")["prior"]["law"] == composed("prior=stvk")["prior"]["law"]
+
+
+@pytest.mark.parametrize("settings", [SimulationSettings, Stage, FitSettings, StaticSettings, CarriedSettings, GeometrySettings])
+def test_a_knob_is_written_once(settings):
+    """Its default is of its kind, the check of a configuration has the same kind, and the settings refuse what that refuses."""
+    given = {"dx": 0.1, "name": "joint", "iterations": 3, "lr": 0.1}
+    given = {name: value for name, value in given.items() if name in {f.name for f in fields(settings)}}
+    made, known = settings(**given), set(map(id, TRAINING.values()))
+    knobs = [f for f in fields(settings) if "kind" in f.metadata]
+    assert len(knobs) >= 2
+    for f in knobs:
+        kind = f.metadata["kind"]
+        assert kind.fits(getattr(made, f.name)) and (id(kind) in known or f.name == "dx"), f.name
+        wrong = object()
+        assert not kind.fits(wrong)
+        with pytest.raises(ConfigError, match=rf"\.{f.name}: expected {re.escape(kind.described)}, found <object"):
+            settings(**{**given, f.name: wrong})

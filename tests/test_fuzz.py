@@ -19,9 +19,10 @@ from mosa.config import rehearse
 from mosa.data.export import export_pacnerf, export_transforms
 from mosa.data.scene import load_scene
 from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
+from mosa.keys import EVALUATION, TRAINING
 from mosa.known import check_known
 from mosa.npz import read_npz, write_npz
-from mosa.schema import EVALUATION, TRAINING, check
+from mosa.schema import check
 from mosa.twin import Twin
 
 DEFAULT = functools.cache(lambda: composed("debug=default", "world.walls={mode: separate}"))

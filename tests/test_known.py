@@ -12,8 +12,8 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from mosa.errors import ConfigError
+from mosa.keys import EVALUATION, SIMULATION, TRAINING
 from mosa.known import check_known, paths, tree_of
-from mosa.schema import EVALUATION, SIMULATION, TRAINING
 
 ROOT = Path(__file__).parents[1]
 CONF = ROOT / "conf"

@@ -20,7 +20,7 @@ from mosa.errors import ConfigError, DataError
 from mosa.guards import check_splats
 from mosa.reconstruction.filling import body_volume
 from mosa.reconstruction.shell import blocked, solid_of
-from mosa.splats import object_twin, read_object, save_twin
+from mosa.splats.objects import object_twin, read_object, save_twin
 from mosa.twin import Twin
 from mosa.types import Appearance, Splats
 

@@ -20,7 +20,8 @@ from mosa.modules.carried_splats import CarriedSplats
 from mosa.modules.heterogeneity import HeterogeneityField
 from mosa.modules.material import Material
 from mosa.physics.contact.colliders import domain_walls
-from mosa.twin import Twin, save_observed, save_rollout
+from mosa.rollout_file import save_observed, save_rollout
+from mosa.twin import Twin
 from mosa.types import Appearance, MotionCues, Rollout, Splats
 
 N, T, SEEN = 27, 5, 3

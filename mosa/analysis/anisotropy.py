@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError, SimulationDiverged
-from mosa.modules.adapter import Adapter
+from mosa.modules.adapter_base import Adapter
 from mosa.modules.microplane import MANDEL
 from mosa.physics.engine.adapter_interface import MaterialState
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from mosa.analysis.anisotropy import in_double
-from mosa.modules.adapter import Adapter
+from mosa.modules.adapter_base import Adapter
 from mosa.physics.constitutive.elasticity import wave_modulus
 from mosa.physics.contact.colliders import Box, Collider
 from mosa.physics.contact.motion import Motion

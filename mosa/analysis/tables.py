@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from mosa.metrics import IMAGE_METRICS, MOTION_METRICS
+
 MODELS = (("floor", "floor/"), ("prior", "prior/"), ("prior + eta", "prior_eta/"), ("adapted", ""))
 UNITS = {"rms_m": ("rms [mm]", 1e3, 2),
          "cd_m": ("CD [mm]", 1e3, 2), "emd_m": ("EMD [mm]", 1e3, 1), "psnr_crop": ("PSNR crop", 1, 2),
@@ -11,11 +13,14 @@ UNITS = {"rms_m": ("rms [mm]", 1e3, 2),
 
 
 def results_table(figures: Mapping[str, float], metrics=("rms_m", "cd_m", "psnr_crop", "ssim_crop")) -> str:
-    """Markdown table of floor, prior, prior + eta and adapted on each training and each held-out sequence."""
+    """Markdown table of floor, prior, prior + eta and adapted on each training and each held-out sequence, of these metrics and
+    those that were registered."""
     sequences = [s for s in _sequences(figures)]
     rows = []
-    for metric in metrics:
-        label, scale, digits = UNITS[metric]
+    units = UNITS | {name: own[1:] for name, own in MOTION_METRICS.items()}
+    units |= {f"{name}_crop": own[1:] for name, own in IMAGE_METRICS.items()}
+    for metric in (*metrics, *(name for name in units if name not in UNITS)):
+        label, scale, digits = units[metric]
         for name, prefix in MODELS:
             values = [figures.get(f"{prefix}{s}/{metric}") for s in sequences]
             if any(v is not None for v in values):

@@ -9,7 +9,7 @@ import torch
 
 from mosa.analysis.anisotropy import in_double
 from mosa.errors import SimulationDiverged
-from mosa.modules.adapter import Adapter
+from mosa.modules.adapter_base import Adapter
 from mosa.modules.material import Material
 from mosa.modules.stiffening import ADAPTER_MARGIN
 from mosa.physics.engine.simulator import Simulator

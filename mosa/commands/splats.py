@@ -14,7 +14,7 @@ from mosa.jobs import attempt, check_arguments
 @hydra.main(version_base="1.3", config_path=configuration(), config_name="splats")
 def run(cfg: DictConfig) -> None:
     def job(cfg: DictConfig) -> None:
-        from mosa.splats import drop
+        from mosa.splats.objects import drop
 
         return drop(cfg)
 

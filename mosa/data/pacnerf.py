@@ -24,7 +24,7 @@ from mosa.data.footage import (
 )  # fmt: skip
 from mosa.data.images import check_amount, composite, expect_size, fill_holes, read_image, resize, scaled_size
 from mosa.data.matting import matte_from_plate
-from mosa.data.scene import assemble
+from mosa.data.scene_from_footage import scene_from_footage
 from mosa.errors import DataError
 from mosa.types import Scene
 
@@ -168,7 +168,7 @@ def split(file: Path, pixels: np.ndarray, plate: np.ndarray | None) -> tuple[np.
 def load_pacnerf(
     path: str | Path, *, frames=None, scale: float = 1.0, fill_holes: int = 0, name: str | None = None, **world
 ) -> Scene:
-    """Scene of a folder in PAC-NeRF's layout. `world`: the keyword arguments of `mosa.data.scene.assemble`."""
+    """Scene of a folder in PAC-NeRF's layout. `world`: the keyword arguments of `scene_from_footage`."""
     footage = read_pacnerf(path, frames=frames, fps=world.get("fps"), scale=scale, fill=fill_holes)
     folder = Path(path).resolve().name
-    return assemble(footage, name=name or folder, known_parameters=PUBLISHED.get(folder, {}), **world)
+    return scene_from_footage(footage, name=name or folder, known_parameters=PUBLISHED.get(folder, {}), **world)

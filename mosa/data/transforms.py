@@ -25,7 +25,7 @@ from mosa.data.footage import (
 )  # fmt: skip
 from mosa.data.images import check_amount, composite, expect_size, fill_holes, read_image, resize, scaled_size
 from mosa.data.lens import COEFFICIENTS, is_fisheye, lens_of
-from mosa.data.scene import assemble
+from mosa.data.scene_from_footage import scene_from_footage
 from mosa.errors import DataError
 from mosa.types import Scene
 
@@ -260,7 +260,7 @@ def load_transforms(
     name: str | None = None,
     **world,
 ) -> Scene:
-    """Scene of a transforms.json. `world`: the keyword arguments of `mosa.data.scene.assemble`."""
+    """Scene of a transforms.json. `world`: the keyword arguments of `scene_from_footage`."""
     footage = read_transforms(path, frames=frames, fps=fps, scale=scale, fill=fill_holes)
     folder = Path(path).resolve()
-    return assemble(footage, name=name or (folder.parent.name if folder.suffix else folder.name), **world)
+    return scene_from_footage(footage, name=name or (folder.parent.name if folder.suffix else folder.name), **world)

@@ -18,7 +18,16 @@ ADAPTERS = {
     "neuma": "mosa.modules.neuma:LowRankLaw",
     "interaction": "mosa.modules.interaction:InteractionNetwork",
 }
-"""adapter.name -> module:class. A new adapter is one class whose keyword arguments are the keys of its YAML, and one line here."""
+"""adapter.name -> module:class. A new adapter is one class whose keyword arguments are the keys of its YAML, and one line here, or
+a call of `register_adapter` from another package."""
+
+
+def register_adapter(name: str, place: str) -> None:
+    """Make an adapter known by the name in its YAML. place: module:class, imported when a configuration asks for it.
+
+    Errors: ConfigError if another adapter has the name."""
+    if ADAPTERS.setdefault(name, place) != place:
+        raise ConfigError(f"adapter.name: there is an adapter {name!r} already; choose another name")
 
 
 def adapter_class(config: Mapping[str, Any]) -> type[nn.Module] | None:

@@ -6,198 +6,35 @@ One module for fitting, evaluation and later use, so that what is learned is wha
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from functools import partial
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError
 from mosa.modules.carried_splats import CarriedSplats
-from mosa.modules.criteria import corrected_rollout
+from mosa.modules.contact import ContactOffset
 from mosa.modules.heterogeneity import HeterogeneityField
 from mosa.modules.material import Material
+from mosa.modules.ready import Ready
+from mosa.modules.simulation_settings import SimulationSettings
+from mosa.modules.start import Start, World
 from mosa.modules.stiffness_modes import StiffnessModes
-from mosa.physics.contact.colliders import Collider, reach
-from mosa.physics.contact.planes import Plane
-from mosa.physics.engine.adapter_interface import AdapterOperator
+from mosa.physics.contact.colliders import reach
 from mosa.physics.engine.adaptive_steps import StepControl
 from mosa.physics.engine.clock import Adaptive, Replay
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.engine.time_step import required_substeps
 from mosa.rotations import skew
-from mosa.types import Ground, ParticleState, Rollout
+from mosa.types import ParticleState, Rollout
 
 VARIANTS = ("prior", "prior_eta", "adapted")
-
-
-@dataclass(frozen=True)
-class Start:
-    """Initial state of a sequence. rotation: (3, 3) pose Q relative to the rest shape; center: (3,) position of the rest
-    centre [m]; velocity: (3,) [m/s]; angular_velocity: (3,) [rad/s]."""
-
-    rotation: Tensor
-    center: Tensor
-    velocity: Tensor
-    angular_velocity: Tensor
-
-    def written(self) -> dict[str, list]:
-        """Plain containers, fit for a checkpoint; `read` gives the same numbers."""
-        return {f.name: getattr(self, f.name).tolist() for f in fields(self)}
-
-    @classmethod
-    def read(cls, written: Mapping[str, list], like: Tensor | None = None) -> Start:
-        """like: tensor of the device and type wanted, None for the CPU's float32."""
-        found = {name: torch.tensor(value) for name, value in written.items()}
-        return cls(**{name: value if like is None else value.to(like) for name, value in found.items()})
-
-
-@dataclass(frozen=True)
-class World:
-    """What a body falls in. gravity, up: (3,); box: (2, 3) [m]; planes: walls beside the ground; colliders: moving rigid solids."""
-
-    ground: Ground | None
-    gravity: Tensor
-    up: Tensor
-    box: Tensor
-    planes: tuple[Plane, ...] = ()
-    colliders: tuple[Collider, ...] = ()
-
-
-@dataclass(frozen=True)
-class Ready:
-    """A body at its start, and what a simulation of it takes; or, by `stack`, the same in B worlds.
-
-    state: in the simulator's type, higher by `lift` (3,) [m], the contact's offset, than where the body is seen; arguments: of
-    `Simulator.rollout`; timing: of substeps that vary, None where they are fixed.
-    """
-
-    simulator: Simulator
-    state: ParticleState
-    lift: Tensor
-    arguments: dict
-    timing: Adaptive | Replay | None
-
-    def simulate(
-        self, frames: int, colliders: Sequence[Collider] = (), *, collect: Callable | None = None,
-        progress: Callable[[int], None] | None = None, observed: Tensor | None = None, gain: float = 0.0,
-    ) -> Rollout:  # fmt: skip
-        """As `Body.simulate`, from here on; of a stack, the worlds at once (`Simulator.rollout_worlds`), without `collect`."""
-        simulator, stacked = self.simulator, self.state.x.ndim == 3
-        if stacked:
-            roll = partial(simulator.rollout_worlds, **self.arguments, motions=self.motions(colliders))
-        else:
-            roll = partial(simulator.rollout, **self.arguments, collect=collect, motions=self.motions(colliders))
-        lift = self.lift[:, None] if stacked else self.lift
-        if observed is None:
-            timing = {} if self.timing is None else {"timing": self.timing}
-            rollout = roll(self.state, frames=frames, progress=progress, **timing)
-        else:
-            if self.timing:
-                raise ConfigError("simulation.adaptive: expected false where a criterion corrects the prediction frame by frame")
-            seen = (observed[:frames, None] if stacked else observed[:frames]) + lift.detach()
-            rollout = corrected_rollout(roll, self.state, seen.to(self.state.x.dtype), gain, simulator.frame_dt)
-        fields = {name: getattr(rollout, name).to(self.lift.dtype) for name in ("x", "v", "F", "F_tot")}
-        return replace(rollout, **{**fields, "x": fields["x"] - lift})
-
-    def motions(self, colliders: Sequence[Collider]) -> list:
-        """Of the colliders, where the simulator sees them: the offset is the ground's, they keep their place. Of a stack, a list
-        for each world."""
-        if self.lift.ndim > 1:
-            return [[collider.motion.shifted(lift) for collider in colliders] for lift in self.lift]
-        return [collider.motion.shifted(self.lift) for collider in colliders]
-
-    def answered(self) -> Ready:
-        """With the adapter's answer now in place of the adapter, which may become another one. Errors: ConfigError where the
-        operator depends on the state."""
-        adapter = self.arguments["adapter"]
-        if adapter is None:
-            return self
-        if self.arguments["stride"] is not None:
-            raise ConfigError(f"adapter: expected one whose operator is the same in every state, found {type(adapter).__name__}")
-        state, parameters = self.state, self.arguments["parameters"]
-        held = AdapterOperator(*adapter(self.simulator.material_state(state.F, state.C_affine, parameters)))
-        return replace(self, arguments={**self.arguments, "adapter": lambda _: held})
-
-    @classmethod
-    def stack(cls, parts: Sequence[Ready]) -> Ready:
-        """B bodies of the same particles and law, each with its own numbers, `answered`, and start, as so many worlds: state
-        (B, N, ...), lift (B, 3), and arguments of `Simulator.rollout_worlds`. Errors: ConfigError where the time steps differ."""
-        first, n = parts[0], len(parts[0].arguments["volume"])
-        counts = sorted({part.simulator.substeps for part in parts})
-        if len(counts) > 1 or any(part.timing for part in parts):
-            raise ConfigError(f"worlds: expected the same fixed substeps in all, found {counts}; give substeps")
-        each = [part.arguments for part in parts]
-        parameters = {name: torch.stack([own["parameters"][name].expand(n) for own in each]) for name in each[0]["parameters"]}
-        adapters = None if each[0]["adapter"] is None else [own["adapter"] for own in each]
-        return replace(
-            first, state=ParticleState.stack([part.state for part in parts]), lift=torch.stack([part.lift for part in parts]),
-            arguments={**each[0], "parameters": parameters, "adapter": adapters},
-        )  # fmt: skip
 
 
 EVEN = 4
 """Substeps of a frame are a multiple of this at least: each count has buffers and captured graphs of its own, and one that followed
 every change of the modulus would need new ones in nearly every step of a fit."""
-
-
-@dataclass(frozen=True)
-class SimulationSettings:
-    """dx [m]; `stride`: substeps between evaluations of the networks; `max_substeps` per frame; `precision`: 32 | 64;
-    `adaptive`: choose the substeps of each frame from the state at its start, at least `min_substeps` (`adaptive_steps.py`)."""
-
-    dx: float
-    stride: int = 8
-    max_substeps: int = 400
-    courant: float = 0.6
-    precision: int = 32
-    contact_offset: bool = True
-    adaptive: bool = False
-    min_substeps: int = 1
-
-    def strides(self, least: int) -> int:
-        """Substeps of the fewest whole strides that are at least `least`."""
-        return self.stride * -(-least // self.stride)
-
-    def __post_init__(self) -> None:
-        if self.precision not in (32, 64):
-            raise ConfigError(f"simulation.precision: expected 32 or 64, found {self.precision!r}: 16 bits cannot carry an MPM")
-        for name, low in (("stride", 1), ("max_substeps", 1), ("min_substeps", 1)):
-            value = getattr(self, name)
-            if not (isinstance(value, int) and not isinstance(value, bool) and value >= low):
-                raise ConfigError(f"simulation.{name}: expected a whole number of at least {low}, found {value!r}")
-        for name in ("dx", "courant"):
-            value = getattr(self, name)
-            if not (isinstance(value, (int, float)) and value > 0):
-                raise ConfigError(f"simulation.{name}: expected a positive number, found {value!r}")
-
-
-class ContactOffset(nn.Module):
-    """Height [m] by which the grid's contact lies above the ground, learned in units of dx.
-
-    A B-spline grid stops a body a fraction of dx before it touches a wall, by an amount that depends on dx and on the stencil's
-    place; without this one number the stiffness absorbs it, differently on every grid.
-    """
-
-    START = 0.3
-    """Cells the fit starts from; seen on balls, the bird and the rabbit: 0.2 to 0.5. From 0 the fit ends in another valley."""
-    LIMITS = (0.15, 0.55)
-    """What a grid can do; beyond, the number would absorb what the law gets wrong, and so end in that other valley."""
-
-    def __init__(self, dx: float, enabled: bool = True) -> None:
-        super().__init__()
-        self.dx, self.enabled = dx, enabled
-        self.cells = nn.Parameter(torch.tensor(self.START if enabled else 0.0), requires_grad=enabled)
-
-    def forward(self) -> Tensor:
-        return self.dx * self.cells
-
-    @torch.no_grad()
-    def project(self) -> None:
-        """Back within `LIMITS`, after an optimiser's step."""
-        if self.enabled:
-            self.cells.clamp_(*self.LIMITS)
 
 
 class Body(nn.Module):

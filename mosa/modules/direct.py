@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.modules.adapter import Adapter, check_network, rested
+from mosa.modules.adapter import check_network, rested
+from mosa.modules.adapter_base import Adapter
 from mosa.modules.networks import TwoHiddenLayers, zero_outputs
 from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState
 

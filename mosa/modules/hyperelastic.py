@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError
-from mosa.modules.adapter import Adapter, OperatorStatistics
+from mosa.modules.adapter_base import Adapter, OperatorStatistics
 from mosa.modules.microplane import MANDEL, isotropic_stiffness
 from mosa.modules.stiffening import ADAPTER_MARGIN, acoustic_stiffening
 from mosa.physics.constitutive.strain import STRAINS

@@ -27,7 +27,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from mosa.errors import ConfigError, SimulationDiverged
-from mosa.modules.adapter import Adapter
+from mosa.modules.adapter_base import Adapter
 from mosa.modules.networks import TwoHiddenLayers, zero_outputs
 from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState
 from mosa.types import ParticleState, Rollout

@@ -10,9 +10,11 @@ import torch
 from torch import Tensor
 
 from mosa import losses, parallel
+from mosa.checkpoints import VERSION
+from mosa.config import build_criterion, build_identification, build_stages, build_world
 from mosa.data.datamodule import Observations
 from mosa.errors import ConfigError, MosaError, SimulationDiverged
-from mosa.modules.adapter import pool
+from mosa.modules.adapter_base import pool
 from mosa.modules.body import Body, Start, World
 from mosa.modules.criteria import Criterion
 from mosa.modules.gauss_newton import Posterior
@@ -21,11 +23,8 @@ from mosa.modules.material import material_states
 from mosa.modules.observer import deformed_covariances, observe
 from mosa.modules.restorable import Restorable
 from mosa.modules.stages import Stage
+from mosa.modules.terms import MISFIT, Step, check_terms, evaluate_terms
 from mosa.types import MotionCues, Rollout
-
-MISFIT = 0.01
-"""Misfit of the calibrated prior, over the object's size, at which the penalty of the operator has its stated weight."""
-TERMS = ("image", "mask", "flow", "rotation", "stretch", "heterogeneity", "position", "operator", "operator_variance")
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ SIDE_BY_SIDE = 10
 class LitMosa(Restorable, L.LightningModule):
     """Fits a body to one or more sequences in stages: the loss is the mean over them.
 
-    weights: per loss term (`TERMS`; mosa/losses.py); config: plain containers from which `eval.py` rebuilds the run.
+    weights: per loss term (`mosa.modules.terms`); config: plain containers from which `eval.py` rebuilds the run.
     """
 
     def __init__(
@@ -65,9 +64,7 @@ class LitMosa(Restorable, L.LightningModule):
         settings: IdentificationSettings | None = None,
     ) -> None:
         super().__init__()
-        unknown = sorted(set(weights) - set(TERMS))
-        if unknown:
-            raise ConfigError(f"losses: unknown terms {unknown}; known are {', '.join(TERMS)}")
+        check_terms(weights)
         self.automatic_optimization = False
         self.body, self.world, self.takes, self.background = body, world, list(takes), background
         self.stages = list(stages)
@@ -81,6 +78,16 @@ class LitMosa(Restorable, L.LightningModule):
         self.posterior: Posterior | None = None
         self.compared: dict[str, float] = {}  # mean distance [m] of the calibrated candidates for the backbone
 
+    @classmethod
+    def from_config(cls, config: dict, body: Body, *, takes: Sequence[Take | None], background: Tensor) -> LitMosa:
+        """The module that fits `body` in the stages of a run. config: what a checkpoint keeps (`mosa.config.run_config`); takes:
+        what it learns from, none where it is only used. Errors: ConfigError naming the key."""
+        cfg = config["cfg"]
+        stages = build_stages(cfg["fit"], body.heterogeneity, body.adapter)
+        return cls(body, takes=takes, world=build_world(config["world"]), background=background, stages=stages,
+                   weights=cfg["losses"], clip=cfg["fit"]["clip"], config=config, criterion=build_criterion(cfg),
+                   settings=build_identification(cfg))
+
     # ---------------------------------------------------------------- state
     @property
     def stage(self) -> Stage | None:
@@ -88,7 +95,7 @@ class LitMosa(Restorable, L.LightningModule):
         return self.stages[self.stage_index] if self.stage_index < len(self.stages) else None
 
     def on_save_checkpoint(self, checkpoint: dict) -> None:
-        checkpoint["mosa"] = {"config": self.config, "stage": self.stage_index, "losses": list(self.losses),
+        checkpoint["mosa"] = {"version": VERSION, "config": self.config, "stage": self.stage_index, "losses": list(self.losses),
                               "steps_done": self.steps_done, "particles": len(self.body.rest), "misfit": self.misfit,
                               "start": self.takes[0].start.written(),
                               "identification": self.identification.state() if self.identification else None,
@@ -267,37 +274,13 @@ class LitMosa(Restorable, L.LightningModule):
             take.start, self.world, frames, take.frame_dt, with_adapter=adapted, with_heterogeneity=stage.name != "prior",
             collect=collected.append if adapted else None, observed=cues.positions if gain else None, gain=gain,
         )
-        def on(name: str) -> bool:
-            return weights.get(name, 0.0) != 0
-
-        terms: dict[str, Tensor] = {}
+        over_all = pool(collected) if collected else None  # a variance over time as well as over particles
         targets = take.observations.select([v % len(take.observations.cameras) for v in views], frames)
-        if on("image") or on("mask") or on("flow"):
-            seen = observe(rollout.x, deformed_covariances(rollout.F_tot, body.covariances), body.opacities, body.colors,
-                           targets.cameras, self.background, flow=on("flow"))
-            if on("image"):
-                terms["image"] = losses.image_loss(seen.images, targets.images)
-            if on("mask"):
-                terms["mask"] = losses.mask_loss(seen.mattes, targets.mattes)
-            if on("flow"):
-                terms["flow"] = losses.flow_loss(seen.flow, targets.flow, targets.image_width)
-        if on("rotation"):
-            terms["rotation"] = losses.rotation_loss(rollout.F_tot, cues.rotation[:frames], cues.weight[:frames],
-                                                     take.start.rotation)
-        if on("stretch"):
-            terms["stretch"] = losses.stretch_loss(rollout.F_tot, cues.stretch[:frames], cues.weight[:frames])
-        if on("position"):
-            terms["position"] = losses.position_loss(rollout.x, cues.positions[:frames], body.size)
-        if stage.name != "prior" and body.heterogeneity is not None and on("heterogeneity"):
-            terms["heterogeneity"] = losses.heterogeneity_loss(body.heterogeneity(body.rest))
-        if collected:
-            over_all = pool(collected)  # a variance over time as well as over particles
-            if on("operator"):
-                # what the prior leaves unexplained is what there is to learn: the size that one expects of the operator grows with
-                # it, and the pull of a loss that is a distance, not its square, does not fade as it should with a small misfit
-                terms["operator"] = (MISFIT / self.misfit) ** 2 * (over_all.mean_square + 1e-8).sqrt()
-            if on("operator_variance"):
-                terms["operator_variance"] = over_all.variance
+        varies = stage.name != "prior" and body.heterogeneity is not None
+        step = Step(body, take.start, rollout, targets, cues, frames, self.background, varies, over_all, self.misfit,
+                    with_flow=weights.get("flow", 0.0) != 0)
+        terms = evaluate_terms(weights, step)
+        if over_all is not None:
             self.last["mean_abs_C"] = float(over_all.mean_abs_C.detach())
         return terms, rollout
 

@@ -1,4 +1,4 @@
-"""Global parameters of a prior law in unconstrained form: `FORMS` says each one's range."""
+"""Global parameters of a prior law in unconstrained form: `FORMS` says each one's range. A parameter may be a direction."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from mosa.physics.constitutive.laws import law_named
 from mosa.physics.constitutive.plasticity import friction_alpha
 from mosa.physics.engine.adapter_interface import MaterialState
 from mosa.physics.engine.simulator import Simulator
+from mosa.schema import is_number
 
 NU_MAX, ANGLE_MAX = 0.49, 89.0
 AUTO = "auto"
@@ -39,9 +40,40 @@ def _scaled_sigmoid(high: float, held: tuple[float, ...]) -> Form:
     return Form(0.0, high, held, lambda v: _logit(v / high), lambda u: high * torch.sigmoid(u))
 
 
+class Direction:
+    """A unit vector, learned as two angles [rad] about the direction that the fit starts from: `<name>_1` and `<name>_2` turn it
+    along great circles towards two directions across it. Its sign means nothing in a law of fibres, and within 90 degrees of the
+    start lie all lines, so that no line is out of reach."""
+
+    AXES = ("x", "y", "z")
+
+    @staticmethod
+    def coordinates(name: str) -> tuple[str, str]:
+        return f"{name}_1", f"{name}_2"
+
+    @staticmethod
+    def frame(value: Sequence[float]) -> Tensor:
+        """(3, 3) float64: the direction of `value`, (3,), and two unit vectors across it."""
+        axis = torch.tensor([float(v) for v in value], dtype=torch.float64)
+        axis = axis / axis.norm()
+        across = torch.linalg.cross(axis, torch.eye(3, dtype=torch.float64)[int(axis.abs().argmin())])
+        across = across / across.norm()
+        return torch.stack([axis, across, torch.linalg.cross(axis, across)])
+
+    @staticmethod
+    def physical(frame: Tensor, angles: Tensor) -> Tensor:
+        """(3,) unit vector at `angles` (2,) [rad] from frame[0]; smooth at 0."""
+        square = angles.square().sum()
+        small = square < 1e-8  # below, the series is exact to rounding, and the root has no slope
+        safe = torch.where(small, torch.ones_like(square), square).sqrt()
+        sine = torch.where(small, 1 - square / 6, torch.sin(safe) / safe)
+        cosine = torch.where(small, 1 - square / 2, torch.cos(safe))
+        return cosine * frame[0] + sine * (angles @ frame[1:])
+
+
 LOG = Form(0.0, math.inf, (), math.log, torch.exp)
 SOFTPLUS = Form(0.0, math.inf, (0.0,), lambda v: v + math.log(-math.expm1(-v)), nn.functional.softplus)
-FORMS = {
+FORMS: dict[str, Form | Direction] = {
     "E": LOG, "mu": LOG, "kappa": LOG, "yield_stress": LOG, "viscosity": SOFTPLUS, "cohesion": SOFTPLUS,
     "nu": _scaled_sigmoid(NU_MAX, (0.0, NU_MAX)), "friction_angle": _scaled_sigmoid(ANGLE_MAX, (0.0, ANGLE_MAX)),
 }  # fmt: skip
@@ -51,10 +83,18 @@ GIVES = {"E": ("mu", "lam"), "nu": (), "friction_angle": ("friction_alpha",)}
 STIFFNESS = ("E", "mu", "kappa")
 
 
+def register_form(name: str, form: Form | Direction) -> None:
+    """Give a parameter of a law with a new name its range: `LOG` (positive, in its logarithm), `SOFTPLUS` (positive or held at 0),
+    a `Form` of one's own, or `Direction()`. Errors: ConfigError if the name has another range already."""
+    if FORMS.setdefault(name, form) != form and not isinstance(form, Direction):
+        raise ConfigError(f"parameter {name!r} has a range already; choose another name")
+
+
 class Material(nn.Module):
     """Parameters of one prior law.
 
-    law: name in `mosa.physics`; parameters: initial physical values (SI, friction_angle in degrees); frozen: names that are not
+    law: name in `mosa.physics`; parameters: initial physical values (SI, friction_angle in degrees; of a direction three numbers of
+    any length); frozen: names that are not
     learned; modulated: names the heterogeneity factor multiplies, by default the stiffness (E, or mu and kappa together).
     candidates: laws among which a calibration chooses, with law=auto; until then it is the first.
     A parameter that starts on a bound of its range is held there.
@@ -62,8 +102,8 @@ class Material(nn.Module):
     """
 
     def __init__(
-        self, law: str, parameters: Mapping[str, float], frozen: Sequence[str] = (), modulated: Sequence[str] | None = None,
-        candidates: Sequence[str] = (),
+        self, law: str, parameters: Mapping[str, float | Sequence[float]], frozen: Sequence[str] = (),
+        modulated: Sequence[str] | None = None, candidates: Sequence[str] = (),
     ) -> None:
         super().__init__()
         if (law == AUTO) != bool(candidates):
@@ -79,10 +119,12 @@ class Material(nn.Module):
         self.begins: dict[str, float] = {}
         """Unconstrained values that the parameters start from, whatever is loaded later."""
         self.held: list[str] = []
+        self.directions = tuple(name for name in parameters if isinstance(FORMS[name], Direction))
         for name, value in parameters.items():
             self._add(name, value, name not in frozen)
 
     def _check_names(self, law: str, parameters, frozen, modulated) -> None:
+        known = law_named(law)
         if unknown := sorted(set(parameters) - set(FORMS)):
             raise ConfigError(f"prior.parameters: expected names among {', '.join(FORMS)}, found {', '.join(unknown)}")
         for key, names in (("frozen", frozen), ("modulated", modulated or ())):
@@ -92,7 +134,6 @@ class Material(nn.Module):
             raise ConfigError(f"prior.parameters: E and nu go together, found {', '.join(parameters)}")
         if "E" not in parameters and "kappa" not in parameters:
             raise ConfigError(f"prior.parameters: expected E with nu, or kappa with mu, found {', '.join(parameters)}")
-        known = law_named(law)
         takes = {name for name in known.parameters if name != known.reference}
         gives = {taken for name in parameters for taken in GIVES.get(name, (name,))}
         listed = [taken for name in parameters for taken in GIVES.get(name, (name,))]
@@ -105,8 +146,11 @@ class Material(nn.Module):
                 f"{', '.join(sorted(gives))} (mu, lam come from E, nu; friction_alpha from friction_angle)"
             )
 
-    def _add(self, name: str, value: float, learned: bool) -> None:
+    def _add(self, name: str, value: float | Sequence[float], learned: bool) -> None:
         form = FORMS[name]
+        if isinstance(form, Direction):
+            self._add_direction(name, value, learned)
+            return
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise ConfigError(f"prior.parameters.{name}: expected a number, found {value!r}")
         value = float(value)
@@ -121,26 +165,51 @@ class Material(nn.Module):
                 f"prior.parameters.{name}: expected a number between {form.low:g} and {form.high:g}, found {value:g}"
             )
 
+    def _add_direction(self, name: str, value: Sequence[float], learned: bool) -> None:
+        numbers = list(value) if isinstance(value, (list, tuple)) else []
+        if len(numbers) != 3 or not all(map(is_number, numbers)) or not any(numbers):
+            raise ConfigError(f"prior.parameters.{name}: expected a direction [x, y, z], found {value!r}")
+        # where the angles begin is the configuration's, as `begins` of the numbers is: no part of what is learned
+        self.register_buffer(f"frame_{name}", Direction.frame(numbers).float(), persistent=False)
+        for coordinate in Direction.coordinates(name):
+            self.begins[coordinate] = 0.0
+            self.raw[coordinate] = nn.Parameter(torch.tensor(0.0), requires_grad=learned)
+
+    def direction(self, name: str) -> Tensor:
+        """(3,) unit vector of a parameter that is one, in the rest shape."""
+        angles = torch.stack([self.raw[coordinate] for coordinate in Direction.coordinates(name)])
+        vector = Direction.physical(getattr(self, f"frame_{name}").to(angles), angles)
+        return vector / vector.norm()
+
     def choose(self, law: str) -> None:
         """Settle on one of the candidates."""
         self.law, self.candidates = law, ()
 
     def physical(self) -> dict[str, Tensor]:
-        """Constrained global values, scalars, in SI units (friction_angle in degrees)."""
-        return {n: getattr(self, f"held_{n}") if n in self.held else FORMS[n].physical(self.raw[n]) for n in self.names}
+        """Constrained global values, scalars, in SI units (friction_angle in degrees); of a direction its components, as
+        `<name>_x`, `<name>_y` and `<name>_z`."""
+        found: dict[str, Tensor] = {}
+        for n in self.names:
+            if n in self.directions:
+                found |= {f"{n}_{axis}": part for axis, part in zip(Direction.AXES, self.direction(n))}
+            else:
+                found[n] = getattr(self, f"held_{n}") if n in self.held else FORMS[n].physical(self.raw[n])
+        return found
 
     @staticmethod
     def physical_of(name: str, raw: Tensor) -> Tensor:
-        """The constrained value of one parameter, from its unconstrained one."""
-        return FORMS[name].physical(raw)
+        """The constrained value of one parameter, from its unconstrained one; the angles of a direction [rad] are themselves."""
+        return FORMS[name].physical(raw) if name in FORMS else raw * 1.0
 
     def per_particle(self, factor: Tensor | float = 1.0) -> dict[str, Tensor]:
         """Values the simulator takes, by the law's own names; factor: (N,) heterogeneity of the modulated parameters, or 1.
 
-        Modulated values are (N,), the others ().
+        Modulated values are (N,), directions (3,), the others ().
         """
+        parts = {f"{name}_{axis}" for name in self.directions for axis in Direction.AXES}
         values = {n: v * factor if n in self.modulated else v for n, v in self.physical().items()}
-        result = {n: v for n, v in values.items() if n not in GIVES}
+        result = {n: v for n, v in values.items() if n not in GIVES and n not in parts}
+        result |= {name: self.direction(name) for name in self.directions}
         if "E" in values:
             result["mu"], result["lam"] = lame(values["E"], values["nu"])
         if "friction_angle" in values:

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError
-from mosa.modules.adapter import Adapter
+from mosa.modules.adapter_base import Adapter
 from mosa.modules.warm_start import SMALLEST_STRAIN, drawn_stretches
 from mosa.physics.constitutive.singular_values import singular_value_decomposition
 from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState

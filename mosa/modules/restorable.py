@@ -12,6 +12,10 @@ from pathlib import Path
 import torch
 from torch.utils.data import DataLoader
 
+from mosa.checkpoints import read_checkpoint
+from mosa.evaluation import evaluate, run_sequences
+from mosa.twin import Twin
+
 
 class Restorable:
     """What a LightningModule with `body`, `world` and `config` needs for that, beside the fit."""
@@ -23,18 +27,13 @@ class Restorable:
         It has no sequences to learn from: a fit goes on with `ckpt_path=` of the command. A checkpoint holds no arguments of
         `__init__`, and Lightning's others (`strict`, `hparams_file`, ...) change nothing. Errors: DataError naming the file.
         """
-        from mosa.config import build_fit  # it builds this class
-        from mosa.twin import Twin, read_checkpoint
-
         twin = Twin.load(checkpoint_path, "cpu" if map_location is None else map_location)
-        module = build_fit(twin.config, twin.body, takes=(), background=torch.ones(3))
+        module = cls.from_config(twin.config, twin.body, takes=(), background=torch.ones(3))
         module.on_load_checkpoint(read_checkpoint(checkpoint_path))
         return module.to(twin.body.rest.device).eval()
 
     def test_dataloader(self) -> DataLoader:
         """The sequences that the run was evaluated on, from the configuration in its checkpoint. Errors: DataError, ConfigError."""
-        from mosa.pipeline import run_sequences
-
         return DataLoader(run_sequences(self.config, self.body), batch_size=None, collate_fn=lambda sequence: sequence)
 
     def transfer_batch_to_device(self, batch, device, dataloader_idx: int):
@@ -43,8 +42,6 @@ class Restorable:
 
     def test_step(self, sequence, _index: int) -> None:
         """Logs the figures of docs/figures.md of one sequence, of every model."""
-        from mosa.evaluation import evaluate
-
         settings = self.config["cfg"].get("evaluation") or {}
         here = replace(sequence, start=type(sequence.start).read(sequence.start.written(), self.body.rest))
         sizes = {name: settings[name] for name in ("samples", "assignment") if name in settings}

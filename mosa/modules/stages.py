@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import MISSING, dataclass, replace
 
 from mosa.errors import ConfigError
+from mosa.schema import COUNT, WEIGHT, check_knobs, knob, one_of, or_null, whole
 
 STAGES = ("prior", "prior_eta", "joint")
-OPTIMIZERS = ("auto", "gauss_newton", "adam")
 
 
 @dataclass(frozen=True)
@@ -23,28 +23,20 @@ class Stage:
     """
 
     name: str
-    iterations: int
-    lr: float
-    lr_networks: float = 0.0
-    lr_adapter: float = 0.0
-    lr_contact: float = 0.0
-    converged: float = 0.0
-    start: str | None = None
-    optimizer: str = "auto"
-    newton_iterations: int = 8
+    iterations: int = knob(MISSING, whole(0))
+    lr: float = knob(MISSING, WEIGHT)
+    lr_networks: float = knob(0.0, WEIGHT)
+    lr_adapter: float = knob(0.0, WEIGHT)
+    lr_contact: float = knob(0.0, WEIGHT)
+    converged: float = knob(0.0, WEIGHT)
+    start: str | None = knob(None, or_null(one_of("prior", "prior_eta")))
+    optimizer: str = knob("auto", one_of("auto", "gauss_newton", "adam"))
+    newton_iterations: int = knob(8, COUNT)
 
     def __post_init__(self) -> None:
         if self.name not in STAGES:
             raise ConfigError(f"fit: expected a stage among {', '.join(STAGES)}, found {self.name!r}")
-        if self.iterations < 0:
-            raise ConfigError(f"fit.{self.name}.iterations: expected a number >= 0, found {self.iterations}")
-        if self.optimizer not in OPTIMIZERS:
-            raise ConfigError(f"fit.{self.name}.optimizer: expected one of {', '.join(OPTIMIZERS)}, found {self.optimizer!r}")
-        if isinstance(self.newton_iterations, bool) or not isinstance(self.newton_iterations, int) or self.newton_iterations < 1:
-            raise ConfigError(f"fit.{self.name}.newton_iterations: expected a whole number of at least 1, found "
-                              f"{self.newton_iterations!r}")
-        if self.start not in (None, "prior", "prior_eta"):
-            raise ConfigError(f"fit.{self.name}.start: expected prior or prior_eta, found {self.start!r}")
+        check_knobs(self, f"fit.{self.name}")
 
     @property
     def newton(self) -> bool:

@@ -23,6 +23,7 @@ from mosa.rendering.covariance import covariance_from
 from mosa.rendering.lighting import LIGHT, surface_normals, turned_basis
 from mosa.rendering.rasterizer import rasterize
 from mosa.rendering.spherical_harmonics import Y0, camera_centers, colors_in, constant_coefficients, mean_colors
+from mosa.schema import COUNT, FLAG, WEIGHT, check_knobs, knob, one_of, whole
 from mosa.types import Appearance, Splats
 
 
@@ -33,15 +34,18 @@ class CarriedSettings(FitSettings):
     in pixels of an image, since what no training camera sees along has no other reason to be dull; light: whether the light is
     fitted, lr_light: its step."""
 
-    views: int = 4
-    keep: float = 1.0
-    shape: str = "anisotropic"
-    lr_colors: float = 0.03
-    degree: int = 1
-    lr_harmonics: float = 0.005
-    keep_harmonics: float = 10.0
-    light: bool = True
-    lr_light: float = 0.02
+    views: int = knob(4, COUNT)
+    keep: float = knob(1.0, WEIGHT)
+    shape: str = knob("anisotropic", one_of("isotropic", "anisotropic"))
+    lr_colors: float = knob(0.03, WEIGHT)
+    degree: int = knob(1, whole(0, 3))
+    lr_harmonics: float = knob(0.005, WEIGHT)
+    keep_harmonics: float = knob(10.0, WEIGHT)
+    light: bool = knob(True, FLAG)
+    lr_light: float = knob(0.02, WEIGHT)
+
+    def __post_init__(self) -> None:
+        check_knobs(self, "reconstruction.carried")
 
 
 class RestGaussians:

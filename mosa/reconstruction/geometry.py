@@ -12,7 +12,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mosa.errors import ConfigError
 from mosa.reconstruction.carving import CarvingSettings, carve, keep_silhouettes
 from mosa.reconstruction.flight import free_motions
 from mosa.reconstruction.hull import Volume, shave_ridges
@@ -25,6 +24,7 @@ from mosa.reconstruction.refinement import (
     surface_information,
     voxels,
 )
+from mosa.schema import COUNT, check_knobs, knob, one_of
 from mosa.types import Scene
 
 OPTIMISM = 1.3
@@ -38,16 +38,15 @@ class GeometrySettings:
     outlines and colours are used, at most; first: rounds and blur [px] of the refinement on frame 0, from which the flight is
     followed; then: on all free frames."""
 
-    source: str = "images"
-    frames: int = 6
+    source: str = knob("images", one_of("images", "hull"))
+    frames: int = knob(6, COUNT)
     first: tuple[tuple[int, float], ...] = ((4, 2.0), (4, 1.0))
     then: tuple[tuple[int, float], ...] = ((3, 1.0), (9, 0.4))
     carving: CarvingSettings = field(default_factory=CarvingSettings)
     refinement: RefinementSettings = field(default_factory=RefinementSettings)
 
     def __post_init__(self) -> None:
-        if self.source not in ("images", "hull"):
-            raise ConfigError(f"reconstruction.geometry.source: expected images or hull, found {self.source!r}")
+        check_knobs(self, "reconstruction.geometry")
 
 
 @dataclass(frozen=True)

@@ -17,16 +17,12 @@ from mosa.reconstruction.initial import initial_splats, random_splats
 from mosa.reconstruction.observed import Windows
 from mosa.reconstruction.photometric import image_loss
 from mosa.rendering.rasterizer import rasterize
+from mosa.schema import COUNT, WEIGHT, check_knobs, knob, number, one_of, or_null, whole
 from mosa.types import Splats
 
 SMALLEST = 0.25
 """Bound of a scale in units of its start."""
 STARTS = {"hull": initial_splats, "random": random_splats}
-
-
-def _one_of(key: str, value: str, known: tuple[str, ...]) -> None:
-    if value not in known:
-        raise ConfigError(f"reconstruction.{key}: expected {' or '.join(known)}, found {value!r}")
 
 
 @dataclass(frozen=True)
@@ -36,22 +32,22 @@ class FitSettings:
     counts for, in pixels of an image; largest: bound of a scale in units of its start; shape: isotropic | anisotropic, three scales
     and a rotation, which start isotropic; axis_ratio: an anisotropic one's largest scale over its smallest, at most."""
 
-    iterations: int = 400
-    views: int = 2
-    lr_positions: float = 0.03
-    lr_scales: float = 0.02
-    lr_opacities: float = 0.05
-    lr_colors: float = 0.02
-    lr_rotations: float = 0.02
-    ssim: float = 0.2
-    matte: float = 1.0
-    keep: float = 0.0
-    largest: float = 2.0
-    shape: str = "isotropic"
-    axis_ratio: float = 10.0
+    iterations: int = knob(400, whole(0))
+    views: int = knob(2, COUNT)
+    lr_positions: float = knob(0.03, WEIGHT)
+    lr_scales: float = knob(0.02, WEIGHT)
+    lr_opacities: float = knob(0.05, WEIGHT)
+    lr_colors: float = knob(0.02, WEIGHT)
+    lr_rotations: float = knob(0.02, WEIGHT)
+    ssim: float = knob(0.2, number(0, 1))
+    matte: float = knob(1.0, WEIGHT)
+    keep: float = knob(0.0, WEIGHT)
+    largest: float = knob(2.0, number(1))
+    shape: str = knob("isotropic", one_of("isotropic", "anisotropic"))
+    axis_ratio: float = knob(10.0, number(1))
 
     def __post_init__(self) -> None:
-        _one_of("*.shape", self.shape, ("isotropic", "anisotropic"))
+        check_knobs(self, "reconstruction.*")
 
 
 @dataclass(frozen=True)
@@ -62,19 +58,17 @@ class StaticSettings(FitSettings):
     fade, what an opacity of 1 costs, in pixels of an image: Gaussians that no image shows vanish and get moved; noise: random
     steps of those about to vanish, in their standard deviations at the first step."""
 
-    start: str = "hull"
-    densify: str = "relocate"
-    max_points: int | None = None
-    relocate_every: int = 100
-    refine_every: int = 10
-    growth: float = 0.1
-    fade: float = 0.03
-    noise: float = 0.2
+    start: str = knob("hull", one_of(*STARTS))
+    densify: str = knob("relocate", one_of("relocate", "mcmc"))
+    max_points: int | None = knob(None, or_null(whole(8)))
+    relocate_every: int = knob(100, whole(0))
+    refine_every: int = knob(10, COUNT)
+    growth: float = knob(0.1, WEIGHT)
+    fade: float = knob(0.03, WEIGHT)
+    noise: float = knob(0.2, WEIGHT)
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        _one_of("static.start", self.start, tuple(STARTS))
-        _one_of("static.densify", self.densify, ("relocate", "mcmc"))
+        check_knobs(self, "reconstruction.static")
         if self.max_points is not None and self.densify != "mcmc":
             raise ConfigError(
                 f"reconstruction.static.max_points: expected null, found {self.max_points}: densify={self.densify} keeps the "

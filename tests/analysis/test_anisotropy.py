@@ -8,7 +8,8 @@ from scipy.optimize import brentq
 
 from mosa.analysis import anisotropy
 from mosa.errors import ConfigError, SimulationDiverged
-from mosa.modules.adapter import Adapter, StressAdapter
+from mosa.modules.adapter import StressAdapter
+from mosa.modules.adapter_base import Adapter
 from mosa.modules.hyperelastic import HyperelasticAdapter
 from mosa.modules.material import material_states
 from mosa.modules.microplane import MANDEL

@@ -30,7 +30,8 @@ from mosa.experiments.specification import (
     pairs,
 )
 from mosa.experiments.writing import printed_table, write_results
-from mosa.schema import EVALUATION, TRAINING, check
+from mosa.keys import EVALUATION, TRAINING
+from mosa.schema import check
 
 CONF = Path(__file__).parents[2] / "conf"
 PAPER = CONF / "experiment" / "paper"

@@ -14,6 +14,7 @@ from hydra import compose, initialize_config_dir
 from mosa import pipeline
 from mosa.data.export import export_particles, export_transforms
 from mosa.data.scene import load_scene
+from mosa.evaluation import run_sequences
 from mosa.twin import Twin
 
 ROOT = Path(__file__).parents[2]
@@ -87,11 +88,11 @@ def test_eval_finds_the_folders_again(run, tmp_path, monkeypatch):
     """All of them, each with its own start: a rollout begins where its images do."""
     seen = {}
 
-    def stop(body, sequences, world, **_):
+    def stop(_settings, body, sequences, *_):
         seen.update(body=body, sequences=sequences)
         raise InterruptedError
 
-    monkeypatch.setattr(pipeline, "evaluate", stop)
+    monkeypatch.setattr(pipeline, "figures_of", stop)
     monkeypatch.setattr(pipeline, "run_folder", lambda: tmp_path)
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         cfg = compose("eval", [f"ckpt_path={run}/checkpoints/last.ckpt"])
@@ -99,7 +100,7 @@ def test_eval_finds_the_folders_again(run, tmp_path, monkeypatch):
         pipeline.evaluate_checkpoint(cfg)
     body, stored = seen["body"], np.load(run / "rollout.npz")
     named = [("train", "train"), ("train/test_60", "test_60"), ("test/second", "second")]
-    found = pipeline.run_sequences(Twin.load(run / "checkpoints" / "last.ckpt").config, body)
+    found = run_sequences(Twin.load(run / "checkpoints" / "last.ckpt").config, body)
     for sequences in (seen["sequences"], found):
         assert [(s.prefix, s.scene.sequence) for s in sequences] == named
         for each in sequences:

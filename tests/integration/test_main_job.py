@@ -253,7 +253,7 @@ def test_eval_without_a_checkpoint_says_what_it_needs(cache, tmp_path):
 
 
 def evaluated(run, tmp_path, monkeypatch, *overrides) -> dict:
-    """What eval.py hands to `evaluate`: body, sequences, world. The checkpoint's body is in float64."""
+    """What eval.py hands to `figures_of`: body, sequences, world. The checkpoint's body is in float64."""
     seen = {}
 
     def load(path, device):
@@ -261,12 +261,12 @@ def evaluated(run, tmp_path, monkeypatch, *overrides) -> dict:
         twin.body.double()
         return twin
 
-    def stop(body, sequences, world, **_):
+    def stop(_settings, body, sequences, world, *_):
         seen.update(body=body, sequences=sequences, world=world)
         raise InterruptedError
 
     monkeypatch.setattr(pipeline, "Twin", SimpleNamespace(load=load))
-    monkeypatch.setattr(pipeline, "evaluate", stop)
+    monkeypatch.setattr(pipeline, "figures_of", stop)
     monkeypatch.setattr(pipeline, "run_folder", lambda: tmp_path)
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         cfg = compose("eval", [f"ckpt_path={run}/checkpoints/last.ckpt", *overrides])

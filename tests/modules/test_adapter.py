@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mosa.errors import ConfigError
-from mosa.modules.adapter import StressAdapter, pool, statistics
+from mosa.modules.adapter import StressAdapter
+from mosa.modules.adapter_base import pool, statistics
 from mosa.modules.direct import DirectAdapter
 
 OPTIONS = {

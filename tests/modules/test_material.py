@@ -1,5 +1,6 @@
 """Global parameters: unconstrained forms, ranges, what the simulator gets, and what a mistake says."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,8 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from mosa.errors import ConfigError
-from mosa.modules.material import ANGLE_MAX, FORMS, NU_MAX, Material
+from mosa.modules import material as material_module
+from mosa.modules.material import ANGLE_MAX, FORMS, LOG, NU_MAX, SOFTPLUS, Direction, Material, register_form
 from mosa.physics.constitutive import laws
 from mosa.physics.constitutive.laws import law_named
 
@@ -142,3 +144,61 @@ def test_a_mistake_is_named(arguments, message):
 
 def test_largest_angle_is_below_a_right_angle():
     assert ANGLE_MAX < 90  # at 90 degrees the cone's slope is finite, but sin has no gradient there
+
+
+@pytest.fixture
+def fibred(monkeypatch):
+    """A law with a direction, known to this test alone."""
+    monkeypatch.setattr(laws, "_LAWS", dict(laws._LAWS))
+    monkeypatch.setattr(material_module, "FORMS", dict(FORMS))
+    laws.register_law("fibred", law_named("stvk").stress, {"mu": 1, "lam": 1, "k": 1, "a": 3})
+    register_form("k", LOG)
+    register_form("a", Direction())
+    return {**ELASTIC, "k": 2e3}
+
+
+@pytest.mark.parametrize("start", [[1, 0, 0], [0, -2, 0], [3, 1, -2]])
+def test_a_direction_starts_at_its_value_and_stays_a_unit_vector(fibred, start):
+    material = Material("fibred", {**fibred, "a": start})
+    expected = torch.tensor(start).float() / torch.tensor(start).float().norm()
+    torch.testing.assert_close(material.per_particle(torch.ones(4))["a"], expected)
+    assert [float(material.physical()[f"a_{axis}"].detach()) for axis in "xyz"] == pytest.approx(expected.tolist())
+    assert "a" not in material.physical() and material.begins["a_1"] == material.begins["a_2"] == 0
+    with torch.no_grad():
+        material.raw["a_1"].fill_(0.6)
+        material.raw["a_2"].fill_(-0.8)
+    turned = material.direction("a")
+    assert float(turned.detach().norm()) == pytest.approx(1, abs=1e-6)
+    assert float(turned.detach() @ expected) == pytest.approx(math.cos(1), abs=1e-6)
+    with torch.no_grad():  # 90 degrees away, where the line is as far as a line can be
+        material.raw["a_1"].fill_(math.pi / 2)
+        material.raw["a_2"].fill_(0)
+    assert abs(float(material.direction("a").detach() @ expected)) < 1e-6
+
+
+def test_the_angles_of_a_direction_have_a_slope_at_the_start_and_beyond(fibred):
+    """Against differences in float64: at 0, in the series' range, at its end and far away; a radian turns by a radian."""
+    frame = Direction.frame([1, 2, -1])
+    for angles in ([0.0, 0.0], [3e-5, -2e-5], [9e-5, 5e-5], [0.4, -1.1]):
+        angles = torch.tensor(angles, dtype=torch.float64, requires_grad=True)
+        assert torch.autograd.gradcheck(lambda a: Direction.physical(frame, a), angles, eps=1e-6, atol=1e-8)
+    jacobian = torch.autograd.functional.jacobian(lambda a: Direction.physical(frame, a), torch.zeros(2, dtype=torch.float64))
+    torch.testing.assert_close(jacobian, frame[1:].T)
+
+
+def test_a_frozen_direction_is_not_learned_and_another_start_is_no_part_of_what_is_saved(fibred):
+    material = Material("fibred", {**fibred, "a": [0, 0, 1]}, frozen=["a"])
+    assert not any(material.raw[name].requires_grad for name in ("a_1", "a_2")) and material.raw["k"].requires_grad
+    assert set(material.state_dict()) == {f"raw.{name}" for name in ("E", "nu", "k", "a_1", "a_2")}
+
+
+@pytest.mark.parametrize("value", [1.0, [0, 0, 0], [1, 2], [1, None, 0], "x", [math.inf, 0, 0]])
+def test_what_is_no_direction_is_refused(fibred, value):
+    with pytest.raises(ConfigError, match=r"prior.parameters.a: expected a direction \[x, y, z\], found"):
+        Material("fibred", {**fibred, "a": value})
+
+
+def test_a_range_is_given_once(fibred):
+    register_form("k", LOG)
+    with pytest.raises(ConfigError, match="parameter 'k' has a range already"):
+        register_form("k", SOFTPLUS)

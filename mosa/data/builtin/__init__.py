@@ -11,7 +11,7 @@ from mosa.data.builtin.objects import object_named
 from mosa.data.builtin.takes import cameras_of, make, pictures_to_footage
 from mosa.data.footage import Footage, frame_range
 from mosa.data.images import scaled_size
-from mosa.data.scene import assemble
+from mosa.data.scene_from_footage import scene_from_footage
 from mosa.errors import ConfigError
 from mosa.rendering.cameras import scale_cameras
 from mosa.types import Ground, Scene, Truth
@@ -75,7 +75,7 @@ def load_builtin(
         hidden.summary(),
     )
     box = BOX if body.reach is None else ((-body.reach, BOX[0][1], -body.reach), (body.reach, BOX[1][1], body.reach))
-    return assemble(
+    return scene_from_footage(
         footage, name=name, gravity=GRAVITY, box=box, ground=Ground(0.0, "sticky"), density=hidden.density, sequence=sequence,
         last_free_frame=last_free_frame, holdout_cameras=holdout_cameras, holdout_frames=holdout_frames, truth=truth,
         known_parameters=hidden.known, synthetic=True,

@@ -1,4 +1,4 @@
-"""A 3DGS file of an object becomes a body that falls, without any video:  python -m mosa.splats ply=object.ply
+"""A 3DGS file of an object becomes a body that falls, without any video.
 
 The Gaussians' inside is filled with particles, a law is chosen (`prior=...`) or taken from a checkpoint (`ckpt_path=...`), and the
 rollout carries the Gaussians, harmonics and all.
@@ -18,9 +18,11 @@ from omegaconf import DictConfig, OmegaConf
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from mosa.checkpoints import VERSION
 from mosa.config import build_body, build_world, plain
 from mosa.data.splats import load_ply
 from mosa.errors import ConfigError, DataError
+from mosa.extensions import load_extensions
 from mosa.guards import check_splats
 from mosa.modules.body import Body, Start
 from mosa.modules.carried_splats import CarriedSplats
@@ -29,8 +31,9 @@ from mosa.reconstruction.initial import inherited_colors
 from mosa.reconstruction.pipeline import FEW, filling_spacing
 from mosa.reconstruction.resolution import PER_CELL, grid_spacing
 from mosa.reconstruction.shell import solid_of
-from mosa.run import named_device
-from mosa.twin import Twin, numbers
+from mosa.run import most_particles, named_device, quiet, run_folder
+from mosa.twin import Twin
+from mosa.twin_start import numbers
 from mosa.types import Appearance, Splats
 
 log = logging.getLogger(__name__)
@@ -161,20 +164,20 @@ def save_twin(twin: Twin, path: str | Path) -> Path:
     splats = twin.body.splats
     torch.save({
         "state_dict": {f"body.{k}": v.cpu() for k, v in twin.body.state_dict().items()},
-        "mosa": {"config": {**twin.config, "starts": {"train": written}}, "stage": 0, "losses": [], "steps_done": 0,
-                 "particles": len(twin.body.rest), "start": written, "splats": None if splats is None else splats.written()},
+        "mosa": {"version": VERSION, "config": {**twin.config, "starts": {"train": written}}, "stage": 0, "losses": [],
+                 "steps_done": 0, "particles": len(twin.body.rest), "start": written,
+                 "splats": None if splats is None else splats.written()},
     }, path)  # fmt: skip
     return path
 
 
 def drop(cfg: DictConfig) -> None:
     """`python -m mosa.splats`: fill the Gaussians of a file, let them fall, write frames, video and a checkpoint of the body."""
-    from mosa.pipeline import MOST_PARTICLES, quiet, run_folder
-
     quiet()
     if OmegaConf.is_missing(cfg, "ply"):
         raise ConfigError("ply: expected a 3DGS PLY file of an object, found none; python -m mosa.splats ply=object.ply")
     values, folder = plain(cfg), run_folder()
+    load_extensions(values.get("extensions"))
     check_splats(values)
     found = read_object(cfg.ply, box=values["box"], opacity=cfg.opacity, size=cfg.size)
     law = values if cfg.ckpt_path is None else Twin.load(cfg.ckpt_path)
@@ -182,7 +185,7 @@ def drop(cfg: DictConfig) -> None:
     simulation, device = values["simulation"], named_device(cfg.device)
     particles = None if simulation["particles"] == "auto" else simulation["particles"]
     grid = {"particles": particles, "dx": simulation["dx"], "per_cell": simulation["particles_per_cell"],
-            "most": MOST_PARTICLES["cpu" if device == "cpu" else "cuda"]}  # fmt: skip
+            "most": most_particles(device)}  # fmt: skip
     twin = object_twin(found, law, frame_dt=1 / cfg.rate, **grid, **{name: values[name] for name in names})
     twin.body.to(device)
     volume, size = float(twin.body.volume.sum()), twin.body.size
@@ -193,9 +196,3 @@ def drop(cfg: DictConfig) -> None:
                             **{name: values[name] for name in ("height", "rotation", "velocity", "angular_velocity")})
     twin.export(rollout, folder, video=cfg.video, title="object", formats=values["formats"])
     log.info("%d frames in %s; look at them with mosa-view %s", len(rollout.x), folder, folder)
-
-
-if __name__ == "__main__":
-    from mosa.commands.splats import main
-
-    main()

@@ -1,0 +1,42 @@
+"""Laws, adapters, loss terms, metrics and data formats of other packages: modules that register them, named in `extensions`.
+
+They are code of whoever starts the program: the command line and the YAML files name them, a checkpoint never does. Who loads a
+checkpoint of a run that had some imports them before (docs/extending.md).
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from mosa.errors import ConfigError
+from mosa.modules.adapters import adapter_class
+from mosa.modules.terms import TERMS
+from mosa.schema import NAMES, WEIGHT, Kind
+
+
+def load_extensions(names: Sequence[str] | None) -> None:
+    """Import the modules of these names, which register what they bring. Errors: ConfigError naming the module."""
+    if not NAMES.fits(names or []):
+        raise ConfigError(f"extensions: expected {NAMES.described}, found {names!r}")
+    for name in names or ():
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            raise ConfigError(f"extensions: expected a module that can be imported (installed, or in PYTHONPATH), found {name!r} "
+                              f"({error})") from error
+
+
+def registered_keys(values: Mapping[str, Any]) -> dict[str, Kind]:
+    """Keys of the configuration that what is registered brings: a weight for each loss term, the arguments of the chosen adapter.
+
+    Errors: ConfigError for an adapter that is not known."""
+    keys = {f"losses.{name}": WEIGHT for name in TERMS}
+    section = values.get("adapter")
+    build = adapter_class(section) if isinstance(section, Mapping) else None
+    if build is not None:
+        anything = Kind("a value", lambda value: True)  # which the adapter checks itself
+        keys |= {f"adapter.{name}": anything for name in inspect.signature(build).parameters}
+    return keys

@@ -1,0 +1,121 @@
+"""The loss terms of a fit by Adam, by name: each is a function of what one step sees, and has its weight in `losses`.
+
+A new term is one function and one call of `register_term`. The terms of the paper are thin: their mathematics is in `mosa.losses`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+from torch import Tensor
+
+from mosa import losses
+from mosa.data.datamodule import Observations
+from mosa.errors import ConfigError
+from mosa.modules.adapter_base import OperatorStatistics
+from mosa.modules.body import Body, Start
+from mosa.modules.observer import Views, deformed_covariances, observe
+from mosa.types import MotionCues, Rollout
+
+MISFIT = 0.01
+"""Misfit of the calibrated prior, over the object's size, at which the penalty of the operator has its stated weight."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """What a step sees of one sequence, its first `frames` frames. rollout: of the body from `start`; targets: real images of the
+    step's views; cues: the reconstruction's motion; operator: statistics of the adapter's evaluations, pooled over the rollout,
+    None where it has none; misfit: of the model the joint stage starts from, over the object's size."""
+
+    body: Body
+    start: Start
+    rollout: Rollout
+    targets: Observations
+    cues: MotionCues
+    frames: int
+    background: Tensor
+    heterogeneous: bool
+    operator: OperatorStatistics | None
+    misfit: float
+    with_flow: bool = field(default=True)
+
+    @cached_property
+    def seen(self) -> Views:
+        """Images, mattes and flow of the rollout, from the cameras of `targets`; rendered once, for all terms that ask."""
+        body, rollout = self.body, self.rollout
+        return observe(rollout.x, deformed_covariances(rollout.F_tot, body.covariances), body.opacities, body.colors,
+                       self.targets.cameras, self.background, flow=self.with_flow)
+
+
+Term = Callable[[Step], Tensor | None]
+"""The term's value, (), without its weight; None where the step has nothing that it could be made of."""
+
+
+def image(step: Step) -> Tensor:
+    return losses.image_loss(step.seen.images, step.targets.images)
+
+
+def mask(step: Step) -> Tensor:
+    return losses.mask_loss(step.seen.mattes, step.targets.mattes)
+
+
+def flow(step: Step) -> Tensor:
+    return losses.flow_loss(step.seen.flow, step.targets.flow, step.targets.image_width)
+
+
+def rotation(step: Step) -> Tensor:
+    cues, frames = step.cues, step.frames
+    return losses.rotation_loss(step.rollout.F_tot, cues.rotation[:frames], cues.weight[:frames], step.start.rotation)
+
+
+def stretch(step: Step) -> Tensor:
+    return losses.stretch_loss(step.rollout.F_tot, step.cues.stretch[: step.frames], step.cues.weight[: step.frames])
+
+
+def position(step: Step) -> Tensor:
+    return losses.position_loss(step.rollout.x, step.cues.positions[: step.frames], step.body.size)
+
+
+def heterogeneity(step: Step) -> Tensor | None:
+    return losses.heterogeneity_loss(step.body.heterogeneity(step.body.rest)) if step.heterogeneous else None
+
+
+def operator(step: Step) -> Tensor | None:
+    """What the prior leaves unexplained is what there is to learn: the size that one expects of the operator grows with it, and
+    the pull of a loss that is a distance, not its square, does not fade as it should with a small misfit."""
+    if step.operator is None:
+        return None
+    return (MISFIT / step.misfit) ** 2 * (step.operator.mean_square + 1e-8).sqrt()
+
+
+def operator_variance(step: Step) -> Tensor | None:
+    return None if step.operator is None else step.operator.variance
+
+
+TERMS: dict[str, Term] = {
+    "image": image, "mask": mask, "flow": flow, "rotation": rotation, "stretch": stretch, "position": position,
+    "heterogeneity": heterogeneity, "operator": operator, "operator_variance": operator_variance,
+}  # fmt: skip
+"""Name in the section `losses` -> term."""
+
+
+def register_term(name: str, term: Term) -> None:
+    """Make a term known by the name of its weight, `losses.<name>`, 0 where the configuration does not say.
+
+    Errors: ConfigError if another term has the name."""
+    if TERMS.setdefault(name, term) is not term:
+        raise ConfigError(f"losses.{name}: there is such a term already; choose another name")
+
+
+def check_terms(weights: Mapping[str, float]) -> None:
+    """Errors: ConfigError naming weights of no term."""
+    if unknown := sorted(set(weights) - set(TERMS)):
+        raise ConfigError(f"losses: unknown terms {unknown}; known are {', '.join(TERMS)}")
+
+
+def evaluate_terms(weights: Mapping[str, float], step: Step) -> dict[str, Tensor]:
+    """Every term that has a weight, raw, in the order in which they are known."""
+    found = {name: term(step) for name, term in TERMS.items() if weights.get(name, 0.0) != 0}
+    return {name: value for name, value in found.items() if value is not None}

@@ -1,0 +1,128 @@
+"""What a user says about the start of a motion, checked and made a start in a world."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from mosa.errors import ConfigError
+from mosa.limits import machine_memory
+from mosa.modules.body import VARIANTS, Body, Start, World
+from mosa.physics.contact.colliders import colliders_from_config
+from mosa.physics.contact.overlap import check_clear
+from mosa.schema import is_number
+
+STARTED = ("rotation", "height", "position", "velocity", "angular_velocity")
+"""What a start may say."""
+FASTEST = 1e6
+"""[m/s], [rad/s] of a start: the time step would be refused far below."""
+STORED_BYTES = 4 * (3 + 3 + 9 + 9)
+"""Of a particle in a frame of a rollout: x, v, F, F_tot."""
+
+
+def check_frames(frames: int, particles: int) -> None:
+    """Errors: ConfigError where frames are no whole number, or are more than the machine can hold."""
+    if isinstance(frames, bool) or not isinstance(frames, int) or frames < 1:
+        raise ConfigError(f"frames: expected a whole number of at least 1, found {frames!r}")
+    most = machine_memory() // (2 * STORED_BYTES * particles)
+    if frames > most:
+        raise ConfigError(f"frames: expected at most {most}, which take half of this machine's memory, found {frames}")
+
+
+def check_variant(variant: str) -> None:
+    if variant not in VARIANTS:
+        raise ConfigError(f"variant: expected one of {', '.join(VARIANTS)}, found {variant!r}")
+
+
+def checked_dt(value: float | None, default: float) -> float:
+    """[s] of a step. Errors: ConfigError."""
+    if value is None:
+        return default
+    if not is_number(value) or not value > 0:
+        raise ConfigError(f"control_dt: expected a positive number [s], found {value!r}")
+    return float(value)
+
+
+def checked_substeps(value: int | None) -> int | None:
+    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
+        raise ConfigError(f"substeps: expected a whole number of at least 1, or None, found {value!r}")
+    return value
+
+
+def placed(position: Sequence[float | None] | Tensor, center: Tensor) -> Tensor:
+    """(3,) the centre with the numbers of `position` that are not None. Errors: ConfigError."""
+    if isinstance(position, Sequence) and not isinstance(position, str) and len(position) == 3:
+        kept = [number is None for number in position]
+        found = vector("position", [0.0 if number is None else number for number in position]).to(center)
+        return torch.where(torch.tensor(kept, device=center.device), center, found)
+    return vector("position", position).to(center)
+
+
+def numbers(name: str, value: Sequence[float] | Tensor, expected: str) -> Tensor:
+    """Tensor of finite numbers, float64 where they are given so, else float32. Errors: ConfigError naming the field."""
+    try:
+        result = torch.as_tensor(value)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}") from error
+    if result.dtype == torch.bool or result.is_complex() or not bool(torch.isfinite(result.detach().float()).all()):
+        raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}")
+    return result if result.dtype == torch.float64 else result.float()
+
+
+def rotation_matrix(value: Sequence[float] | Tensor) -> Tensor:
+    """(3, 3) from (ax, ay, az, degrees) or a matrix. Errors: ConfigError for anything else, and a matrix that is no rotation."""
+    expected = "(ax, ay, az, degrees) with a non-zero axis or a 3x3 rotation matrix"
+    value = numbers("rotation", value, expected)
+    if value.shape == (3, 3):
+        R = value.detach().double()
+        defect = float((R @ R.T - torch.eye(3).double()).abs().max())
+        if defect > 1e-3 or float(torch.linalg.det(R)) < 0:
+            raise ConfigError(f"rotation: expected R R^T = I and det R = 1, found a defect of {defect:.3g} and a determinant of "
+                              f"{float(torch.linalg.det(R)):.3g}: scaled, sheared or mirrored bodies are not what was learned")
+        return value
+    if value.shape != (4,) or not 0 < float(value[:3].double().norm()) < math.inf:
+        raise ConfigError(f"rotation: expected {expected}, found {value.tolist()}")
+    axis = (value[:3].double() / value[:3].double().norm()).numpy()
+    return torch.tensor(Rotation.from_rotvec(axis * math.radians(float(value[3]))).as_matrix(), dtype=torch.float32)
+
+
+def vector(name: str, value: Sequence[float]) -> Tensor:
+    """(3,) tensor. Errors: ConfigError naming the field."""
+    expected = f"three finite numbers within {FASTEST:g}"
+    result = numbers(name, value, expected)
+    if result.shape != (3,) or float(result.detach().abs().max()) > FASTEST:
+        raise ConfigError(f"{name}: expected {expected}, found {str(value)[:120]}")
+    return result
+
+
+def start_in(
+    body: Body, world: World, first: Start, *, rotation=None, height=None, position=None, velocity=None, angular_velocity=None,
+    colliders=None,
+) -> tuple[Start, World]:  # fmt: skip
+    """(the start, the world with its colliders) of arguments as `Twin.simulate` takes them, None for those of `first`.
+
+    Errors: ConfigError naming the argument."""
+    Q = first.rotation if rotation is None else rotation_matrix(rotation)
+    Q = Q.to(body.rest)
+    velocity_ = first.velocity if velocity is None else vector("velocity", velocity)
+    spin = first.angular_velocity if angular_velocity is None else vector("angular_velocity", angular_velocity)
+    center = first.center.to(body.rest)
+    if position is not None:
+        center = placed(position, center)
+    up = world.up.to(body.rest)
+    arms = (body.rest - body.center) @ Q.T
+    if height is not None:
+        if not is_number(height) or (height < 0 and world.ground is not None):
+            raise ConfigError(f"height: expected metres above the ground, a finite number >= 0, found {height!r}")
+        ground = world.ground.height if world.ground is not None else 0.0
+        center = center + up * (ground + height - (arms @ up).min() - center @ up)
+    start = Start(Q, center, velocity_.to(body.rest), spin.to(body.rest))
+    if colliders is not None:
+        world = replace(world, colliders=colliders_from_config(colliders, "colliders"))
+    check_clear(world.colliders, center + arms, "the body", "world.colliders" if colliders is None else "colliders")
+    return start, world

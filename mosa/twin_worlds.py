@@ -1,0 +1,97 @@
+"""A twin's body in many worlds at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from torch import Tensor
+
+from mosa.episode import Episode, Stepped, TwinState
+from mosa.errors import ConfigError
+from mosa.modules.body import Body, Start, World
+from mosa.physics.contact.colliders import Collider
+from mosa.twin_start import STARTED, check_frames, check_variant, checked_dt, checked_substeps, numbers, start_in
+
+
+class TwinWorlds:
+    """A twin's body in `count` worlds that never meet, stepped together: on CUDA in the same launches, on a CPU in threads."""
+
+    def __init__(
+        self, body: Body, world: World, frame_dt: float, training_start: Start, count: int, laws: Tensor | None = None
+    ) -> None:
+        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+            raise ConfigError(f"worlds: expected a whole number of at least 1, found {count!r}")
+        if laws is not None and len(laws) != count:
+            raise ConfigError(f"laws: expected one for each of {count} worlds, found {len(laws)}")
+        self.body, self.world, self.frame_dt, self.training_start = body, world, frame_dt, training_start
+        self.count, self.laws = count, laws
+        self.episode: Episode | None = None
+
+    def reset(
+        self, starts: Mapping | Sequence[Mapping] | None = None, *, colliders: Sequence[Collider | Mapping] | None = None,
+        gravity: Tensor | Sequence | None = None, variant: str = "adapted", control_dt: float | None = None,
+        substeps: int | None = None, frames: int = 30, differentiable: bool = False,
+    ) -> TwinState:  # fmt: skip
+        """Begin a motion in every world; returns the state (count, ...).
+
+        starts: rotation, height, position, velocity, angular_velocity as `Twin.simulate` takes them, for all worlds or one mapping
+        for each; gravity: (count, 3) [m/s^2], None for the world's; others as `Twin.reset`. Errors: ConfigError naming the world.
+        """
+        check_frames(frames, self.count * len(self.body.rest))
+        check_variant(variant)
+        found = self._found(starts, range(self.count), colliders)
+        if gravity is not None:
+            gravity = numbers("gravity", gravity, f"finite numbers ({self.count}, 3)")
+            if gravity.shape != (self.count, 3):
+                raise ConfigError(f"gravity: expected shape ({self.count}, 3), found {tuple(gravity.shape)}")
+        self.episode = Episode(
+            self.body, found[0][1], checked_dt(control_dt, self.frame_dt), [start for start, _ in found],
+            variant=variant, frames=frames, substeps=checked_substeps(substeps), laws=self.laws, gravity=gravity,
+            differentiable=differentiable,
+        )  # fmt: skip
+        return self.episode.state
+
+    def restart(self, which: Sequence[int], starts: Mapping | Sequence[Mapping] | None = None) -> TwinState:
+        """Put the worlds with these numbers back to new starts, as `reset` takes them, None for those they had; the others stay as
+        they are. Time is one for all and goes on: colliders that were driven are back where they began, others follow their
+        motion. Errors: ConfigError naming the world."""
+        which, episode = list(which), self._going()
+        given = None if starts is None else [start for start, _ in self._found(starts, which, episode.colliders)]
+        return episode.restart(which, given)
+
+    def _found(self, starts: Mapping | Sequence[Mapping] | None, which: Sequence[int], colliders) -> list[tuple[Start, World]]:
+        """The starts of these worlds, and the world. Errors: ConfigError."""
+        each = [dict(starts or {})] * len(which) if starts is None or isinstance(starts, Mapping) else list(starts)
+        if len(each) != len(which):
+            raise ConfigError(f"starts: expected one, or one for each of {len(which)} worlds, found {len(each)}")
+        found = []
+        for i, (b, given) in enumerate(zip(which, each)):
+            if unknown := sorted(set(given) - set(STARTED)):
+                raise ConfigError(f"starts[{b}]: expected {', '.join(STARTED)}, found {', '.join(unknown)}")
+            if i and given is each[0]:
+                found.append(found[0])
+                continue
+            try:
+                found.append(start_in(self.body, self.world, self.training_start, colliders=colliders, **given))
+            except ConfigError as error:
+                raise ConfigError(f"starts[{b}]: {error}") from error
+        return found
+
+    def _going(self) -> Episode:
+        if self.episode is None:
+            raise ConfigError("worlds: expected reset(...) before step and state, found no motion")
+        return self.episode
+
+    def step(self, action: Mapping[str, Any] | None = None) -> Stepped:
+        """As `Twin.step`; every command is the same in all worlds, or (count, 3), rotations (count, 3, 3), for each."""
+        return self._going().step(action)
+
+    @property
+    def state(self) -> TwinState:
+        """As `Twin.state`, of all worlds."""
+        return self._going().state
+
+    @state.setter
+    def state(self, state: TwinState) -> None:
+        self._going().state = state

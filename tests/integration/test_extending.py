@@ -1,0 +1,104 @@
+"""The package of docs/extending.md as the page has it, in a run of every stage: law, adapter, loss term, metric, format."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mosa.data.scene import load_scene
+
+ROOT = Path(__file__).parents[2]
+BLOCK = re.compile(r"```(?:python|yaml)\n# ([\w/]+\.(?:py|yaml))\n(.*?)```", re.DOTALL)
+"""Path and text of a file on the page; a YAML file's package, where it names one, is the line after."""
+QUICK = ["debug=default", "scene.holdout_frames=0", "fit=adam", "fit.prior.iterations=2", "fit.joint.iterations=2",
+         "fit.prior_eta.iterations=0", "heterogeneity.enabled=false", "simulation.particles=100", "reconstruction.resolution=40",
+         "reconstruction.static.iterations=30", "reconstruction.appearance.iterations=30", "reconstruction.carried.iterations=10",
+         "reconstruction.dynamic.iterations=10", "reconstruction.dynamic.track_iterations=10", "logger=csv",
+         "evaluation.video=false", "evaluation.samples=64", "evaluation.assignment=32"]  # fmt: skip
+
+
+def written(folder: Path) -> list[str]:
+    """The files of the page, below `folder`."""
+    names = []
+    for name, text in BLOCK.findall((ROOT / "docs" / "extending.md").read_text()):
+        file = folder / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+        names.append(name)
+    return names
+
+
+def recorded(folder: Path, cache: Path) -> Path:
+    """The tiny scene in the page's format."""
+    scene = load_scene(format="builtin", name="tiny", cache=cache)
+    kept = {"images": scene.images, "mattes": scene.mattes, "K": scene.cameras.K, "w2c": scene.cameras.w2c, "times": scene.times}
+    np.savez(folder / "fall.npz", **{name: value.numpy() for name, value in kept.items()})
+    return folder / "fall.npz"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, cache):
+    folder = tmp_path_factory.mktemp("extending")
+    assert len(written(folder)) == 9
+    given = [*QUICK, "extensions=[my_mosa]", f"hydra.searchpath=[file://{folder}/conf_of_mine]", "scene=recording",
+             f"scene.path={recorded(folder, cache)}", f"scene.cache={folder}/cache", "prior=fibres", "adapter=softer",
+             "+losses.volume=0.5"]  # fmt: skip
+    result = subprocess.run([sys.executable, "train.py", f"hydra.run.dir={folder}/run", *given], cwd=ROOT, capture_output=True,
+                            text=True, timeout=400, env=os.environ | {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"})
+    assert result.returncode == 0, result.stderr[-3000:]
+    return folder
+
+
+def test_the_law_is_learned_with_its_direction(run):
+    figures = json.loads((run / "run" / "metrics.json").read_text())
+    start = np.array([1, 0.2, 0]) / np.hypot(1, 0.2)
+    for prefix in ("id_prior", "id"):
+        fibre = np.array([figures[f"{prefix}/fibre_{axis}"] for axis in "xyz"])
+        assert np.linalg.norm(fibre) == pytest.approx(1, abs=1e-6) and 1e-3 < np.linalg.norm(fibre - start) < 0.5
+        assert figures[f"{prefix}/fibre_stiffness"] > 0
+        assert figures[f"{prefix}/fibre_stiffness"] != pytest.approx(2e3, rel=1e-3)
+
+
+def test_adapter_and_term_are_in_the_fit(run):
+    lines = next((run / "run").rglob("metrics.csv")).read_text()
+    header = lines.splitlines()[0].split(",")
+    assert {"loss_raw/volume", "loss_weighted/volume", "loss_raw/operator", "adapter/mean_abs_C"} <= set(header)
+    figures = json.loads((run / "run" / "metrics.json").read_text())
+    assert 0 < figures["train/mean_abs_C"] < 0.2
+
+
+def test_the_metric_is_in_the_tables(run):
+    figures = json.loads((run / "run" / "metrics.json").read_text())
+    for model in ("", "prior/"):
+        assert 0 < figures[f"{model}train/l1_crop"] < 255 and f"{model}train/l1_full" in figures
+    assert "| L1 crop " in (run / "run" / "results.md").read_text()
+
+
+LOAD = """
+import sys
+from mosa.errors import DataError
+from mosa.twin import Twin
+try:
+    Twin.load(sys.argv[1])
+except DataError as error:
+    print(error)
+import my_mosa
+twin = Twin.load(sys.argv[1])
+print(twin.simulate(frames=3).x.isfinite().all().item(), *twin.body.material.direction("fibre").tolist())
+"""
+
+
+def test_a_checkpoint_needs_the_package_and_does_not_import_it(run):
+    result = subprocess.run([sys.executable, "-c", LOAD, str(run / "run" / "checkpoints" / "last.ckpt")], cwd=run, text=True,
+                            capture_output=True, timeout=200, env=os.environ | {"PYTHONPATH": f"{run}{os.pathsep}{ROOT}"})
+    assert result.returncode == 0, result.stderr[-2000:]
+    refused, found = result.stdout.strip().splitlines()[-2:]
+    assert "expected one of" in refused and "found 'fibres'" in refused
+    flag, *numbers = found.split()
+    figures = json.loads((run / "run" / "metrics.json").read_text())
+    assert flag == "True" and [float(n) for n in numbers] == pytest.approx([figures[f"id/fibre_{a}"] for a in "xyz"], abs=1e-6)

@@ -1,0 +1,49 @@
+"""What another package registers: once, under a name of its own, with its keys known to the check of a configuration."""
+
+import pytest
+
+from mosa import metrics
+from mosa.data import scene
+from mosa.errors import ConfigError
+from mosa.extensions import load_extensions, registered_keys
+from mosa.metrics import Metric, register_metric
+from mosa.modules import adapters, terms
+from mosa.modules.adapters import register_adapter
+from mosa.modules.terms import register_term
+
+
+@pytest.mark.parametrize("names", [["no_such_package"], "text", [1]])
+def test_a_package_that_cannot_be_imported_is_named(names):
+    with pytest.raises(ConfigError, match=r"extensions: expected .*found"):
+        load_extensions(names)
+
+
+def test_no_extensions_are_none():
+    load_extensions(None)
+    load_extensions([])
+
+
+def test_a_name_is_taken_once(monkeypatch):
+    monkeypatch.setattr(terms, "TERMS", dict(terms.TERMS))
+    monkeypatch.setattr(adapters, "ADAPTERS", dict(adapters.ADAPTERS))
+    monkeypatch.setattr(scene, "FORMATS", dict(scene.FORMATS))
+    monkeypatch.setattr(metrics, "MOTION_METRICS", {})
+    mine, other = lambda *_: 0.0, lambda *_: 1.0
+    for register, first, second in (
+        (register_term, mine, other), (register_adapter, "a:b", "c:d"), (scene.register_format, "a:b", "c:d"),
+        (register_metric, Metric(mine, "mine"), Metric(other, "mine")),
+    ):  # fmt: skip
+        register("mine", first)
+        register("mine", first)
+        with pytest.raises(ConfigError, match="another"):
+            register("mine", second)
+    for name in ("rms_m", "psnr", "a/b", ""):
+        with pytest.raises(ConfigError, match=r"metric .*expected a name"):
+            register_metric(name, Metric(mine, "mine"))
+
+
+def test_the_arguments_of_an_adapter_and_the_weights_of_terms_are_keys():
+    keys = registered_keys({"adapter": {"name": "nclaw", "hidden": 8}})
+    assert {"adapter.start", "adapter.plastic_rate"} <= set(keys) and "adapter.rank" not in keys
+    weights = {f"losses.{name}" for name in terms.TERMS}
+    assert set(registered_keys({"adapter": {"name": None}})) == weights == set(registered_keys({"adapter": None}))
