@@ -28,10 +28,10 @@ class InformedSettings:
     """iterations: 0 for never; views: of every frame in each; lr: its step in units of the object's radius; elastic, bending:
     weights of the energies, counted from the prediction, as in `DynamicSettings`."""
 
-    iterations: int = 150
+    iterations: int = 80
     views: int = 1
-    lr: float = 0.01
-    elastic: float = 0.3
+    lr: float = 0.02
+    elastic: float = 1.0
     bending: float = 1.0
 
     def __post_init__(self) -> None:

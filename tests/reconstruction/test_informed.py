@@ -41,7 +41,7 @@ def bent(scaffold):
 
 def fitted(bent, predicted, seen, **settings):
     windows, body, _ = bent
-    chosen = InformedSettings(**{"iterations": 60} | settings)
+    chosen = InformedSettings(**{"iterations": 60, "lr": 0.01} | settings)
     motion = informed_motion(body, body, windows, OFFSETS, torch.ones(3), predicted, seen, chosen,
                              DynamicSettings(carriers="particles"), reach=0.1, seed=0)
     with torch.no_grad():
