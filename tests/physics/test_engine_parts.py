@@ -114,6 +114,20 @@ def test_what_is_made_of_weights_is_not_mixed_up_with_what_lies_where_they_lay()
             assert from_weights(lambda weights=weights: float(weights[0][0]), weights, "key") == value
 
 
+def test_a_part_of_the_physics_knows_only_those_below_it():
+    """launching < constitutive, grid < contact < reference < engine."""
+    order = {"launching": 0, "constitutive": 1, "grid": 1, "contact": 2, "reference": 3, "engine": 4}
+    root, upwards, seen = Path(mosa.physics.__file__).parent, [], set()
+    for path in root.rglob("*.py"):
+        own = path.relative_to(root).with_suffix("").parts[0]
+        for node in ast.walk(ast.parse(path.read_text())):
+            if own in order and isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("mosa.physics."):
+                other = node.module.split(".")[2]
+                seen.add((own, other))
+                upwards += [(path.name, other)] if own != other and order[other] >= order[own] else []
+    assert upwards == [] and {("engine", "grid"), ("contact", "grid"), ("constitutive", "launching")} <= seen
+
+
 def test_no_result_is_kept_under_an_id_or_an_address():
     """Those of something that is gone are given to something else."""
     found = []
