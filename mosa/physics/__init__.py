@@ -1,7 +1,8 @@
 """Differentiable MLS-MPM in NVIDIA Warp behind torch operations.
 
-`constitutive`: laws; `grid`: transfers; `contact`: planes and colliders; `engine`: what advances a body, from which `Simulator` is
-what a user starts with; `reference`: the pure-torch float64 twin of a substep.
+`constitutive`: laws; `grid`: transfers; `contact`: planes and colliders, on the nodes of a grid; `engine`: what advances a body
+with them, for a user `engine.simulator.Simulator`; `reference`: the pure-torch float64 twin of a substep; `launching`: what all
+kernels are launched with. A part imports those that it needs below it, never one above it (tests/physics/test_engine_parts.py).
 """
 
 import warp as wp

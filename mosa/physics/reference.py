@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.physics.contact.planes import THICKNESS, WHOLE, Plane
+from mosa.physics.contact.planes import THICKNESS, Plane
+from mosa.physics.contact.reference import fade
 from mosa.types import ParticleState
 
 EYE = torch.eye(3, dtype=torch.float64)
@@ -181,14 +182,6 @@ def stiffened_stress(law: str, measure: str, F: Tensor, p: dict[str, Tensor], S:
     F = F if F.requires_grad else F.clone().requires_grad_()
     slope = torch.autograd.grad(stiffness_energy(measure, F, p["mu"], S).sum(), F, create_graph=True)[0]
     return stress(law, F, p) + slope @ F.mT
-
-
-def fade(phi: Tensor, thickness: float) -> Tensor:
-    """Weight of the contact of nodes at distances phi (M,) [m]: 1 up to `WHOLE` of the thickness, then a smooth step to 0."""
-    if thickness == 0:
-        return (phi <= 1e-6).to(phi)
-    s = ((phi / thickness - WHOLE) / (1 - WHOLE)).clamp(0, 1)
-    return torch.where(phi <= 1e-6, torch.ones_like(phi), (1 - s) ** 2 * (1 + 2 * s))
 
 
 def collide(v: Tensor, y: Tensor, planes: Sequence[Plane], dx: float) -> Tensor:

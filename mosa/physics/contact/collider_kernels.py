@@ -17,7 +17,7 @@ import warp as wp
 from mosa.physics.contact.planes import make_fade, make_normal_adjoint, make_plane_functions
 from mosa.physics.contact.shapes import shape_functions
 from mosa.physics.grid.node_access import node_access
-from mosa.physics.grid.transfer_kernels import transfer_kernels
+from mosa.physics.grid.stencil import node_functions
 
 
 @cache
@@ -31,8 +31,8 @@ def collider_kernels(scalar) -> SimpleNamespace:
     weight = make_fade(scalar)
     shape = shape_functions(scalar)
     signed_distance, curvature = shape.signed_distance, shape.curvature
-    transfers = transfer_kernels(scalar)
-    node_position, nodes_of = transfers.node_position, transfers.nodes_of
+    nodes = node_functions(scalar)
+    node_position, nodes_of = nodes.node_position, nodes.nodes_of
     load3, store3 = node_access(scalar).load3, node_access(scalar).store3
     module = f"mosa.physics.colliders_{scalar.__name__}"
 

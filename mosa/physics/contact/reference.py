@@ -8,7 +8,15 @@ from torch import Tensor
 
 from mosa.physics.contact.colliders import Box, Capsule, Collider, Cylinder, HalfSpace, Sphere
 from mosa.physics.contact.mesh import SignedDistanceField
-from mosa.physics.reference import fade
+from mosa.physics.contact.planes import WHOLE
+
+
+def fade(phi: Tensor, thickness: float) -> Tensor:
+    """Weight of the contact of nodes at distances phi (M,) [m]: 1 up to `WHOLE` of the thickness, then a smooth step to 0."""
+    if thickness == 0:
+        return (phi <= 1e-6).to(phi)
+    s = ((phi / thickness - WHOLE) / (1 - WHOLE)).clamp(0, 1)
+    return torch.where(phi <= 1e-6, torch.ones_like(phi), (1 - s) ** 2 * (1 + 2 * s))
 
 
 def signed_distance(shape, q: Tensor) -> Tensor:

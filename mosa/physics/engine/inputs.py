@@ -10,8 +10,12 @@ from torch import Tensor
 
 from mosa.errors import ConfigError
 from mosa.physics.constitutive.laws import SLOTS, Law
+from mosa.physics.contact.colliders import Collider
+from mosa.physics.contact.motion import Motion, Trajectory
 from mosa.physics.engine.numerics import Numerics, State
 from mosa.types import ParticleState
+
+UNBOUNDED = 1e30
 
 
 def pack_parameters(
@@ -106,6 +110,37 @@ def gravity_of_worlds(
     if tuple(gravity.shape) != (worlds, 3) or not bool(torch.isfinite(gravity).all()):
         raise ConfigError(f"gravity: expected finite numbers of shape ({worlds}, 3), found shape {tuple(gravity.shape)}")
     return tuple(map(tuple, gravity.tolist()))
+
+
+def checked_motions(
+    motions: Sequence[Motion | Trajectory] | None, colliders: Sequence[Collider]
+) -> Sequence[Motion | Trajectory]:
+    """One for each collider, by default its own. Errors: ConfigError."""
+    motions = [collider.motion for collider in colliders] if motions is None else motions
+    if len(motions) != len(colliders):
+        raise ConfigError(f"motions: expected one for each of {len(colliders)} colliders, found {len(motions)}")
+    return motions
+
+
+def motions_of_worlds(
+    motions: Sequence | None, colliders: Sequence[Collider], worlds: int
+) -> list[Sequence[Motion | Trajectory]]:
+    """Of the colliders in every world: those of one for all, or a sequence for each. Errors: ConfigError."""
+    if motions is None or not any(isinstance(own, Sequence) for own in motions):
+        return [checked_motions(motions, colliders)] * worlds
+    if len(motions) != worlds:
+        raise ConfigError(f"motions: expected one sequence for each of {worlds} worlds, found {len(motions)}")
+    return [checked_motions(own, colliders) for own in motions]
+
+
+def corners(box: Tensor | None) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """(low, high) [m] of the domain (2, 3) that particles may not leave, far away where there is none. Errors: ConfigError."""
+    if box is None:
+        return (-UNBOUNDED,) * 3, (UNBOUNDED,) * 3
+    low, high = (tuple(corner) for corner in torch.as_tensor(box).double().tolist())
+    if not all(a < b for a, b in zip(low, high)):
+        raise ConfigError(f"box: expected min < max on every axis, found {low} and {high}")
+    return low, high
 
 
 def polar_rotation(F: Tensor) -> Tensor:

@@ -31,8 +31,11 @@ from mosa.physics.engine.clock import Adaptive, Clock, Replay
 from mosa.physics.engine.inputs import (
     check_state,
     checked_density,
+    checked_motions,
+    corners,
     count_of_worlds,
     gravity_of_worlds,
+    motions_of_worlds,
     pack_parameters,
     polar_rotation,
 )
@@ -45,7 +48,6 @@ from mosa.physics.engine.stepping import Moment, Prepared, Stepper, mean_force, 
 from mosa.physics.launching import SCALARS
 from mosa.types import Ground, ParticleState, Rollout
 
-_UNBOUNDED = 1e30
 RECORDED = ("x", "v", "F", "F_tot")
 """What a `Rollout` holds of every frame."""
 
@@ -117,12 +119,7 @@ class Simulator:
         values, modes = pack_planes(all_planes, dtype, self.device, float(dx))
         self.colliders = tuple(colliders)
         packed_colliders = pack_colliders(self.colliders, dtype, self.device, float(dx)) if self.colliders else None
-        if box is None:
-            low, high = (-_UNBOUNDED,) * 3, (_UNBOUNDED,) * 3
-        else:
-            low, high = (tuple(corner) for corner in torch.as_tensor(box).double().tolist())
-            if not all(a < b for a, b in zip(low, high)):
-                raise ConfigError(f"box: expected min < max on every axis, found {low} and {high}")
+        low, high = corners(box)
         self.numerics = Numerics(
             law=self.law, dtype=dtype, device=self.device, dx=float(dx), dt=self.dt, gravity=tuple(gravity.tolist()),
             planes=values, modes=modes, plane_count=len(all_planes), low=low, high=high, norm_eps=float(norm_eps),
@@ -179,17 +176,15 @@ class Simulator:
         Frame 0 of the result holds the state as given. Errors: SimulationDiverged naming substep and particle; ConfigError.
         """
         prepared = self._prepare(state, parameters, volume, density, adapter, stride, collect, frames)
-        motions = self._motions(motions)
+        motions = checked_motions(motions, self.colliders)
         clock = self._clock(timing, frames, prepared, parameters, density, motions)
-        poses = () if clock.varies else self._poses(motions, frames, start_time)
 
         def along(clock: Clock) -> tuple[Tensor, ...]:
-            if not clock.varies or not self.colliders:
-                return tuple(part[clock.first : clock.first + clock.count] for part in poses)
             place = len(clock.taken) - 1, frames - 1, clock.taken, self.frame_dt, start_time
             return sample_frame(motions, *place, self.dtype, self.device, isinstance(timing, Replay))
 
-        return self._run(prepared, self._begun(state, started), frames, clock, poses, along, started, progress, self.chained)
+        poses = along if clock.varies and self.colliders else self._poses(motions, frames, start_time)
+        return self._run(prepared, self._begun(state, started), frames, clock, poses, started, progress, self.chained)
 
     def rollout_worlds(
         self,
@@ -222,15 +217,11 @@ class Simulator:
         worlds = count_of_worlds(state, together)
         gravities = gravity_of_worlds(gravity, worlds, self.numerics.gravity)
         prepared = self._prepare(state, parameters, volume, density, adapter, stride, None, frames, worlds, gravities, together)
-        each = self._motions_of_worlds(motions, worlds)
+        each = motions_of_worlds(motions, self.colliders, worlds)
         poses = [self._poses(own, frames, start_time) for own in each]
         poses = tuple(torch.cat(parts, 1) for parts in zip(*poses))
         clock = Clock(self.frame_dt, self.substeps)
-
-        def along(clock: Clock) -> tuple[Tensor, ...]:
-            return tuple(part[clock.first : clock.first + clock.count] for part in poses)
-
-        found = self._run(prepared, self._begun(state, started), frames, clock, poses, along, started, progress)
+        found = self._run(prepared, self._begun(state, started), frames, clock, poses, started, progress)
         apart = {name: getattr(found, name).unflatten(1, (worlds, -1)) for name in RECORDED}
         final = ParticleState(*(t.unflatten(0, (worlds, -1)) for t in State.of(found.final)))
         forces = None if found.reactions is None else found.reactions.unflatten(2, (worlds, -1))
@@ -266,7 +257,7 @@ class Simulator:
             raise ConfigError("gravity and together: expected None without worlds; gravity is the simulator's")
         gravities = None if worlds is None else gravity_of_worlds(gravity, worlds, self.numerics.gravity)
         prepared = self._prepare(state, parameters, volume, density, adapter, stride, None, 1, worlds, gravities, together)
-        each = [self._motions(motions)] if worlds is None else self._motions_of_worlds(motions, worlds)
+        each = [checked_motions(motions, self.colliders)] if worlds is None else motions_of_worlds(motions, self.colliders, worlds)
         each = [[m.timed(None, self.frame_dt) if isinstance(m, Motion) else m for m in own] for own in each]
         chooser = None if timing is None else self._chooser(timing.control, prepared, parameters, density, each[0])
         current = self._begun(state, started)
@@ -276,11 +267,12 @@ class Simulator:
         return stepper, Moment(current, self.substeps if started else 0)
 
     def _run(
-        self, prepared: Prepared, start: ParticleState, frames: int, clock: Clock, poses: tuple[Tensor, ...],
-        along: Callable[[Clock], tuple[Tensor, ...]], started: bool, progress: Callable[[int], None] | None, chained: bool = False,
+        self, prepared: Prepared, start: ParticleState, frames: int, clock: Clock,
+        poses: tuple[Tensor, ...] | Callable[[Clock], tuple[Tensor, ...]], started: bool, progress: Callable[[int], None] | None,
+        chained: bool = False,
     ) -> Rollout:  # fmt: skip
-        """The frames, of one body or of many worlds one after another. poses: of the colliders at all substeps, where these are
-        known beforehand; along: at those of the frame that is under way; chained: where the adapter can be."""
+        """The frames, of one body or of many worlds one after another. poses: of the colliders at all substeps or, where these
+        are not known beforehand, what tells those of the frame that is under way; chained: where the adapter can be."""
         current = flat(start)
         recorded = {name: [getattr(current, name)] for name in RECORDED}
         if frames > 1:
@@ -294,7 +286,8 @@ class Simulator:
             states = self._chains.frames(
                 prepared.lanes.solvers[0], prepared.adapter, current, prepared.packed, frames - 1, lengths, prepared.collect
             )
-        wanted, total = wants_gradient((*current, *prepared.held.values(), *poses)), (frames - 1) * self.substeps
+        known = () if callable(poses) else poses
+        wanted, total = wants_gradient((*current, *prepared.held.values(), *known)), (frames - 1) * self.substeps
         if states is None:
             prepared.give_memory(total, wanted)
         prepared.choose_lengths(total, wanted, clock.varies)
@@ -305,8 +298,9 @@ class Simulator:
             if states is not None:
                 current, forces = next(states), None
             else:
-                lengths = prepared.lengths(clock.count, clock.varies)
-                current, forces = prepared.frame(current, lengths, clock.first, along(clock), clock.steps)
+                lengths, first = prepared.lengths(clock.count, clock.varies), clock.first
+                along = poses(clock) if callable(poses) else tuple(part[first : first + clock.count] for part in poses)
+                current, forces = prepared.frame(current, lengths, first, along, clock.steps)
             if forces is not None:
                 reactions.append(mean_force(forces, clock.steps) if clock.varies else forces)
             for name, values in recorded.items():
@@ -386,19 +380,6 @@ class Simulator:
         return Rollout(
             **stacked, times=times, final=ParticleState(*current), inverted=inverted, reactions=per_frame, counts=tuple(taken)
         )
-
-    def _motions_of_worlds(self, motions: Sequence | None, worlds: int) -> list[Sequence[Motion | Trajectory]]:
-        if motions is None or not any(isinstance(own, Sequence) for own in motions):
-            return [self._motions(motions)] * worlds
-        if len(motions) != worlds:
-            raise ConfigError(f"motions: expected one sequence for each of {worlds} worlds, found {len(motions)}")
-        return [self._motions(own) for own in motions]
-
-    def _motions(self, motions: Sequence[Motion | Trajectory] | None) -> Sequence[Motion | Trajectory]:
-        motions = [collider.motion for collider in self.colliders] if motions is None else motions
-        if len(motions) != len(self.colliders):
-            raise ConfigError(f"motions: expected one for each of {len(self.colliders)} colliders, found {len(motions)}")
-        return motions
 
     def _poses(self, motions: Sequence[Motion | Trajectory], frames: int, start_time: float) -> tuple[Tensor, ...]:
         if not self.colliders:

@@ -16,6 +16,7 @@ from torch import Tensor
 from mosa.physics.constitutive.laws import SLOTS
 from mosa.physics.constitutive.material_kernels import kernels_of
 from mosa.physics.contact.collider_buffers import ColliderBuffers
+from mosa.physics.contact.grid_update import update_kernels
 from mosa.physics.engine.capture import Graphs, WarpCapture
 from mosa.physics.engine.numerics import Numerics, State, Steps
 from mosa.physics.grid.transfer_kernels import NO_EVENT, transfer_kernels
@@ -46,7 +47,7 @@ class Workspace:
         self.worlds, self.size = worlds, particles // worlds
         self.numerics, self.particles, self.substeps, self.with_adjoint = numerics, particles, substeps, with_adjoint
         self.scalar = SCALARS[numerics.dtype]
-        self.kernels = transfer_kernels(self.scalar)
+        self.kernels, self.update = transfer_kernels(self.scalar), update_kernels(self.scalar)
         self.stress, self.mapping = kernels_of(numerics.law, self.scalar, adapted, plastic_adapted, numerics.strain)
         self.plastic = numerics.law.plastic
         n = particles
@@ -276,7 +277,7 @@ class Workspace:
                 self.x_wp[a], self.v_wp[a], self.C_affine_wp[a], self.F_wp[a], self.tau_wp[g], self.mass_wp, self.volume_wp,
                 *(geometry if step else kicked), int(numerics.check_J), step, self.flags_wp, self.grid_wp[g],
             ])  # fmt: skip
-            self.over_nodes(kernels.grid_update, [*self._grid_arguments(g, step), self.velocity_wp[g]])
+            self.over_nodes(self.update.grid_update, [*self._grid_arguments(g, step), self.velocity_wp[g]])
             if self.colliders is not None:
                 self.colliders.apply(step, self._collider_place(g), self._kick(step), self.velocity_wp[g])
             self._run(kernels.g2p, n, [
@@ -311,9 +312,9 @@ class Workspace:
             ])  # fmt: skip
             if self.colliders is not None:
                 # the velocities that the colliders found are cheaper to compute again than to keep
-                self.over_nodes(kernels.grid_update, [*self._grid_arguments(step, step), self.colliders.before_wp])
+                self.over_nodes(self.update.grid_update, [*self._grid_arguments(step, step), self.colliders.before_wp])
                 self.colliders.adjoint(step, self._collider_place(step), self._kick(step), self.adj_velocity_wp)
-            self.over_nodes(kernels.adj_grid, [*self._grid_arguments(step, step), self.adj_velocity_wp, self.adj_grid_wp])
+            self.over_nodes(self.update.adj_grid, [*self._grid_arguments(step, step), self.adj_velocity_wp, self.adj_grid_wp])
             if self.colliders is not None:
                 self.colliders.add_mass(self.adj_grid_wp)
             self._run(kernels.adj_p2g, n, [

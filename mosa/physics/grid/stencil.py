@@ -1,4 +1,4 @@
-"""The 27 nodes around a particle: quadratic B-splines, and where the stencil lies in a window."""
+"""Where nodes are, and the 27 around a particle: quadratic B-splines, and where the stencil lies in a window."""
 
 # ruff: noqa: UP018, RUF046
 # (Warp: `int(0)` makes a variable that a dynamic loop or branch may change)
@@ -49,3 +49,26 @@ def stencil_functions(scalar) -> SimpleNamespace:
         return r
 
     return SimpleNamespace(spline=spline, spline_slope=spline_slope, cell=cell, local_cell=local_cell)
+
+
+@cache
+def node_functions(scalar) -> SimpleNamespace:
+    """Warp functions node_position, nodes_of."""
+    vec3 = wp.types.vector(length=3, dtype=scalar)
+
+    @wp.func
+    def node_position(node: int, origin: wp.vec3i, dims: wp.vec3i, dx: scalar):
+        plane = dims[1] * dims[2]
+        i = node / plane
+        j = (node - i * plane) / dims[2]
+        k = node - i * plane - j * dims[2]
+        return dx * vec3(scalar(origin[0] + i), scalar(origin[1] + j), scalar(origin[2] + k))
+
+    @wp.func
+    def nodes_of(window: wp.array(dtype=wp.vec3i), world: int):
+        """(first, last + 1) of a world's nodes in the arrays."""
+        dims = window[3 * world + 1]
+        first = window[3 * world + 2][0]
+        return first, first + dims[0] * dims[1] * dims[2]
+
+    return SimpleNamespace(node_position=node_position, nodes_of=nodes_of)

@@ -14,8 +14,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from mosa.physics.grid.node_access import node_access
-from mosa.physics.grid.node_kernels import node_kernels
-from mosa.physics.grid.stencil import stencil_functions
+from mosa.physics.grid.stencil import node_functions, stencil_functions
 
 # slots of the flag array: the first substep * N + particle at which the event happened
 WINDOW, NONFINITE, OUTSIDE, INVERTED = 0, 1, 2, 3
@@ -29,17 +28,26 @@ _FLIPPED = wp.constant(INVERTED)
 
 @cache
 def transfer_kernels(scalar) -> SimpleNamespace:
-    """Kernels p2g, g2p, adj_g2p, adj_p2g, and those of `node_kernels`, for wp.float32 or wp.float64 fields."""
+    """Kernels clear, p2g, g2p, adj_g2p, adj_p2g for wp.float32 or wp.float64 fields.
+
+    clear is launched with `threads` for each world and takes all nodes of its window, however many threads that is."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
     vec4 = wp.types.vector(length=4, dtype=scalar)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
-    memory, stencil = node_access(scalar), stencil_functions(scalar)
-    load3, load4, add3, add4 = memory.load3, memory.load4, memory.add3, memory.add4
+    memory, stencil, nodes_of = node_access(scalar), stencil_functions(scalar), node_functions(scalar).nodes_of
+    load3, load4, store4, add3, add4 = memory.load3, memory.load4, memory.store4, memory.add3, memory.add4
     spline, spline_slope, cell, local_cell = stencil.spline, stencil.spline_slope, stencil.cell, stencil.local_cell
     module = f"mosa.physics.transfers_{scalar.__name__}"
-    nodes = node_kernels(scalar, module)
 
     # `steps` in the kernels holds the node offsets as scalars: Warp 1.19 retypes a loop variable that is cast to float64
+
+    @wp.kernel(module=module, enable_backward=False)
+    def clear(window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4)):
+        z = scalar(0.0)
+        world = wp.tid() / threads
+        first, end = nodes_of(window, world)
+        for node in range(first + wp.tid() - world * threads, end, threads):
+            store4(grid, node, vec4(z, z, z, z))
 
     @wp.kernel(module=module, enable_backward=False)
     def p2g(
@@ -279,4 +287,6 @@ def transfer_kernels(scalar) -> SimpleNamespace:
         adj_tau[p] = -stiffness * aB
         adj_x[p] = adj_x[p] + inv_dx * (vec3(gx, gy, gz) - wp.transpose(B) * s)
 
-    return SimpleNamespace(p2g=p2g, g2p=g2p, adj_g2p=adj_g2p, adj_p2g=adj_p2g, vec3=vec3, vec4=vec4, mat33=mat33, **vars(nodes))
+    return SimpleNamespace(
+        clear=clear, p2g=p2g, g2p=g2p, adj_g2p=adj_g2p, adj_p2g=adj_p2g, vec3=vec3, vec4=vec4, mat33=mat33
+    )

@@ -1,4 +1,4 @@
-"""What happens at the nodes: from momentum to velocity, gravity, contact with planes, and the adjoint of it."""
+"""The grid update: from momentum to velocity, gravity, contact with planes, and the adjoint of it."""
 
 from functools import cache
 from types import SimpleNamespace
@@ -7,31 +7,25 @@ import warp as wp
 
 from mosa.physics.contact.planes import make_fade, make_plane_functions
 from mosa.physics.grid.node_access import node_access
+from mosa.physics.grid.stencil import node_functions
 
 
 @cache
-def node_kernels(scalar, module: str) -> SimpleNamespace:
-    """Kernels clear, grid_update, adj_grid in the Warp module of that name, functions node_position, nodes_of; scalar: as
-    `transfer_kernels`.
+def update_kernels(scalar) -> SimpleNamespace:
+    """Kernels grid_update, adj_grid for wp.float32 or wp.float64 fields.
 
-    The kernels are launched with `threads` for each world and take all nodes of its window, however many threads that is."""
+    They are launched with `threads` for each world and take all nodes of its window, however many threads that is."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
     vec4 = wp.types.vector(length=4, dtype=scalar)
     collide, adj_collide = make_plane_functions(scalar)
-    fade, memory = make_fade(scalar), node_access(scalar)
+    fade, memory, nodes = make_fade(scalar), node_access(scalar), node_functions(scalar)
     load3, load4, store3, store4 = memory.load3, memory.load4, memory.store3, memory.store4
+    node_position, nodes_of = nodes.node_position, nodes.nodes_of
+    module = f"mosa.physics.grid_update_{scalar.__name__}"
 
     @wp.func
     def free_velocity(g: vec4, impulse: vec3):
         return vec3(g[0], g[1], g[2]) / g[3] + impulse
-
-    @wp.func
-    def node_position(node: int, origin: wp.vec3i, dims: wp.vec3i, dx: scalar):
-        plane = dims[1] * dims[2]
-        i = node / plane
-        j = (node - i * plane) / dims[2]
-        k = node - i * plane - j * dims[2]
-        return dx * vec3(scalar(origin[0] + i), scalar(origin[1] + j), scalar(origin[2] + k))
 
     @wp.func
     def touch(y: vec3, planes: wp.array2d(dtype=scalar), i: int):
@@ -69,21 +63,6 @@ def node_kernels(scalar, module: str) -> SimpleNamespace:
                 normal = vec3(planes[i, 0], planes[i, 1], planes[i, 2])
                 a = (scalar(1.0) - w) * a + adj_collide(before, normal, modes[i], planes[i, 4], w * a)
         return a
-
-    @wp.func
-    def nodes_of(window: wp.array(dtype=wp.vec3i), world: int):
-        """(first, last + 1) of a world's nodes in the arrays."""
-        dims = window[3 * world + 1]
-        first = window[3 * world + 2][0]
-        return first, first + dims[0] * dims[1] * dims[2]
-
-    @wp.kernel(module=module, enable_backward=False)
-    def clear(window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4)):
-        z = scalar(0.0)
-        world = wp.tid() / threads
-        first, end = nodes_of(window, world)
-        for node in range(first + wp.tid() - world * threads, end, threads):
-            store4(grid, node, vec4(z, z, z, z))
 
     @wp.kernel(module=module, enable_backward=False)
     def grid_update(
@@ -130,6 +109,4 @@ def node_kernels(scalar, module: str) -> SimpleNamespace:
                 z = scalar(0.0)
                 store4(adj_grid, node, vec4(z, z, z, z))
 
-    return SimpleNamespace(
-        clear=clear, grid_update=grid_update, adj_grid=adj_grid, node_position=node_position, nodes_of=nodes_of
-    )
+    return SimpleNamespace(grid_update=grid_update, adj_grid=adj_grid)

@@ -1,0 +1,139 @@
+"""The parts that segments and chains share: graphs, budget, clock, what is known of tensors."""
+
+import ast
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+
+import mosa.physics
+from mosa.physics.engine.adaptive_steps import StepControl
+from mosa.physics.engine.budget import Budget
+from mosa.physics.engine.capture import ATTEMPTS, MAX_GRAPHS, Graphs, Strategy
+from mosa.physics.engine.clock import Adaptive, Clock, Replay
+from mosa.physics.engine.network_evaluation import from_weights, same_weights
+from mosa.physics.launching import same_memory
+
+
+class Counted(Strategy):
+    """Runs and captures are told apart by what they leave in `said`; the first `broken` captures fail."""
+
+    def __init__(self, broken: int = 0) -> None:
+        self.said, self.broken = [], broken
+
+    def run(self, body) -> None:
+        body()
+        self.said.append("run")
+
+    def capture(self, body):
+        if self.broken:
+            self.broken -= 1
+            raise RuntimeError("no")
+        body()
+        self.said.append("captured")
+        return lambda: self.said.append("replayed")
+
+
+def play(graphs: Graphs, name="pass") -> str:
+    if graphs.waits(name):
+        graphs.capture(name, lambda: None)
+    graphs.play(name, lambda: None)
+    return graphs.strategy.said[-1]
+
+
+def test_a_pass_is_run_then_captured_then_replayed():
+    graphs = Graphs(Counted(), "")
+    assert not graphs.waits("pass")
+    assert [play(graphs) for _ in range(3)] == ["run", "replayed", "replayed"]
+    assert graphs.strategy.said == ["run", "captured", "replayed", "replayed"]
+    graphs.drop()
+    assert len(graphs) == 0 and play(graphs) == "replayed"  # captured at once
+    graphs.forget()
+    assert play(graphs) == "run" and play(graphs, "another") == "run"
+
+
+def test_captures_that_fail_are_tried_a_few_times_in_a_row():
+    graphs = Graphs(Counted(broken=ATTEMPTS - 1), "passes are slow")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert [play(graphs) for _ in range(ATTEMPTS + 1)] == ["run"] * ATTEMPTS + ["replayed"]
+    graphs = Graphs(Counted(broken=ATTEMPTS), "passes are slow")
+    with pytest.warns(UserWarning, match="passes are slow: no"):
+        assert [play(graphs) for _ in range(ATTEMPTS + 3)] == ["run"] * (ATTEMPTS + 3)
+    assert Graphs(Counted(), "", attempts=0).attempts == 0 and not graphs.waits("pass")
+
+
+def test_there_are_never_many_more_graphs_than_allowed():
+    graphs = Graphs(Counted(), "")
+    for dt in range(3 * MAX_GRAPHS):
+        play(graphs, dt), play(graphs, dt)
+        assert len(graphs) <= MAX_GRAPHS + 1
+
+
+def test_a_budget_is_spent_and_comes_back():
+    budget, tape = Budget(), [torch.zeros(10), torch.zeros(30)]  # 160 bytes
+    assert budget.keep(tape) == []
+    budget.room = 200.0
+    assert budget.keep(tape) is tape and budget.room == 40 and budget.keep(tape) == []
+    budget.used(tape)
+    assert budget.room == 200
+
+
+def test_velocities_lie_between_the_positions_of_steps_that_vary():
+    fixed = Clock(0.1, 5)
+    assert fixed.dt == 0.1 / 5 and not fixed.varies  # before the first frame too
+    fixed.start(None), fixed.start(None)
+    assert (fixed.count, fixed.first, fixed.steps, fixed.taken) == (5, 5, None, [5, 5])
+    counts = [4, 10, 5]
+    clock = Clock(0.1, 5, lambda frame, state: counts[frame - 1], lag=0.0)
+    found = []
+    for _ in counts:
+        clock.start(None)
+        found.append((clock.first, *clock.steps))
+    expected = [(0, 0.0125, 0.025), (4, 0.0175, 0.01), (14, 0.015, 0.02)]
+    assert found == [pytest.approx(e) for e in expected]
+    late = Clock(0.1, 5, lambda frame, state: 4)
+    late.start(None)
+    assert late.steps.kick == late.steps.dt == 0.1 / 4
+    assert Adaptive(StepControl()).lag is None and Replay([3]).lag is None
+
+
+def test_memory_is_the_same_whoever_views_it():
+    a = torch.arange(6.0)
+    leaf = torch.nn.Parameter(a)
+    assert same_memory([a, leaf], [leaf.detach(), a])
+    assert not same_memory([a], [a.clone()]) and not same_memory([a], [a[:3]]) and not same_memory([a], [a, a])
+
+
+def test_what_is_made_of_weights_is_not_mixed_up_with_what_lies_where_they_lay():
+    """Freed memory may come back at the same address: what was made of it is held, so that it does not."""
+    with same_weights():
+        for value in range(50):
+            weights = [torch.full((1000,), float(value))]
+            assert from_weights(lambda weights=weights: float(weights[0][0]), weights, "key") == value
+
+
+def test_a_part_of_the_physics_knows_only_those_below_it():
+    """launching < constitutive, grid < contact < reference < engine."""
+    order = {"launching": 0, "constitutive": 1, "grid": 1, "contact": 2, "reference": 3, "engine": 4}
+    root, upwards, seen = Path(mosa.physics.__file__).parent, [], set()
+    for path in root.rglob("*.py"):
+        own = path.relative_to(root).with_suffix("").parts[0]
+        for node in ast.walk(ast.parse(path.read_text())):
+            if own in order and isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("mosa.physics."):
+                other = node.module.split(".")[2]
+                seen.add((own, other))
+                upwards += [(path.name, other)] if own != other and order[other] >= order[own] else []
+    assert upwards == [] and {("engine", "grid"), ("contact", "grid"), ("constitutive", "launching")} <= seen
+
+
+def test_no_result_is_kept_under_an_id_or_an_address():
+    """Those of something that is gone are given to something else."""
+    found = []
+    for path in sorted(Path(mosa.physics.__file__).parent.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call):
+                name = node.func.id if isinstance(node.func, ast.Name) else getattr(node.func, "attr", None)
+                found += [(path.name, name)] if name in ("id", "data_ptr") else []
+    assert found == [("launching.py", "data_ptr")]  # of alignment
