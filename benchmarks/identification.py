@@ -99,9 +99,9 @@ def read(path: Path, overrides: list[str], device: str) -> SimpleNamespace:
 @torch.no_grad()
 def errors(case: SimpleNamespace, **switches: bool) -> dict[str, float]:
     """By sequence, [mm]."""
-    chosen, found = sampled(len(case.body.rest), torch.device("cpu")), {}
+    chosen, found, model = sampled(len(case.body.rest), torch.device("cpu")), {}, case.body.model().only(**switches)
     for prefix, s in case.problem["sequences"].items():
-        x = case.body.simulate(s["start"], case.module.world, s["frames"], s["frame_dt"], **switches).x[:, chosen].cpu()
+        x = case.body.simulate(s["start"], case.module.world, s["frames"], s["frame_dt"], model=model).x[:, chosen].cpu()
         found[prefix] = rms_mm((x - s["truth"])[s["contact"] :])
     return found
 
@@ -119,7 +119,7 @@ def fit(path: Path, overrides: list[str], device: str) -> dict:
     calibration = module.identifying(stages[0])
     calibration.search()
     run(calibration, stages[0].iterations)
-    prior = errors(case, with_adapter=False, with_heterogeneity=False)
+    prior = errors(case, heterogeneity=False, adapter=False)
     body.adapter.switch_on(body.material.reference_modulus(), body.material.poisson())
     joint = module.identifying(stages[-1])
     taken = run(joint, stages[-1].iterations)

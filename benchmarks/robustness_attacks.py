@@ -18,7 +18,6 @@ import cv2
 import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
-from mosa.keys import EVALUATION, TRAINING
 from omegaconf import OmegaConf
 
 from mosa.config import build_body, build_world, rehearse
@@ -26,6 +25,7 @@ from mosa.data.export import export_transforms
 from mosa.data.scene import load_scene
 from mosa.data.splats import load_ply
 from mosa.errors import MosaError
+from mosa.keys import EVALUATION, TRAINING
 from mosa.known import check_known
 from mosa.modules.body import Start
 from mosa.npz import read_npz, write_npz

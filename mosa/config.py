@@ -19,7 +19,7 @@ from mosa.modules.criteria import Criterion
 from mosa.modules.heterogeneity import HeterogeneityField
 from mosa.modules.identification import IdentificationSettings, few_numbers
 from mosa.modules.material import Material
-from mosa.modules.stages import Stage
+from mosa.modules.stages import STAGES, Stage
 from mosa.modules.stiffness_modes import StiffnessModes
 from mosa.modules.terms import check_terms
 from mosa.physics.constitutive.laws import law_named
@@ -193,12 +193,12 @@ def build_stages(
     """The stages of a run, without those that have nothing to optimise or no iterations, each with the optimiser that it runs.
 
     searching: whether the calibration chooses the law too."""
-    stages = [known_keys(f"fit.{name}", Stage, fit[name], name) for name in ("prior", "prior_eta", "joint")]
-    parts = {"prior": (), "prior_eta": (heterogeneity,), "joint": (heterogeneity, adapter)}
-    wanted = {"prior": True, "prior_eta": heterogeneity is not None, "joint": adapter is not None or heterogeneity is not None}
-    stages = [s.resolved(all(map(few_numbers, parts[s.name]))) for s in stages if wanted[s.name] and s.iterations > 0]
+    stages = [known_keys(f"fit.{name}", Stage, fit[name], name) for name in STAGES]
+    learned = {s.name: s.learns(heterogeneity, adapter) for s in stages}
+    wanted = [s for s in stages if s.iterations > 0 and (s.calibrates or any(part is not None for part in learned[s.name]))]
+    stages = [s.resolved(all(map(few_numbers, learned[s.name]))) for s in wanted]
     if searching and stages and not stages[0].newton:
         raise ConfigError("prior=auto: expected fit.prior.optimizer=auto or gauss_newton, which compares candidates; found adam")
-    if not stages or stages[0].name != "prior":
+    if not stages or not stages[0].calibrates:
         raise ConfigError("fit.prior.iterations: expected at least 1: every later figure is compared with the calibrated prior")
     return stages

@@ -174,7 +174,7 @@ def speed_of_rollouts(body: Body, frame_dt: float, gravity: torch.Tensor, up: to
     with torch.no_grad():
         for _ in range(2):
             began = time.perf_counter()
-            body.simulate(start, world, 3, frame_dt, with_adapter=False, observed=seen, gain=0.1)
+            body.simulate(start, world, 3, frame_dt, model=body.model().only(adapter=False), observed=seen, gain=0.1)
             if body.rest.is_cuda:
                 torch.cuda.synchronize()
             took = (time.perf_counter() - began) / 2
@@ -243,8 +243,8 @@ def seconds_of_fit(module: LitMosa, speeds: Speeds, frames: int, processes: int 
     step = (BACKWARD * rollout + views * frames * speeds.picture) * -(-len(module.takes) // processes)
     total = KERNELS
     for stage in module.stages:
-        adapted = ADAPTER_COST if stage.name == "joint" and networks else 1.0
-        stiff = STIFFNESS_COST if stage.name == "joint" and body.adapter is not None else 1.0
+        adapted = ADAPTER_COST if stage.learns_adapter and networks else 1.0
+        stiff = STIFFNESS_COST if stage.learns_adapter and body.adapter is not None else 1.0
         total += module.rollouts(stage) * rollout * stiff if stage.newton else stage.iterations * step * adapted
     return total
 
@@ -263,7 +263,7 @@ def seconds_of_parts(cfg: Mapping[str, Any], size: Size, window: int, module: Li
     reconstruction = (1.0 if stored else still + motion) + (size.taught - 1) * motion
     poses = (size.sequences - 1) * (0.5 + 3e-4 * size.cameras * window) + size.sequences * 4e-5 * size.cameras * window
     rollout = moving * speeds.frame
-    draws = DRAWS + 1 if any(stage.newton and stage.name == "joint" for stage in module.stages) else 0
+    draws = DRAWS + 1 if any(stage.newton and stage.learns_adapter for stage in module.stages) else 0
     count = min(size.particles, cfg["evaluation"]["assignment"])
     distances = 0.6 * size.frames * 0.02 + 4 * 0.4 * (count / 2048) ** 2.4
     shown = 3 * size.sequences * size.cameras * size.frames

@@ -95,7 +95,7 @@ class Episode:
         self.names = [collider.name or str(i) for i, collider in enumerate(world.colliders)]
         if twice := sorted({name for name in self.names if self.names.count(name) > 1}):
             raise ConfigError(f"colliders: expected names of their own, found {', '.join(twice)} more than once")
-        options = {"frames": frames, "frame_dt": frame_dt, "variant": variant, "substeps": substeps}
+        options = {"frames": frames, "frame_dt": frame_dt, "model": body.model(variant), "substeps": substeps}
         with self._gradients():
             if self.worlds is None:
                 ready = body.ready(starts, world, **options)
@@ -331,9 +331,9 @@ def _worlds(
     """(all worlds, with a lift (3,) [m] where it is the same in all; the state of a world at a start)."""
     if body.settings.adaptive:
         raise ConfigError("simulation.adaptive: expected false with many worlds, which take the same substeps")
-    if laws is not None and (len(laws) != len(starts) or options["variant"] != "adapted"):
-        raise ConfigError(f"laws: expected one for each of {len(starts)} worlds, of variant adapted, found {len(laws)} of "
-                          f"{options['variant']}")
+    if laws is not None and (len(laws) != len(starts) or options["model"] != body.model()):
+        raise ConfigError(f"laws: expected one for each of {len(starts)} worlds, of variant adapted, found {len(laws)}"
+                          f"{'' if options['model'] == body.model() else ' of another variant'}")
     pulls = [world.gravity.to(body.rest)] * len(starts) if gravity is None else list(gravity.to(body.rest))
     # the time step is one for all
     hardest = replace(world, gravity=max(pulls, key=lambda g: float(g.norm())))

@@ -64,7 +64,7 @@ def rollouts(
     result, rate = {}, 0.0
     for v in variants:
         began = time.perf_counter()
-        result[v] = body.simulate(sequence.start, world, scene.frames, frame_dt, variant=v,
+        result[v] = body.simulate(sequence.start, world, scene.frames, frame_dt, model=body.model(v),
                                   collect=lambda found: sizes.append(float(found.mean_abs_C)))
         if body.rest.is_cuda:
             torch.cuda.synchronize()
@@ -229,15 +229,15 @@ def identification(body: Body, scene: Scene) -> dict[str, float]:
     """Identified parameters after calibration (`id_prior/`) and after the joint stage (`id/`), with errors where truth is known."""
     figures = {}
     for prefix, variant in (("id_prior", "prior"), ("id", "adapted")):
-        material, contact, heterogeneity, _ = body.parts(variant)
-        mean = float(body.factor(heterogeneity).detach().mean())
+        model = body.model(variant)
+        material, mean = model.material, float(body.factor(model.heterogeneity).detach().mean())
         for name, value in material.physical().items():
             scale = mean if name in material.modulated else 1.0
             figures[f"{prefix}/{name}"] = float(value.detach()) * scale
             if name in scene.known_parameters:
                 errors = metrics.identification_errors(name, figures[f"{prefix}/{name}"], scene.known_parameters[name])
                 figures |= {f"{prefix}/{key}": value for key, value in errors.items()}
-        figures[f"{prefix}/contact_offset_m"] = float(contact().detach())
+        figures[f"{prefix}/contact_offset_m"] = float(model.contact().detach())
     return figures
 
 
@@ -253,7 +253,7 @@ def hidden_figures(body: Body, scene: Scene, figures: Mapping[str, float]) -> di
     fibre, axis = getattr(hidden, "fibre", None), [figures.get(f"id/stiffest_{name}") for name in "xyz"]
     if fibre is not None and getattr(hidden, "ratio", 1) > 1 and None not in axis:
         found["id/fibre_angle_deg"] = float(angle_between(torch.tensor(axis), torch.tensor(fibre)))
-    learned, true = body.factor(body.parts("adapted")[2]).detach().cpu(), hidden.factor(body.rest.cpu().float())
+    learned, true = body.factor(body.model().heterogeneity).detach().cpu(), hidden.factor(body.rest.cpu().float())
     if float(true.std()) > 1e-6 and float(learned.std()) > 1e-6:
         found["id/stiffness_correlation"] = float(torch.corrcoef(torch.stack([true, learned.float()]))[0, 1])
     return found

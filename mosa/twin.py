@@ -116,7 +116,8 @@ class Twin:
             angular_velocity=angular_velocity, colliders=colliders,
         )  # fmt: skip
         with tqdm(total=frames - 1, desc="simulate", unit="frame", disable=not progress) as bar:
-            return self.body.simulate(start, world, frames, self.frame_dt, variant=variant, progress=lambda _: bar.update())
+            model = self.body.model(variant)
+            return self.body.simulate(start, world, frames, self.frame_dt, model=model, progress=lambda _: bar.update())
 
     def reset(
         self,

@@ -38,3 +38,10 @@ def test_views_cover_all_cameras_once_per_pass_and_depend_on_seed_and_step_alone
     torch.manual_seed(99)
     assert [ViewSchedule(12, 2, 100, seed=3)[i] for i in range(20)] == [schedule[i] for i in range(20)]
     assert [ViewSchedule(12, 2, 100, seed=4)[i] for i in range(6)] != [schedule[i] for i in range(6)]
+
+
+def test_a_stage_says_what_it_learns_and_what_its_result_is_kept_as():
+    prior, prior_eta, joint = (Stage(name, 1, 0.1) for name in ("prior", "prior_eta", "joint"))
+    assert [s.calibrates for s in (prior, prior_eta, joint)] == [True, False, False]
+    assert [s.learns("eta", "adapter") for s in (prior, prior_eta, joint)] == [(), ("eta",), ("eta", "adapter")]
+    assert [set(s.keeps) for s in (prior, prior_eta, joint)] == [{"prior", "prior_eta"}, {"prior_eta"}, set()]

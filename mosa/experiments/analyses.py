@@ -214,7 +214,7 @@ def heterogeneity(experiment: Experiment, records: Sequence[Record], stem: Path)
     grid, lines = canvas.subplots(2, len(found), squeeze=False), []
     for column, (record, twin) in enumerate(found):
         body, scene = twin.body, twin.config["cfg"]["scene"]
-        learned = body.factor(body.parts("adapted")[2]).detach()
+        learned = body.factor(body.model().heterogeneity).detach()
         hidden = (
             OBJECTS[scene["name"]].material.variant(scene.get("material", "anisotropic")) if scene.get("name") in OBJECTS else None
         )
@@ -251,7 +251,8 @@ def heterogeneity(experiment: Experiment, records: Sequence[Record], stem: Path)
 def pressed_modulus(twin: Twin, variant: str, directions: Tensor) -> list[Pressed]:
     """A specimen of a model's law between two plates, along unit vectors (K, 3)."""
     body = twin.body
-    material, _, _, adapter = body.parts(variant)
+    model = body.model(variant)
+    material, adapter = model.material, model.adapter
     adapter = adapter if adapter is not None and adapter.is_on else None
     poisson = float(material.poisson().detach())
     return [press(material.law, material.per_particle(), n, modulus=longitudinal_modulus(material), poisson=poisson,

@@ -17,6 +17,7 @@ from mosa.modules.carried_splats import CarriedSplats
 from mosa.modules.contact import ContactOffset
 from mosa.modules.heterogeneity import HeterogeneityField
 from mosa.modules.material import Material
+from mosa.modules.model import Model
 from mosa.modules.ready import Ready
 from mosa.modules.simulation_settings import SimulationSettings
 from mosa.modules.start import Start, World
@@ -98,15 +99,17 @@ class Body(nn.Module):
             return torch.ones_like(self.volume)
         return heterogeneity.factor(self.rest)
 
-    def parts(self, variant: str) -> tuple[Material, ContactOffset, nn.Module | None, nn.Module | None]:
-        """(material, contact, heterogeneity, adapter) of `variant`: the live modules (adapted), or those of an ended stage."""
+    def model(self, variant: str = "adapted") -> Model:
+        """What is simulated as `variant`: the live modules (adapted), or those of an ended stage. An adapter that was not switched
+        on yet is no part of it: before its stage it is the prior."""
         if variant == "adapted":
-            return self.material, self.contact, self.heterogeneity, self.adapter
+            adapter = self.adapter if self.adapter is not None and self.adapter.is_on else None
+            return Model(self.material, self.contact, self.heterogeneity, adapter)
         if variant not in self.frozen:
             raise ConfigError(f"variant: expected one of {', '.join(VARIANTS)}, found {variant!r}")
         frozen = self.frozen[variant]
         heterogeneity = frozen["heterogeneity"] if variant == "prior_eta" and "heterogeneity" in frozen else None
-        return frozen["material"], frozen["contact"], heterogeneity, None
+        return Model(frozen["material"], frozen["contact"], heterogeneity)
 
     def freeze(self, variant: str) -> None:
         """Keep the live parameters as the calibrated backbone `variant` (prior | prior_eta)."""
@@ -161,9 +164,7 @@ class Body(nn.Module):
         frames: int,
         frame_dt: float,
         *,
-        variant: str = "adapted",
-        with_adapter: bool = True,
-        with_heterogeneity: bool = True,
+        model: Model | None = None,
         collect: Callable | None = None,
         progress: Callable[[int], None] | None = None,
         counts: Sequence[int] | None = None,
@@ -173,34 +174,29 @@ class Body(nn.Module):
     ) -> Rollout:
         """Roll `frames` frames out (frame 0 is the start). Differentiable in every parameter and in `start`.
 
-        collect: called with the statistics of every evaluation of the adapter (penalties, mean |C|). counts: of substeps, to
-        replay those of an adaptive rollout. observed, gain: (T, N, 3) [m] and a number; at every frame the velocities are corrected
-        towards what was seen (`criteria.corrected_rollout`). substeps: of every frame, where differences hold them fixed; None: as
-        many as the time step bound asks for. Errors: SimulationDiverged, ConfigError (time step).
+        model: what is simulated, None for all that was learned. collect: called with the statistics of every evaluation of the
+        adapter (penalties, mean |C|). counts: of substeps, to replay those of an adaptive rollout. observed, gain: (T, N, 3) [m]
+        and a number; at every frame the velocities are corrected towards what was seen (`criteria.corrected_rollout`). substeps: of
+        every frame, where differences hold them fixed; None: as many as the time step bound asks for.
+        Errors: SimulationDiverged, ConfigError (time step).
         """
-        ready = self.ready(
-            start, world, frames, frame_dt, variant=variant, with_adapter=with_adapter, with_heterogeneity=with_heterogeneity,
-            counts=counts, substeps=substeps,
-        )  # fmt: skip
+        ready = self.ready(start, world, frames, frame_dt, model=model, counts=counts, substeps=substeps)
         rollout = ready.simulate(frames, world.colliders, collect=collect, progress=progress, observed=observed, gain=gain)
         taken = rollout.counts
         self.last_substeps = -(-sum(taken) // len(taken)) if taken else ready.simulator.substeps
         return rollout
 
     def ready(
-        self, start: Start, world: World, frames: int, frame_dt: float, *, variant: str = "adapted", with_adapter: bool = True,
-        with_heterogeneity: bool = True, counts: Sequence[int] | None = None, substeps: int | None = None,
+        self, start: Start, world: World, frames: int, frame_dt: float, *, model: Model | None = None,
+        counts: Sequence[int] | None = None, substeps: int | None = None,
     ) -> Ready:  # fmt: skip
         """The body at `start`, ready to be simulated; arguments and errors as `simulate`."""
-        material, contact, heterogeneity, adapter = self.parts(variant)
-        if not with_heterogeneity:
-            heterogeneity = None
-        if not with_adapter or (adapter is not None and not adapter.is_on):  # before its stage an adapter is the prior
-            adapter = None
+        model = self.model() if model is None else model
+        material, adapter = model.material, model.adapter
         if adapter is not None:
             adapter.follow(material.poisson(live=True))
         dtype = torch.float64 if self.settings.precision == 64 else torch.float32
-        factor = self.factor(heterogeneity)
+        factor = self.factor(model.heterogeneity)
         parameters = material.per_particle(factor)
         gravity, up = world.gravity.to(self.rest), world.up.to(self.rest)
         timing = None
@@ -224,7 +220,7 @@ class Body(nn.Module):
                 float(material.max_viscosity(factor.detach())),
             )  # fmt: skip
             state = self.initial_state(start, frame_dt / substeps, gravity)
-        lift = contact() * up
+        lift = model.contact() * up
         if (own := getattr(adapter, "simulator", None)) is not None:  # no law on a grid: the adapter brings its dynamics
             simulator, lift, timing = own(self.density, world, frame_dt), torch.zeros_like(lift), None
             state = self.initial_state(start, frame_dt / simulator.substeps, gravity)

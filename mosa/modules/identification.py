@@ -182,8 +182,8 @@ class Identification:
         seats: int | None = None,
     ) -> None:  # fmt: skip
         self.body, self.takes, self.world, self.settings = body, list(takes), world, settings
-        self.calibrating = stage.name == "prior"
-        self.adapter = stage.name == "joint" and _learned(body.adapter)
+        self.calibrating = stage.calibrates
+        self.adapter = stage.learns_adapter and _learned(body.adapter)
         self.heterogeneity = not self.calibrating and _learned(body.heterogeneity)
         self.gains = (0.0,) if self.calibrating else criterion.gains
         self.kinds = (True, False, False) if self.calibrating and kinds[0] else kinds
@@ -233,8 +233,9 @@ class Identification:
         take = self.takes[index]
         cues = take.cues
         return body.simulate(
-            take.start, self.world, len(cues.positions), take.frame_dt, with_adapter=self.adapter,
-            with_heterogeneity=self.heterogeneity, observed=cues.positions if gain else None, gain=gain, substeps=substeps,
+            take.start, self.world, len(cues.positions), take.frame_dt,
+            model=body.model().only(heterogeneity=self.heterogeneity, adapter=self.adapter),
+            observed=cues.positions if gain else None, gain=gain, substeps=substeps,
         )  # fmt: skip
 
     @torch.no_grad()
@@ -249,8 +250,9 @@ class Identification:
                 for row in some:
                     seat.write(row)
                     parts.append(self.body.ready(
-                        take.start, self.world, len(take.cues.positions), take.frame_dt, with_adapter=self.adapter,
-                        with_heterogeneity=self.heterogeneity, substeps=self.substeps[i]).answered())  # fmt: skip
+                        take.start, self.world, len(take.cues.positions), take.frame_dt, substeps=self.substeps[i],
+                        model=self.body.model().only(heterogeneity=self.heterogeneity, adapter=self.adapter),
+                    ).answered())  # fmt: skip
                 rollout = Ready.stack(parts).simulate(
                     len(take.cues.positions), self.world.colliders, observed=take.cues.positions if gain else None, gain=gain)
                 for k, own in enumerate(rollout.worlds()):

@@ -126,14 +126,14 @@ class LitMosa(Restorable, L.LightningModule):
     def groups(self, stage: Stage) -> list[dict]:
         """Parameter groups of a stage; `rate` keeps the learning rate before decay."""
         body = self.body
-        replaced = stage.name == "joint" and body.adapter is not None and body.adapter.replaces_law
+        replaced = stage.learns_adapter and body.adapter is not None and body.adapter.replaces_law
         learned = [] if replaced else [p for p in body.material.parameters() if p.requires_grad]
         groups = [{"params": learned, "rate": stage.lr, "name": "material"}]
         if body.contact.enabled:
             groups.append({"params": list(body.contact.parameters()), "rate": stage.lr_contact, "name": "contact"})
-        if stage.name != "prior" and body.heterogeneity is not None:
+        if stage.learns_heterogeneity and body.heterogeneity is not None:
             groups.append({"params": list(body.heterogeneity.parameters()), "rate": stage.lr_networks, "name": "heterogeneity"})
-        if stage.name == "joint" and body.adapter is not None:
+        if stage.learns_adapter and body.adapter is not None:
             params = [p for p in body.adapter.parameters() if p.requires_grad]
             groups.append({"params": params, "rate": stage.lr_adapter, "name": "adapter"})
         return [{**g, "lr": g["rate"]} for g in groups if g["params"]]
@@ -184,7 +184,7 @@ class LitMosa(Restorable, L.LightningModule):
                 self.identification = self.identifying(stage)
                 if iteration > 0 and self.saved_identification is not None:
                     self.identification.restore(self.saved_identification)
-                elif stage.name == "prior" and not searched:
+                elif stage.calibrates and not searched:
                     self.identification.search()
             found = self.identification.iterate()
         except MosaError as error:
@@ -195,7 +195,7 @@ class LitMosa(Restorable, L.LightningModule):
         self.steps_done += 1
         self.report_newton(found)
         if self.identification.converged or stage.ended(self.losses):
-            if stage.name == "joint":
+            if stage.learns_adapter:
                 self.posterior = self.identification.posterior()
             self.finish(stage)
 
@@ -232,7 +232,7 @@ class LitMosa(Restorable, L.LightningModule):
         One graph at a time: memory is that of one sequence.
         """
         frames = self.active_frames(stage, iteration, take)
-        gains = (0.0,) if stage.name == "prior" else self.criterion.gains
+        gains = (0.0,) if stage.calibrates else self.criterion.gains
         figures: dict[str, Tensor] = {}
         for gain in gains:
             for name, value in self._descend(stage, iteration, take, views, weight / len(gains), frames, gain).items():
@@ -268,15 +268,16 @@ class LitMosa(Restorable, L.LightningModule):
         gain: of the criterion's rollout, 0 for a free one."""
         take = self.takes[0] if take is None else take
         body, weights, cues = self.body, self.weights, take.cues
-        adapted = stage.name == "joint" and body.adapter is not None
+        adapted = stage.learns_adapter and body.adapter is not None
         collected: list = []
         rollout = body.simulate(
-            take.start, self.world, frames, take.frame_dt, with_adapter=adapted, with_heterogeneity=stage.name != "prior",
+            take.start, self.world, frames, take.frame_dt,
+            model=body.model().only(heterogeneity=stage.learns_heterogeneity, adapter=adapted),
             collect=collected.append if adapted else None, observed=cues.positions if gain else None, gain=gain,
         )
         over_all = pool(collected) if collected else None  # a variance over time as well as over particles
         targets = take.observations.select([v % len(take.observations.cameras) for v in views], frames)
-        varies = stage.name != "prior" and body.heterogeneity is not None
+        varies = stage.learns_heterogeneity and body.heterogeneity is not None
         step = Step(body, take.start, rollout, targets, cues, frames, self.background, varies, over_all, self.misfit,
                     with_flow=weights.get("flow", 0.0) != 0)
         terms = evaluate_terms(weights, step)
@@ -302,7 +303,7 @@ class LitMosa(Restorable, L.LightningModule):
         if stage.start is not None:
             self.body.thaw(stage.start)
         adapter, material = self.body.adapter, self.body.material
-        if stage.name == "joint" and adapter is not None:
+        if stage.learns_adapter and adapter is not None:
             adapter.switch_on(material.reference_modulus(), material.poisson())
             parameters = {k: v.detach() for k, v in material.per_particle(1.0).items()}
             adapter.prepare(material.law, material_states(material.law, parameters, **self.body.law_options))
@@ -315,16 +316,15 @@ class LitMosa(Restorable, L.LightningModule):
         """Mean distance of the particles from the reconstruction's, over the object's size, without adapter."""
         misfits = []
         for take in self.takes:
-            rollout = self.body.simulate(take.start, self.world, len(take.cues.positions), take.frame_dt, with_adapter=False)
+            model = self.body.model().only(adapter=False)
+            rollout = self.body.simulate(take.start, self.world, len(take.cues.positions), take.frame_dt, model=model)
             misfits.append(float(losses.position_loss(rollout.x, take.cues.positions, self.body.size)))
         return sum(misfits) / len(misfits)
 
     def finish(self, stage: Stage) -> None:
         """Keep the stage's result as a backbone and go on to the next; stop the trainer after the last."""
-        if stage.name == "prior":  # also what prior_eta and joint go on from, should the stage between them be left out
-            self.body.freeze("prior_eta")
-        if stage.name != "joint":
-            self.body.freeze(stage.name)
+        for name in stage.keeps:
+            self.body.freeze(name)
         self.stage_index, self.losses, self.identification = self.stage_index + 1, [], None
         if self.stage is None:
             self.trainer.should_stop = True
@@ -360,8 +360,7 @@ class LitMosa(Restorable, L.LightningModule):
         """(3, 2 h, T w) strip of one view of the first sequence: real above, rendered below, every frame from left to right."""
         take, body = self.takes[0], self.body
         frames = len(take.cues.positions)
-        adapted = body.adapter is not None and body.adapter.is_on  # it is switched on when its stage begins
-        rollout = body.simulate(take.start, self.world, frames, take.frame_dt, with_adapter=adapted)
+        rollout = body.simulate(take.start, self.world, frames, take.frame_dt)
         targets = take.observations.select([view], frames)
         seen = observe(rollout.x, deformed_covariances(rollout.F_tot, body.covariances), body.opacities, body.colors,
                        targets.cameras, self.background)

@@ -39,6 +39,29 @@ class Stage:
         check_knobs(self, f"fit.{self.name}")
 
     @property
+    def calibrates(self) -> bool:
+        """Whether the stage learns the global parameters alone, from free rollouts of which more and more frames count."""
+        return self.name == "prior"
+
+    @property
+    def learns_heterogeneity(self) -> bool:
+        return not self.calibrates
+
+    @property
+    def learns_adapter(self) -> bool:
+        return self.name == "joint"
+
+    @property
+    def keeps(self) -> tuple[str, ...]:
+        """The backbones that its result is kept as. Calibration's is also what later stages go on from, should the one between them
+        be left out."""
+        return {"prior": ("prior_eta", "prior"), "prior_eta": ("prior_eta",)}.get(self.name, ())
+
+    def learns(self, heterogeneity: object | None, adapter: object | None) -> tuple[object | None, ...]:
+        """Of these parts of a body those that the stage learns beside the global parameters; None for one that the body has not."""
+        return (heterogeneity,) * self.learns_heterogeneity + (adapter,) * self.learns_adapter
+
+    @property
     def newton(self) -> bool:
         """Whether the stage runs Gauss-Newton, once `resolved`."""
         return self.optimizer == "gauss_newton"
@@ -61,7 +84,7 @@ class Stage:
 
     def active_frames(self, iteration: int, first: int, total: int) -> int:
         """Frames that enter progressively in the first stage: from `first` to all over the first third of its iterations."""
-        if self.name != "prior":
+        if not self.calibrates:
             return total
         ramp = max(1, self.iterations // 3)
         return min(total, max(2, first + math.ceil((total - first) * iteration / ramp)))

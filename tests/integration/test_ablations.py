@@ -114,7 +114,7 @@ def test_a_stage_that_starts_from_the_prior_forgets_eta(first_step, kind):
     assert learned.abs().max() > 0.2
     body.freeze("prior_eta")
     body.thaw("prior")
-    assert (body.heterogeneity(body.rest) == 0).all() and body.parts("prior")[2] is None
+    assert (body.heterogeneity(body.rest) == 0).all() and body.model("prior").heterogeneity is None
     body.thaw("prior_eta")
     assert torch.equal(body.heterogeneity(body.rest), learned)
     assert kind == "modes" or (learned == 0.3).all()

@@ -42,8 +42,8 @@ def test_a_take_is_simulated_at_its_own_frame_rate(cache):
     longer = replace(take, frame_dt=2 * take.frame_dt)
     with torch.no_grad():
         _, found = module.terms(stage, [0], 3, longer)
-        expected = module.body.simulate(take.start, module.world, 3, longer.frame_dt, with_adapter=False)
-        usual = module.body.simulate(take.start, module.world, 3, take.frame_dt, with_adapter=False)
+        expected = module.body.simulate(take.start, module.world, 3, longer.frame_dt, model=module.body.model().only(adapter=False))
+        usual = module.body.simulate(take.start, module.world, 3, take.frame_dt, model=module.body.model().only(adapter=False))
     assert (found.x - expected.x).abs().max() < 1e-6
     assert (expected.x - usual.x).abs().max() > 1e-2
 

@@ -132,7 +132,8 @@ def test_a_body_begins_as_its_prior_moves(adapter):
     body = adapted(adapter)
     adapter.prepare("neo_hookean", states())
     with torch.no_grad():
-        learned, prior = (body.simulate(start(speed=-0.5), WORLD, 8, FRAME_DT, with_adapter=on) for on in (True, False))
+        learned, prior = (body.simulate(start(speed=-0.5), WORLD, 8, FRAME_DT, model=body.model().only(adapter=on))
+                          for on in (True, False))  # fmt: skip
     distance = (learned.x - prior.x).norm(dim=-1)
     assert 0 < distance.max() < 0.05 * DX
 
@@ -149,7 +150,7 @@ def test_a_plastic_network_takes_the_place_of_the_return_mapping():
             rollout = body.simulate(start(), WORLD, 8, FRAME_DT)
             moved[name] = (rollout.F - rollout.F_tot).abs().max()
             randomise(adapter.plastic, 0.3)
-        alone = body.simulate(start(), WORLD, 8, FRAME_DT, with_adapter=False)
+        alone = body.simulate(start(), WORLD, 8, FRAME_DT, model=body.model().only(adapter=False))
     assert moved["none"] < 1e-12 and moved["some"] > 1e-4  # without flow it is elastic, however low the prior's yield stress is
     assert (alone.F - alone.F_tot).abs().max() > 1e-3
 

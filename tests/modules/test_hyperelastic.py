@@ -187,7 +187,7 @@ def test_moduli_of_the_stiffness_are_those_of_a_uniaxial_test(strain):
 def test_a_body_with_zero_numbers_moves_as_the_prior_does_bit_for_bit(precision, strain):
     body = small_body(strain=strain, precision=precision)
     begins = start(turn=0.4, dtype=torch.float64 if precision == 64 else torch.float32)
-    prior, adapted = (body.simulate(begins, WORLD, 8, FRAME_DT, with_adapter=on) for on in (False, True))
+    prior, adapted = (body.simulate(begins, WORLD, 8, FRAME_DT, model=body.model().only(adapter=on)) for on in (False, True))
     assert torch.equal(prior.x, adapted.x) and torch.equal(prior.F, adapted.F)
     body.adapter.numbers.fill_(0.1)
     moved = body.simulate(begins, WORLD, 8, FRAME_DT)
