@@ -22,7 +22,7 @@ from mosa.modules.body import Body, Start, World
 from mosa.modules.carried_splats import CarriedSplats
 from mosa.modules.lit_mosa import LitMosa, Take
 from mosa.progress import tqdm
-from mosa.reconstruction.pipeline import follow, reconstruct, spacing_for, stored
+from mosa.reconstruction.pipeline import SecondLook, follow, reconstruct, spacing_for, stored
 from mosa.reconstruction.resolution import grid_spacing
 from mosa.reconstruction.settings import ReconstructionSettings, build_settings
 from mosa.reconstruction.starts import first_contact, sequence_start
@@ -169,8 +169,13 @@ class Run:
         return Take(
             start, training_observations(scene, reconstruction, margin=self.cfg.rendering.margin, device=self.device),
             MotionCues(*(getattr(cues, n)[:frames].to(self.device) for n in names)), float(scene.times[1] - scene.times[0]),
-            first_contact(self.body, start, scene),
+            first_contact(self.body, start, scene), self.second_look(scene, reconstruction),
         )  # fmt: skip
+
+    def second_look(self, scene: Scene, reconstruction: Reconstruction) -> SecondLook | None:
+        """Finds the cues of a sequence about a prediction, where reconstruction.informed asks for it."""
+        settings = self.reconstruction_settings
+        return SecondLook(scene, reconstruction, settings, self.cfg.seed, self.device) if settings.looks_again else None
 
 
 def scenes(cfg: DictConfig) -> tuple[Scene, list[Scene]]:

@@ -241,7 +241,8 @@ def seconds_of_fit(module: LitMosa, speeds: Speeds, frames: int, processes: int 
     rollout, views = (frames - 1) * speeds.frame, module.config["cfg"]["fit"]["views"]
     networks = body.adapter is not None and not body.adapter.steady
     step = (BACKWARD * rollout + views * frames * speeds.picture) * -(-len(module.takes) // processes)
-    total = KERNELS
+    again = module.config["cfg"]["reconstruction"].get("informed") or {}
+    total = KERNELS + 0.7 * again.get("iterations", 0) * again.get("views", 1) * len(module.takes) * (frames - 1) * speeds.picture
     for stage in module.stages:
         adapted = ADAPTER_COST if stage.learns_adapter and networks else 1.0
         stiff = STIFFNESS_COST if stage.learns_adapter and body.adapter is not None else 1.0

@@ -10,6 +10,7 @@ from mosa.modules.simulation_settings import SimulationSettings
 from mosa.modules.stages import Stage
 from mosa.reconstruction.carried import CarriedSettings
 from mosa.reconstruction.geometry import GeometrySettings
+from mosa.reconstruction.informed import InformedSettings
 from mosa.reconstruction.static import FitSettings, StaticSettings
 from mosa.schema import (
     COUNT,
@@ -38,7 +39,8 @@ from mosa.schema import (
 SECTIONS = ("scene", "prior", "adapter", "reconstruction", "simulation", "fit", "rendering", "trainer", "logger", "evaluation",
             "heterogeneity", "losses", "world", "criterion", "identification",
             "fit.prior", "fit.prior_eta", "fit.joint", "reconstruction.static",
-            "reconstruction.appearance", "reconstruction.dynamic", "reconstruction.carried")  # fmt: skip
+            "reconstruction.appearance", "reconstruction.dynamic", "reconstruction.carried",
+            "reconstruction.informed")  # fmt: skip
 
 FIGURE = Kind("a figure's name like test/rms_m (docs/figures.md)",
               lambda v: isinstance(v, str) and v.split("/")[0] in FIGURES and "/" in v)
@@ -53,6 +55,7 @@ TRAINING: dict[str, Kind] = {
     **kinds_of(StaticSettings, "reconstruction.static"),
     **kinds_of(FitSettings, "reconstruction.appearance"),
     **kinds_of(CarriedSettings, "reconstruction.carried"),
+    **kinds_of(InformedSettings, "reconstruction.informed"),
     "seed": whole(0, 2**32 - 1),
     "extensions": or_null(NAMES),
     "scene.also_train": or_null(SEQUENCES),

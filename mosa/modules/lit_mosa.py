@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import lightning as L
 import torch
@@ -24,19 +25,24 @@ from mosa.modules.observer import deformed_covariances, observe
 from mosa.modules.restorable import Restorable
 from mosa.modules.stages import Stage
 from mosa.modules.terms import MISFIT, Step, check_terms, evaluate_terms
+from mosa.reconstruction.pipeline import SecondLook
 from mosa.types import MotionCues, Rollout
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Take:
     """A sequence to learn from. start: where the body starts; observations: targets (datamodule.py); cues: the reconstruction's,
-    of the training frames, frame_dt [s] apart; first_contact: index of the first frame after it."""
+    of the training frames, frame_dt [s] apart; first_contact: index of the first frame after it; again: finds the cues once more
+    about what a calibrated backbone predicts, None where the first ones stay."""
 
     start: Start
     observations: Observations
     cues: MotionCues
     frame_dt: float
     first_contact: int
+    again: SecondLook | None = None
 
 
 SIDE_BY_SIDE = 10
@@ -76,6 +82,7 @@ class LitMosa(Restorable, L.LightningModule):
         self.identification: Identification | None = None  # of the running stage, where it is Gauss-Newton's
         self.saved_identification: dict | None = None  # its state in the checkpoint that the fit goes on from
         self.posterior: Posterior | None = None
+        self.informed = False  # whether the takes have the cues about the calibrated backbone
         self.compared: dict[str, float] = {}  # mean distance [m] of the calibrated candidates for the backbone
 
     @classmethod
@@ -100,6 +107,7 @@ class LitMosa(Restorable, L.LightningModule):
                               "start": self.takes[0].start.written(),
                               "identification": self.identification.state() if self.identification else None,
                               "compared": self.compared,
+                              "cues": [take.cues.positions.cpu() for take in self.takes] if self.informed else None,
                               "posterior": self.posterior.written() if self.posterior else None,
                               "splats": self.body.splats.written() if self.body.splats is not None else None}
 
@@ -119,6 +127,8 @@ class LitMosa(Restorable, L.LightningModule):
                 material.choose(saved["config"]["cfg"]["prior"]["law"])
             self.settle_law()
         self.posterior = Posterior.read(saved["posterior"]) if saved.get("posterior") else None
+        if saved.get("cues") is not None and self.takes:
+            self.restore_cues(saved["cues"])
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
         return [torch.optim.Adam(self.groups(stage), betas=(0.9, 0.95)) for stage in self.stages]
@@ -302,6 +312,8 @@ class LitMosa(Restorable, L.LightningModule):
         """What a stage starts from."""
         if stage.start is not None:
             self.body.thaw(stage.start)
+        if not stage.calibrates:
+            self.inform()
         adapter, material = self.body.adapter, self.body.material
         if stage.learns_adapter and adapter is not None:
             adapter.switch_on(material.reference_modulus(), material.poisson())
@@ -310,6 +322,32 @@ class LitMosa(Restorable, L.LightningModule):
             if self.weights.get("operator", 0.0) != 0:
                 self.misfit = max(parallel.mean(self.measure_misfit()), 0.1 * MISFIT)
         parallel.synchronise(self.body)  # on a GPU ranks may come to slightly different numbers
+
+    def inform(self) -> None:
+        """The cues of the takes once more, about what the calibrated backbone predicts."""
+        if self.informed or not any(take.again for take in self.takes):
+            return
+        model = self.body.model().only(heterogeneity=False, adapter=False)
+        for i, take in enumerate(self.takes):
+            if take.again is None:
+                continue
+            with torch.no_grad():
+                rollout = self.body.simulate(take.start, self.world, len(take.cues.positions), take.frame_dt, model=model)
+            cues = take.again.about(rollout.x)
+            moved = float((cues.positions - take.cues.positions).square().sum(-1).mean().sqrt())
+            log.info("motion of %s once more, about the calibrated backbone's: moved by %.2g mm (root mean square)",
+                     take.again.scene.sequence, 1e3 * moved)
+            self.takes[i] = replace(take, cues=cues)
+        self.informed = True
+
+    def restore_cues(self, positions: Sequence[Tensor]) -> None:
+        """The cues that `inform` found. positions: (T, N, 3) [m] of each take. Errors: ConfigError where they are of others."""
+        expected = [tuple(take.cues.positions.shape) for take in self.takes]
+        if [tuple(each.shape) for each in positions] != expected or not all(take.again for take in self.takes):
+            raise ConfigError(f"ckpt_path: expected cues of shapes {expected}, found {[tuple(each.shape) for each in positions]}: "
+                              "the checkpoint belongs to other sequences, or reconstruction.informed was switched off since")
+        self.takes = [replace(take, cues=take.again.cues(each)) for take, each in zip(self.takes, positions)]
+        self.informed = True
 
     @torch.no_grad()
     def measure_misfit(self) -> float:

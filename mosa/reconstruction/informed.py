@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from mosa.errors import ConfigError
 from mosa.reconstruction.cues import polar
 from mosa.reconstruction.dynamic import DynamicSettings, Objective, Predicted, Scaffold, minimise
 from mosa.reconstruction.motion import ModalMotion
 from mosa.reconstruction.observed import Windows
 from mosa.reconstruction.uniform_adam import UniformAdam
+from mosa.schema import COUNT, POSITIVE, WEIGHT, check_knobs, knob, whole
 
 
 @dataclass(frozen=True)
@@ -28,15 +28,14 @@ class InformedSettings:
     """iterations: 0 for never; views: of every frame in each; lr: its step in units of the object's radius; elastic, bending:
     weights of the energies, counted from the prediction, as in `DynamicSettings`."""
 
-    iterations: int = 80
-    views: int = 1
-    lr: float = 0.02
-    elastic: float = 1.0
-    bending: float = 1.0
+    iterations: int = knob(80, whole(0))
+    views: int = knob(1, COUNT)
+    lr: float = knob(0.02, POSITIVE)
+    elastic: float = knob(1.0, WEIGHT)
+    bending: float = knob(1.0, WEIGHT)
 
     def __post_init__(self) -> None:
-        if self.iterations < 0:
-            raise ConfigError(f"reconstruction.informed.iterations: expected a number >= 0, found {self.iterations}")
+        check_knobs(self, "reconstruction.informed")
 
 
 def laid_onto(predicted: Tensor, seen: Tensor) -> Tensor:

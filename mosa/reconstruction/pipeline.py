@@ -6,7 +6,7 @@ from __future__ import annotations
 import functools
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from mosa.reconstruction.observed import Windows, object_windows
 from mosa.reconstruction.resolution import PER_CELL, particles_for
 from mosa.reconstruction.settings import ReconstructionSettings
 from mosa.reconstruction.static import fit_splats, start_splats
-from mosa.rendering.covariance import covariance_from, matrix_to_quaternion, quaternion_multiply
+from mosa.rendering.covariance import covariance_from, matrix_to_quaternion, quaternion_multiply, quaternion_to_matrix
 from mosa.rendering.rasterizer import rasterize
 from mosa.rendering.spherical_harmonics import constant_coefficients
 from mosa.threads import threaded
@@ -354,31 +354,42 @@ def _moving_parts(
     return torch.stack(centres).to(splats.means), scaffold, carried, reach
 
 
-def inform(
-    scene: Scene,
-    reconstruction: Reconstruction,
-    predicted: Tensor,
-    *,
-    settings: ReconstructionSettings,
-    seed: int = 0,
-    device: torch.device | str = "cpu",
-    progress: bool = True,
-) -> MotionCues:
-    """Cues of the training frames once more, about what a simulation predicts (`informed`).
+@dataclass(frozen=True)
+class SecondLook:
+    """The cues of a sequence once more, about what a simulation predicts (`informed`). Nothing is cached: the prediction is a run's
+    own.
 
-    reconstruction: of `scene`; predicted: (T, N, 3) [m] of its particles. Nothing is cached: the prediction is a run's own.
+    reconstruction: of `scene`; seed: of the order in which views are drawn.
     """
-    splats, static = reconstruction.splats.to(device), reconstruction.static.to(device)
-    windows = object_windows(scene, scene.training_cameras, scene.training_frames, margin=settings.margin).to(device)
-    centres, scaffold, carried, reach = _moving_parts(scene, splats, static, settings)
-    seen, background = reconstruction.cues.positions.to(splats.means), scene.background.to(device)
-    title = f"motion of {scene.sequence} about the prediction"
-    with tqdm(total=settings.informed.iterations, desc=title, disable=not progress, leave=False) as steps:
-        motion = informed_motion(scaffold, carried, windows, centres, background, predicted.to(seen), seen, settings.informed,
-                                 settings.dynamic, reach=reach, seed=seed, progress=steps.update)
-    with torch.no_grad():
-        sample = motion(torch.arange(len(centres), device=splats.means.device), splats, scaffold.modes, scaffold.around)
-    return neighbourhood_cues(sample.positions, sample.covariances, scaffold.around)
+
+    scene: Scene
+    reconstruction: Reconstruction
+    settings: ReconstructionSettings
+    seed: int = 0
+    device: torch.device | str = "cpu"
+    progress: bool = True
+
+    def about(self, predicted: Tensor) -> MotionCues:
+        """predicted: (T, N, 3) [m] of the particles in the training frames."""
+        found, scene, settings = self.reconstruction, self.scene, self.settings
+        splats, static = found.splats.to(self.device), found.static.to(self.device)
+        windows = object_windows(scene, scene.training_cameras, scene.training_frames, margin=settings.margin).to(self.device)
+        centres, scaffold, carried, reach = _moving_parts(scene, splats, static, settings)
+        seen, background = found.cues.positions.to(centres), scene.background.to(centres)
+        title = f"motion of {scene.sequence} about the prediction"
+        with tqdm(total=settings.informed.iterations, desc=title, disable=not self.progress, leave=False) as steps:
+            motion = informed_motion(scaffold, carried, windows, centres, background, predicted.to(seen), seen, settings.informed,
+                                     settings.dynamic, reach=reach, seed=self.seed, progress=steps.update)
+        with torch.no_grad():
+            frames = torch.arange(len(centres), device=centres.device)
+            return self.cues(motion(frames, splats, scaffold.modes, scaffold.around).positions)
+
+    def cues(self, positions: Tensor) -> MotionCues:
+        """Of positions (T, N, 3) [m] that `about` found, for instance those in a checkpoint."""
+        splats = self.reconstruction.splats.to(self.device)
+        around, positions = neighbourhood(splats.means, neighbours=self.settings.neighbours), positions.to(splats.means)
+        deformed = around.deformation(positions) @ (quaternion_to_matrix(splats.rotations) * splats.scales[:, None, :])
+        return neighbourhood_cues(positions, deformed @ deformed.mT, around)
 
 
 def _motion(

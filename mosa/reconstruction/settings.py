@@ -20,7 +20,8 @@ class ReconstructionSettings:
     hull.shave_ridges: the body where geometry.source is hull, else where its refinement starts; points: static Gaussians
     (with static.densify=mcmc at the start); neighbours: of the least-squares deformation; cue: neighbourhood | gaussian
     (docs/cues.md); margin: px of the windows around mattes; splats: 3DGS PLY file of the object at frame 0, in the scene's
-    world, that replaces the static stage (None: fit it)."""
+    world, that replaces the static stage (None: fit it); informed: the motion once more, about the calibrated
+    backbone's, where it is one of modes and the cue that of the neighbourhood."""
 
     resolution: int = 80
     ridge_passes: int = 24
@@ -35,6 +36,11 @@ class ReconstructionSettings:
     dynamic: DynamicSettings = field(default_factory=DynamicSettings)
     carried: CarriedSettings = field(default_factory=CarriedSettings)
     informed: InformedSettings = field(default_factory=InformedSettings)
+
+    @property
+    def looks_again(self) -> bool:
+        """Whether the motion is found once more, informed by a simulation."""
+        return self.informed.iterations > 0 and self.cue == "neighbourhood" and self.dynamic.model == "modes"
 
     def __post_init__(self) -> None:
         if self.cue not in ("neighbourhood", "gaussian"):
