@@ -32,7 +32,7 @@ ROUGH = 0.05
 OUTLIER = 3.5
 """Standard deviations from which on a frame at an end of the window is no free fall."""
 FEWEST = 5
-NOISE = 0.15
+NOISE = 0.05
 """[px] Least noise that is assumed of a centre."""
 SCANS = {"down": (1, 1), "up": (1, -1), "right": (0, 1), "left": (0, -1)}
 """Where the sensor's next row lies in the picture -> axis of a pixel, sign."""
