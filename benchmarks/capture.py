@@ -76,7 +76,7 @@ def errors(truth: dict, found: dict) -> dict[str, float]:
         "readout_said_ms": float(1e3 * np.mean([p["readout_sd"] for p in found["phones"]])),
         "scale_percent": 100 * (found["scale"] / truth["scale"] - 1), "scale_said_percent": 100 * found["scale_sd"] / found["scale"],
         "up_degrees": float(np.degrees(np.arccos(np.clip(up[1], -1, 1)))), "up_said_degrees": found["up_sd_degrees"],
-        "ground_mm": 1e3 * float(b[1]), "ground_said_mm": 1e3 * found["ground_sd"],
+        "ground_mm": 1e3 * float(b[1]), "ground_said_mm": 1e3 * found["ground"]["sd"],
     }  # fmt: skip
 
 
@@ -84,15 +84,25 @@ def pictures_errors(seen: Path, right: Path) -> dict[str, float]:
     """Of mattes: overlap, and distance of centres [px]; of colours inside both: PSNR [dB]."""
     overlap, apart, squares = [], [], []
     for file in sorted((right / "images").glob("*.png")):
-        a, b = (cv2.imread(str(folder / "images" / file.name), cv2.IMREAD_UNCHANGED).astype(np.float32) / 255
-                for folder in (seen, right))
+        a, b = (
+            cv2.imread(str(folder / "images" / file.name), cv2.IMREAD_UNCHANGED).astype(np.float32) / 255
+            for folder in (seen, right)
+        )
         both, either = (a[..., 3] > 0.5) & (b[..., 3] > 0.5), (a[..., 3] > 0.5) | (b[..., 3] > 0.5)
         overlap.append(both.sum() / either.sum())
-        centres = [np.array([(m.sum(0) @ np.arange(m.shape[1])), (m.sum(1) @ np.arange(m.shape[0]))]) / m.sum() for m in (a[..., 3], b[..., 3])]
+        centres = [
+            np.array([(m.sum(0) @ np.arange(m.shape[1])), (m.sum(1) @ np.arange(m.shape[0]))]) / m.sum()
+            for m in (a[..., 3], b[..., 3])
+        ]
         apart.append(np.linalg.norm(centres[0] - centres[1]))
         squares.append(np.square(a[both][:, :3] - b[both][:, :3]).mean())
-    return {"overlap": float(np.mean(overlap)), "overlap_worst": float(np.min(overlap)), "apart_px": float(np.mean(apart)),
-            "apart_worst_px": float(np.max(apart)), "psnr": float(-10 * np.log10(np.mean(squares)))}
+    return {
+        "overlap": float(np.mean(overlap)),
+        "overlap_worst": float(np.min(overlap)),
+        "apart_px": float(np.mean(apart)),
+        "apart_worst_px": float(np.max(apart)),
+        "psnr": float(-10 * np.log10(np.mean(squares))),
+    }
 
 
 def compare(folder: Path, kinds: list[str]) -> dict:
@@ -103,15 +113,21 @@ def compare(folder: Path, kinds: list[str]) -> dict:
         times = true_times(truth, found)
         if kind == kinds[0]:
             said |= errors(truth, found)
-            perfect(folder / "perfect", truth, sequence="train", times=times, world=gauge(truth, found_world(found)), particles=True)
+            perfect(
+                folder / "perfect", truth, sequence="train", times=times, world=gauge(truth, found_world(found)), particles=True
+            )
         said[kind] = pictures_errors(folder / "scene", folder / "perfect")
     print("\n| | error | said |\n|---|---|---|")
     for name, unit in (("clock_rms", "ms"), ("readout_rms", "ms"), ("scale", "percent"), ("up", "degrees"), ("ground", "mm")):
         print(f"| {name} [{unit}] | {said[f'{name}_{unit}']:.3g} | {said[name.removesuffix('_rms') + f'_said_{unit}']:.3g} |")
-    print("\n| frames at common times | overlap of mattes | worst | centres apart [px] | worst | PSNR inside [dB] |\n|---|---|---|---|---|---|")
+    print(
+        "\n| frames at common times | overlap of mattes | worst | centres apart [px] | worst | PSNR inside [dB] |\n|---|---|---|---|---|---|"
+    )
     for kind in kinds:
         p = said[kind]
-        print(f"| {kind} | {p['overlap']:.4f} | {p['overlap_worst']:.4f} | {p['apart_px']:.2f} | {p['apart_worst_px']:.2f} | {p['psnr']:.1f} |")
+        print(
+            f"| {kind} | {p['overlap']:.4f} | {p['overlap_worst']:.4f} | {p['apart_px']:.2f} | {p['apart_worst_px']:.2f} | {p['psnr']:.1f} |"
+        )
     (folder / "compare.json").write_text(json.dumps(said, indent=1))
     return said
 
@@ -125,8 +141,10 @@ def footage(folder: Path, held: list[str]) -> None:
     tests = ",".join(f"{{path: {folder.resolve()}/held_out/{sequence}, particles: truth}}" for sequence in held)
     box = json.dumps(found["box"], separators=(",", ":"))
     for name in ("scene", "perfect"):
-        print(f"python train.py scene=transforms scene.path={folder.resolve()}/{name} scene.up=[0,1,0] "
-              f"scene.gravity=[0,-{truth['gravity']:g},0] 'scene.box={box}' 'scene.test=[{tests}]' prior=neo_hookean")
+        print(
+            f"python train.py scene=transforms scene.path={folder.resolve()}/{name} scene.up=[0,1,0] "
+            f"scene.gravity=[0,-{truth['gravity']:g},0] 'scene.box={box}' 'scene.test=[{tests}]' prior=neo_hookean"
+        )
 
 
 def main() -> None:
@@ -143,7 +161,15 @@ def main() -> None:
     options = parser.parse_args()
     if options.what == "film":
         size = tuple(int(n) for n in options.size.split("x"))
-        film(options.folder, name=options.name, material=options.material, size=size, fps=options.fps, faults=Faults(), seed=options.seed)
+        film(
+            options.folder,
+            name=options.name,
+            material=options.material,
+            size=size,
+            fps=options.fps,
+            faults=Faults(),
+            seed=options.seed,
+        )
     elif options.what == "compare":
         compare(options.folder, options.kinds.split(","))
     else:

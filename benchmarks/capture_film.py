@@ -95,13 +95,16 @@ class Shown:
         if self.when != key:
             self.vertices = self.fall.skin.follow(self.fall.at(key)).astype(np.float32)
             triangles = self.fall.surface.triangles
-            self.mesh = wp.Mesh(wp.array(self.vertices, dtype=wp.vec3, device="cpu"),
-                                wp.array(triangles.ravel(), dtype=wp.int32, device="cpu"))
+            self.mesh = wp.Mesh(
+                wp.array(self.vertices, dtype=wp.vec3, device="cpu"), wp.array(triangles.ravel(), dtype=wp.int32, device="cpu")
+            )
             self.normals = wp.array(vertex_normals(self.vertices, triangles).astype(np.float32), dtype=wp.vec3, device="cpu")
             self.when = key
         return np.zeros(3) if shift is None else shift
 
-    def rows(self, t: float, K: np.ndarray, w2c: np.ndarray, size: tuple[int, int], rows: tuple[int, int]) -> tuple[int, np.ndarray]:
+    def rows(
+        self, t: float, K: np.ndarray, w2c: np.ndarray, size: tuple[int, int], rows: tuple[int, int]
+    ) -> tuple[int, np.ndarray]:
         """(first column, RGBA (h, w, 4) in [0, 1], straight) of the given rows at one time; w = 0 where nothing is seen."""
         shift = self.move_to(t)
         pose = w2c.copy()
@@ -137,7 +140,9 @@ class Shown:
         return picture
 
 
-def phones(count: int, size: tuple[int, int], target: float, field: float, rng: np.random.Generator) -> list[tuple[np.ndarray, np.ndarray]]:
+def phones(
+    count: int, size: tuple[int, int], target: float, field: float, rng: np.random.Generator
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """(K, w2c) of phones on tripods around; field: half the height they see at the target [m]."""
     found = []
     for i in range(count):
@@ -189,9 +194,28 @@ class Room:
         return self.picture * np.where(self.is_floor, 1 - dark, 1)[..., None].astype(np.float32)
 
 
-def film(folder: Path, *, name: str, material: str, phone_count: int = 6, size: tuple[int, int] = (960, 720), fps: float = 60.0,
-         seconds: float = 0.30, faults: Faults | None = None, seed: int = 0) -> dict:
-    """Write videos/, plates/, sparse/ (a COLMAP model in text) and truth.json into a folder; returns what truth.json says."""
+def floor_points(rng: np.random.Generator, turn: Rotation, scale: float, move: np.ndarray) -> list[str]:
+    """Lines of points3D.txt: what COLMAP finds on a textured floor, to 2 mm, on the wall, and some mistakes."""
+    floor = np.stack([rng.uniform(-1.2, 1.2, 300), np.zeros(300), rng.uniform(-1.2, 1.2, 300)], 1) + rng.normal(0, 0.002, (300, 3))
+    angle = rng.uniform(0, 2 * np.pi, 200)
+    wall = np.stack([2.5 * np.cos(angle), rng.uniform(0, 2, 200), 2.5 * np.sin(angle)], 1)
+    points = turn.apply(np.concatenate([floor, wall, rng.uniform(-1, 1, (40, 3))])) / scale + move
+    return [f"{i + 1} {x:.9g} {y:.9g} {z:.9g} 90 110 130 0.6 1 1 2 1" for i, (x, y, z) in enumerate(points)]
+
+
+def film(
+    folder: Path,
+    *,
+    name: str,
+    material: str,
+    phone_count: int = 6,
+    size: tuple[int, int] = (960, 720),
+    fps: float = 60.0,
+    seconds: float = 0.30,
+    faults: Faults | None = None,
+    seed: int = 0,
+) -> dict:
+    """Write videos/, plates/, sparse/ (a COLMAP model in text, floor points included) and truth.json into a folder; returns what truth.json says."""
     faults = faults or Faults()
     rng = np.random.default_rng([seed, 11])
     fall = Fall(name, "train", material, seconds + 0.06)
@@ -215,8 +239,15 @@ def film(folder: Path, *, name: str, material: str, phone_count: int = 6, size: 
 
         iio.imwrite(folder / "plates" / f"{phone}.png", developed(room.picture, gain * (1 + rng.normal(0, faults.plate))))
         count = int((seconds - begin) * fps)
-        with iio.get_writer(folder / "videos" / f"{phone}.mp4", fps=fps, codec="libx264", quality=None, pixelformat="yuv420p",
-                            macro_block_size=2, output_params=["-crf", str(faults.quality)]) as writer:
+        with iio.get_writer(
+            folder / "videos" / f"{phone}.mp4",
+            fps=fps,
+            codec="libx264",
+            quality=None,
+            pixelformat="yuv420p",
+            macro_block_size=2,
+            output_params=["-crf", str(faults.quality)],
+        ) as writer:
             for k in range(count):
                 t = begin + k / fps
                 seen = shown.picture(t, K, w2c, size, readout)
@@ -232,8 +263,18 @@ def film(folder: Path, *, name: str, material: str, phone_count: int = 6, size: 
         focal = K[0, 0] * (1 + rng.normal(0, faults.focal))
         cameras_text.append(f"{v + 1} SIMPLE_PINHOLE {size[0]} {size[1]} {focal:.6f} {K[0, 2]} {K[1, 2]}")
         images_text += [f"{v + 1} " + " ".join(f"{x:.12g}" for x in [*quaternion, *shift]) + f" {v + 1} {phone}.jpg", ""]
-        records.append({"phone": phone, "begin": begin, "readout": readout, "K": K.tolist(), "w2c": w2c.tolist(),
-                        "gain": gain.tolist(), "frames": count})
+        records.append(
+            {
+                "phone": phone,
+                "begin": begin,
+                "readout": readout,
+                "K": K.tolist(),
+                "w2c": w2c.tolist(),
+                "gain": gain.tolist(),
+                "frames": count,
+            }
+        )
+    (folder / "sparse" / "points3D.txt").write_text("\n".join(["# 3D point list", *floor_points(rng, turn, scale, move)]) + "\n")
     (folder / "sparse" / "cameras.txt").write_text("\n".join(cameras_text) + "\n")
     (folder / "sparse" / "images.txt").write_text("\n".join(images_text) + "\n")
     truth = {"name": name, "material": material, "size": list(size), "fps": fps, "scale": scale, "turn": turn.as_matrix().tolist(),
@@ -263,6 +304,6 @@ def perfect(folder: Path, truth: dict, *, sequence: str, times: np.ndarray, worl
     width, height = truth["size"]
     (folder / "transforms.json").write_text(json.dumps({"w": width, "h": height, "frames": entries}))
     if particles:
-        positions = np.stack([fall.at(float(t)) for t in times])[:, ::max(1, len(fall.particles) // 8000)]
+        positions = np.stack([fall.at(float(t)) for t in times])[:, :: max(1, len(fall.particles) // 8000)]
         export_particles(torch.from_numpy(positions @ world[:3, :3].T + world[:3, 3]).float(), folder / "truth")
     return folder

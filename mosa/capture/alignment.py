@@ -15,8 +15,12 @@ MOVING = 0.15
 """Share of a track's fastest motion from which on a frame counts: of an object at rest every offset fits."""
 FINE = 0.25
 """Step of the search, in frames."""
+FINEST = 0.004
+"""[s] of it: no phone's films need a finer one to begin with."""
 LOST = 0.5
 """Share of a track that may find no partner."""
+NEARLY = 0.1
+"""Of a share: offsets that do worse by less are as good."""
 
 
 def moving_frames(track: Track) -> np.ndarray:
@@ -57,31 +61,41 @@ def disagreement(phones: tuple[Phone, Phone], tracks: tuple[Track, Track], offse
 
 
 def coarse_offsets(phones: list[Phone], tracks: list[Track], most: float) -> np.ndarray:
-    """(V,) [s] to add to each phone's clock so that all have the first one's, to about a quarter of a frame.
+    """(V,) [s] to add to each phone's clock so that all have the first one's, to about half a frame.
 
-    most [s]: offsets that are looked at. Errors: DataError naming the phone whose lines of sight meet the others' at none of them.
+    Phones are placed one after the other against all that are placed, at each turn the one whose offset is told most sharply: of two
+    that stand opposite each other, with the object between them, nothing tells it. most [s]: offsets that are looked at. Errors:
+    DataError naming the phone whose lines of sight meet the others' at none of them.
     """
-    offsets = np.zeros(len(phones))
-    for v, (phone, track) in enumerate(zip(phones, tracks)):
+    for phone, track in zip(phones, tracks):
         if len(moving_frames(track)) < 3:
-            raise DataError(f"{phone.video}: expected an object that moves through at least 3 frames, whole and away from the "
-                            f"border, found a whole object in {int(track.seen.sum())} of {len(track.times)} frames; look at its "
-                            "mattes in the report, and film with more room around the fall")
-        if v == 0:
-            continue
-        step = FINE * min(tracks[0].clip.interval, track.clip.interval)
-        grid = np.arange(-most, most + step, step)
-        cost = np.zeros(len(grid))
-        for u in range(v):
-            cost += disagreement((phones[u], phone), (tracks[u], track), grid - offsets[u])
-            cost += disagreement((phone, phones[u]), (track, tracks[u]), offsets[u] - grid)
-        cost /= 2 * v
-        best = int(cost.argmin())
-        if cost[best] > LOST:
-            raise DataError(f"{phone.video}: its lines of sight meet those of {', '.join(p.name for p in phones[:v])} at no offset "
-                            f"within {most:g} s (at the best, {grid[best]:.3f} s, in {1 - cost[best]:.0%} of the frames): expected one "
-                            "fall filmed by phones whose poses belong together; look for a wrong pose, or raise max_offset")
+            raise DataError(
+                f"{phone.video}: expected an object that moves through at least 3 frames, whole and away from the border, found a "
+                f"whole object in {int(track.seen.sum())} of {len(track.times)} frames; look at its plate, and film with more room "
+                "around the fall"
+            )
+    step = max(FINE * min(track.clip.interval for track in tracks), FINEST)
+    grid = np.arange(-most, most + step, step)
+    offsets, placed = np.zeros(len(phones)), [0]
+    while len(placed) < len(phones):
+        costs = {}
+        for v in set(range(len(phones))) - set(placed):
+            cost = np.zeros(len(grid))
+            for u in placed:
+                cost += disagreement((phones[u], phones[v]), (tracks[u], tracks[v]), grid - offsets[u])
+                cost += disagreement((phones[v], phones[u]), (tracks[v], tracks[u]), offsets[u] - grid)
+            costs[v] = cost / (2 * len(placed))
+        v = min(costs, key=lambda v: (costs[v].min() > LOST, int((costs[v] < costs[v].min() + NEARLY).sum())))
+        best = int(costs[v].argmin())
+        if costs[v][best] > LOST:
+            others = ", ".join(phones[u].name for u in placed)
+            raise DataError(
+                f"{phones[v].video}: its lines of sight meet those of {others} at no offset within {most:g} s (at the best, "
+                f"{grid[best]:.3f} s, in {1 - costs[v][best]:.0%} of the frames): expected one fall filmed by phones whose poses "
+                "belong together; look for a wrong pose, or raise max_offset"
+            )
         offsets[v] = grid[best]
+        placed.append(v)
     return offsets
 
 

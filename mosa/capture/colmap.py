@@ -1,4 +1,4 @@
-"""COLMAP's sparse models, cameras and images of either form (https://colmap.github.io/format.html); points are not read."""
+"""COLMAP's sparse models: cameras, images and points of either form (https://colmap.github.io/format.html)."""
 
 from __future__ import annotations
 
@@ -48,8 +48,9 @@ def read_model(folder: Path) -> dict[str, Camera]:
     raise DataError(f"{folder}: expected images.bin or images.txt of a COLMAP model, found neither")
 
 
-def assembled(cameras: dict[int, Intrinsics], images: list[tuple[str, int, np.ndarray, np.ndarray]],
-              file: Path) -> dict[str, Camera]:
+def assembled(
+    cameras: dict[int, Intrinsics], images: list[tuple[str, int, np.ndarray, np.ndarray]], file: Path
+) -> dict[str, Camera]:
     found = {}
     for name, number, quaternion, shift in images:
         where = f"{file}, image {name}"
@@ -57,7 +58,9 @@ def assembled(cameras: dict[int, Intrinsics], images: list[tuple[str, int, np.nd
             raise DataError(f"{where}: expected one of the cameras {sorted(cameras)}, found CAMERA_ID {number}")
         norm = float(np.linalg.norm(quaternion))
         if not np.isfinite([*quaternion, *shift]).all() or abs(norm - 1) > 1e-3:
-            raise DataError(f"{where}: expected a unit quaternion and a finite translation, found {list(quaternion)}, {list(shift)}")
+            raise DataError(
+                f"{where}: expected a unit quaternion and a finite translation, found {list(quaternion)}, {list(shift)}"
+            )
         K, coefficients, fisheye, size = cameras[number]
         w2c = np.eye(4)
         w2c[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()  # COLMAP writes w first, scipy last
@@ -70,8 +73,10 @@ def assembled(cameras: dict[int, Intrinsics], images: list[tuple[str, int, np.nd
 
 def intrinsics(model: str, width: int, height: int, values: list[float], where: str) -> Intrinsics:
     if model not in MODELS:
-        raise DataError(f"{where}: expected a camera model of {', '.join(MODELS)}, found {model}; undistort the images, or choose "
-                        "one of these in COLMAP (ImageReader.camera_model)")
+        raise DataError(
+            f"{where}: expected a camera model of {', '.join(MODELS)}, found {model}; undistort the images, or choose "
+            "one of these in COLMAP (ImageReader.camera_model)"
+        )
     names = MODELS[model][1]
     if len(values) != len(names):
         raise DataError(f"{where}: expected the {len(names)} parameters {', '.join(names)} of {model}, found {len(values)}")
@@ -153,8 +158,29 @@ def binary_images(file: Path) -> list[tuple[str, int, np.ndarray, np.ndarray]]:
     return found
 
 
-def counted(data: bytes, file: Path) -> int:
+def read_points(folder: Path) -> np.ndarray:
+    """(N, 3) points of a model, none where it has no file of them. Errors: DataError."""
+    text, binary = folder / "points3D.txt", folder / "points3D.bin"
+    if binary.is_file():
+        data, at, found = binary.read_bytes(), 8, []
+        try:
+            for _ in range(counted(data, binary, 100 * MOST)):
+                found.append(struct.unpack_from("<3d", data, at + 8))
+                at += 51 + 8 * struct.unpack_from("<Q", data, at + 43)[0]
+        except struct.error as error:
+            raise DataError(
+                f"{binary}: expected points of a COLMAP model, found a damaged file ({error}); export it again"
+            ) from error
+    elif text.is_file():
+        found = [numbers(line.split()[1:4], f"{text}, line {i}") for i, line in lines_of(text) if line]
+    else:
+        return np.zeros((0, 3))
+    points = np.array(found, float).reshape(-1, 3)
+    return points[np.isfinite(points).all(1)]
+
+
+def counted(data: bytes, file: Path, most: int = MOST) -> int:
     (count,) = struct.unpack_from("<Q", data, 0)
-    if count > MOST:
-        raise DataError(f"{file}: expected at most {MOST} entries, found {count}: not a file of a COLMAP model")
+    if count > most:
+        raise DataError(f"{file}: expected at most {most} entries, found {count}: not a file of a COLMAP model")
     return count

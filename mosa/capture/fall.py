@@ -34,6 +34,9 @@ OUTLIER = 3.5
 FEWEST = 5
 NOISE = 0.05
 """[px] Least noise that is assumed of a centre."""
+OUTLINE = 0.003
+"""The same in radii of the object: what a hull leaves of the difference between an outline's centre and the body's. With it the
+errors of the two synthetic films of docs/capture.md are as large as is said."""
 SCANS = {"down": (1, 1), "up": (1, -1), "right": (0, 1), "left": (0, -1)}
 """Where the sensor's next row lies in the picture -> axis of a pixel, sign."""
 
@@ -111,14 +114,17 @@ def longest_parabola(times: np.ndarray, points: np.ndarray, tolerance: float) ->
             if bend > best:
                 best, found = bend, (i, j - 1)
     if found is None or best < tolerance:
-        raise DataError("no free fall: expected a part of the film in which the object, seen whole by two phones or more, falls "
-                        f"freely through at least {FEWEST} frames and bends off a straight line by {tolerance:.2g} units of the poses, "
-                        f"found {best:.2g} at most; let it fall from higher up, or name the part with flight=[<from>, <to>]")
+        raise DataError(
+            "no free fall: expected a part of the film in which the object, seen whole by two phones or more, falls "
+            f"freely through at least {FEWEST} frames and bends off a straight line by {tolerance:.2g} units of the poses, "
+            f"found {best:.2g} at most; let it fall from higher up, or name the part with flight=[<from>, <to>]"
+        )
     return found
 
 
-def rough_window(phones: list[Phone], tracks: list[Track], offsets: np.ndarray,
-                 flight: tuple[float, float] | None) -> tuple[float, float]:
+def rough_window(
+    phones: list[Phone], tracks: list[Track], offsets: np.ndarray, flight: tuple[float, float] | None
+) -> tuple[float, float]:
     """First and last time [s] of free fall on the first phone's clock; flight: where it is known."""
     if flight is not None:
         return flight
@@ -140,13 +146,16 @@ class Problem:
         self.start = offsets
         self.times, self.pixels, self.shares, self.sigma, self.frames = [], [], [], [], []
         for phone, track, offset in zip(phones, tracks, offsets):
-            inside = np.flatnonzero(track.seen & (track.times + offset >= window[0] - 1e-9) & (track.times + offset <= window[1] + 1e-9))
+            inside = np.flatnonzero(
+                track.seen & (track.times + offset >= window[0] - 1e-9) & (track.times + offset <= window[1] + 1e-9)
+            )
             self.frames.append(inside)
             self.times.append(track.times[inside])
             self.pixels.append(track.centres[inside])
             self.shares.append(row_share(phone, track.centres[inside], knowledge))
             radius = float(np.median(track.radii[inside])) if len(inside) else 1.0
             self.sigma.append(np.hypot(SHIFT * radius, POSE * phone.camera.K[0, 0]))
+        self.radius = float(np.median([np.median(track.radii[track.seen]) for track in tracks]))
         points = centres_at(phones, tracks, offsets, np.linspace(*window, 12))
         good = np.isfinite(points[:, 0])
         t = np.linspace(*window, 12)[good] - self.origin
@@ -157,8 +166,9 @@ class Problem:
 
     def begin(self) -> np.ndarray:
         readouts = np.array([READOUT if known is None else known for known in self.readouts])
-        return np.concatenate([(self.rough / self.depth).ravel(), np.zeros(len(self.phones) - 1), readouts,
-                               np.zeros(2 * len(self.phones))])
+        return np.concatenate(
+            [(self.rough / self.depth).ravel(), np.zeros(len(self.phones) - 1), readouts, np.zeros(2 * len(self.phones))]
+        )
 
     def parts(self, numbers: np.ndarray):
         V = len(self.phones)
@@ -182,8 +192,11 @@ class Problem:
         motion, _, readouts, shifts = self.parts(numbers)
         parts = [miss.ravel() / noise for v, miss in enumerate(self.misses(numbers)) if v != without]
         parts += [(shifts / np.array(self.sigma)[:, None]).ravel()]
-        parts.append(np.array([(r - READOUT) / READOUT_SD if known is None else (r - known) / 1e-5
-                               for r, known in zip(readouts, self.readouts)]))
+        parts.append(
+            np.array(
+                [(r - READOUT) / READOUT_SD if known is None else (r - known) / 1e-5 for r, known in zip(readouts, self.readouts)]
+            )
+        )
         g = self.knowledge.gravity
         if self.knowledge.scale is not None:
             parts.append(np.array([(np.linalg.norm(motion[2]) * self.knowledge.scale / g - 1) / 3e-3]))
@@ -198,8 +211,9 @@ class Problem:
         return least_squares(self.residuals, numbers, args=(noise, without), x_scale="jac", method="trf", max_nfev=60)
 
 
-def fit_fall(phones: list[Phone], tracks: list[Track], offsets: np.ndarray, knowledge: Knowledge,
-             flight: tuple[float, float] | None = None) -> Fall:
+def fit_fall(
+    phones: list[Phone], tracks: list[Track], offsets: np.ndarray, knowledge: Knowledge, flight: tuple[float, float] | None = None
+) -> Fall:
     """The fall from rough offsets (V,) [s]. flight: first and last time of it, where they are known. Errors: DataError."""
     window = rough_window(phones, tracks, offsets, flight)
     interval = max(track.clip.interval for track in tracks)
@@ -208,14 +222,16 @@ def fit_fall(phones: list[Phone], tracks: list[Track], offsets: np.ndarray, know
         problem = Problem(phones, tracks, offsets, window, knowledge)
         count = sum(map(len, problem.times))
         if count < 3 * len(phones) or window[1] - window[0] < 3 * interval:
-            raise DataError(f"no free fall: {count} centres of {len(phones)} phones from {window[0]:.3f} to {window[1]:.3f} s on the "
-                            f"clock of {phones[0].name} are left, at least {3 * len(phones)} are needed; let the object fall from "
-                            "higher up, or name the part with flight=[<from>, <to>]")
+            raise DataError(
+                f"no free fall: {count} centres of {len(phones)} phones from {window[0]:.3f} to {window[1]:.3f} s on the "
+                f"clock of {phones[0].name} are left, at least {3 * len(phones)} are needed; let the object fall from "
+                "higher up, or name the part with flight=[<from>, <to>]"
+            )
         solution = problem.solve(problem.begin() if numbers is None else numbers, noise)
         numbers = solution.x
         misses = problem.misses(numbers)
         every = np.concatenate([m.ravel() for m in misses])
-        noise = max(NOISE, 1.4826 * float(np.median(np.abs(every))))
+        noise = max(NOISE, OUTLINE * problem.radius, 1.4826 * float(np.median(np.abs(every))))
         offsets = problem.parts(numbers)[1]
         numbers = np.concatenate([numbers[:9], np.zeros(len(phones) - 1), numbers[8 + len(phones) :]])
         if flight is not None:
@@ -266,8 +282,12 @@ def described(problem: Problem, solution, noise: float, count: int) -> Fall:
     others = [problem.parts(problem.solve(solution.x, noise, v).x) for v in range(V)] if V > 3 else []
     if others:  # a phone's mistakes are in all of its frames: what the fit is without it says more than its residuals
         sizes = np.array([np.linalg.norm(m[2]) for m, *_ in others])
-        turns = np.array([np.degrees(np.arcsin(np.clip(np.linalg.norm(np.cross(m[2], direction)) / np.linalg.norm(m[2]), 0, 1)))
-                          for m, *_ in others])
+        turns = np.array(
+            [
+                np.degrees(np.arcsin(np.clip(np.linalg.norm(np.cross(m[2], direction)) / np.linalg.norm(m[2]), 0, 1)))
+                for m, *_ in others
+            ]
+        )
         scale_sd = max(scale_sd, np.sqrt((V - 1) / V * np.square(sizes / sizes.mean() - 1).sum()))
         up_sd = max(up_sd, np.sqrt((V - 1) / V * np.square(turns).sum()))
     scale = knowledge.gravity / size if knowledge.scale is None else knowledge.scale

@@ -15,8 +15,9 @@ from omegaconf import DictConfig, OmegaConf
 from mosa.capture.alignment import centres_at, coarse_offsets
 from mosa.capture.fall import SCANS, Fall, Knowledge, fit_fall
 from mosa.capture.mattes import Matting, Track, follow, matting_of
+from mosa.capture.outline import corrected, radius_of
 from mosa.capture.phones import Phone
-from mosa.capture.poses import read_phones
+from mosa.capture.poses import read_phones, scene_points
 from mosa.capture.report import write_report
 from mosa.capture.resampling import common_times, exposure_of, resampled
 from mosa.capture.videos import Clip, find_videos, open_clip, plate_of
@@ -25,6 +26,7 @@ from mosa.capture.world import (
     World,
     box_of,
     floor_gains,
+    floor_of_points,
     ground_height,
     lowest_points,
     read_world,
@@ -45,6 +47,8 @@ OWN = ("fps", "scan", "readout")
 """What one phone may have otherwise than the others."""
 APART = 0.12
 """Radii of the object from where the others see it, from which on a phone is suspected."""
+CORRECTIONS = 2
+"""Times that the fall is fitted again, with the outlines that its hull has."""
 COARSE = 320
 """Pixels of images in which the ground is looked for."""
 
@@ -71,10 +75,9 @@ def capture(values: Mapping[str, Any]) -> dict[str, Any]:
     tracks = followed(clips, mattings)
     world = None if values["like"] is None else read_world(values["like"])
     knowledge = known(values, clips, world)
-    offsets = coarse_offsets(phones, tracks, float(values["max_offset"]))
     flight = None if values["flight"] is None else tuple(map(float, values["flight"]))
-    fall = fit_fall(phones, tracks, offsets, knowledge, flight)
-    log.info("fall: %.3f to %.3f s on the clock of %s, %d centres, %.2f px off", *fall.window, phones[0].name, fall.frames, fall.noise)
+    fall = found_fall(phones, tracks, knowledge, float(values["max_offset"]), flight)
+    log.info("fall: %.3f to %.3f s on the clock of %s, %d centres", *fall.window, phones[0].name, fall.frames)
     exposures = [exposure_of(v, *pair, fall, knowledge) for v, pair in enumerate(zip(phones, tracks))]
     times = common_times(exposures, fall.window, before=values["before"], after=values["after"], rate=values["rate"])
     ground = None if values["ground"] is None else np.array(values["ground"], float)
@@ -89,23 +92,47 @@ def capture(values: Mapping[str, Any]) -> dict[str, Any]:
     write_transforms(folder, phones, times, world)
     centres = world.points(centres_of(exposures, phones, times))
     radius = radius_of(phones, tracks, fall) * world.scale
-    height, error = 0.0, None
+    floor = {"from": "like" if not own else "ground", "sd": None, "tilt_degrees": None}
     if own and ground is None:
         scale = min(1.0, COARSE / max(phones[0].camera.size))
-        lowest = lowest_points(folder, centres, radius, scale)
         pixel = world.scale * np.mean([np.linalg.norm(p.camera.centre - fall.position) / p.camera.K[0, 0] for p in phones])
-        height, error = ground_height(lowest, float(pixel))
+        height, error = ground_height(lowest_points(folder, centres, radius, scale), float(pixel))
+        floor = {"from": "lowest contact", "sd": error, "tilt_degrees": None}
+        level = floor_of_points(world.points(scene_points(values["poses"])), radius, height, max(3 * error, 0.3 * radius))
+        if level is not None:
+            height, floor = level[0], {"from": "points of the model", "sd": level[1], "tilt_degrees": level[2]}
         world = world.lowered(height)
         centres = centres - [0, height, 0]
         write_transforms(folder, phones, times, world)
-    found = figures(values, phones, clips, tracks, fall, knowledge, world, times, centres, radius, error, gains)
+    found = figures(values, phones, clips, tracks, fall, knowledge, world, times, centres, radius, floor, gains)
     (folder / FILE).write_text(json.dumps(found, indent=1))
     write_report(folder, found, phones, tracks, fall, exposures, world, times)
     for line in found["warnings"]:
         log.warning("warning: %s", line)
-    log.info("%d frames of %d phones in %s; what was found is in %s\n%s", len(times), len(phones), folder, folder / "capture.md",
-             found["command"])
+    log.info(
+        "%d frames of %d phones in %s; what was found is in %s\n%s",
+        len(times),
+        len(phones),
+        folder,
+        folder / "capture.md",
+        found["command"],
+    )
     return found
+
+
+def found_fall(
+    phones: list[Phone], tracks: list[Track], knowledge: Knowledge, most: float, flight: tuple[float, float] | None = None
+) -> Fall:
+    """The fall from nothing but tracks: rough clocks, a parabola, and again with the outlines that the hull has. most [s]: of
+    offsets; flight: first and last time [s], where they are known. Errors: DataError."""
+    fall = fit_fall(phones, tracks, coarse_offsets(phones, tracks, most), knowledge, flight)
+    for _ in range(CORRECTIONS):
+        better = corrected(phones, tracks, fall, knowledge)
+        if better is None:
+            log.warning("warning: the mattes have no common hull in the free fall: poses, or mattes, are off")
+            break
+        fall = fit_fall(phones, better, fall.offsets, knowledge, fall.window if flight is None else flight)
+    return fall
 
 
 def of_phone(values: Mapping[str, Any], name: str, key: str):
@@ -159,20 +186,15 @@ def gains_of(values, phones, clips, plates, world, tracks, fall) -> np.ndarray |
     return floor_gains(phones, pictures, world, radius_of(phones, tracks, fall) * world.scale)
 
 
-def radius_of(phones: list[Phone], tracks: list[Track], fall: Fall) -> float:
-    """Of the object, in units of the poses."""
-    return float(np.median([np.median(track.radii[track.seen]) / phone.camera.K[0, 0]
-                            * np.linalg.norm(phone.camera.centre - fall.position) for phone, track in zip(phones, tracks)]))
-
-
 def centres_of(exposures, phones: list[Phone], times: np.ndarray) -> np.ndarray:
     """(T, 3) in units of the poses, where the lines of sight meet at common times."""
     tracks = [Track(None, times, e.path(times), np.ones(len(times))) for e in exposures]
     return centres_at(phones, tracks, np.zeros(len(phones)), times)
 
 
-def figures(values, phones, clips, tracks, fall: Fall, knowledge: Knowledge, world: World, times, centres, radius, ground_sd,
-            gains) -> dict[str, Any]:
+def figures(
+    values, phones, clips, tracks, fall: Fall, knowledge: Knowledge, world: World, times, centres, radius, floor, gains
+) -> dict[str, Any]:
     """All that capture.json says."""
     box = box_of(centres, radius)
     folder = Path(values["output"])
@@ -186,14 +208,16 @@ def figures(values, phones, clips, tracks, fall: Fall, knowledge: Knowledge, wor
             "shift": fall.shifts[v].tolist(), "jitter": clip.jitter, "radius_px": float(np.median(track.radii[track.seen])),
             "gain": None if gains is None else gains[v].tolist(),
         })  # fmt: skip
-    command = (f"python train.py scene=transforms scene.path={folder} scene.up=[0,1,0] "
-               f"scene.gravity=[0,-{values['gravity']:g},0] 'scene.box={json.dumps(box, separators=(',', ':'))}' prior=neo_hookean")
+    command = (
+        f"python train.py scene=transforms scene.path={folder} scene.up=[0,1,0] "
+        f"scene.gravity=[0,-{values['gravity']:g},0] 'scene.box={json.dumps(box, separators=(',', ':'))}' prior=neo_hookean"
+    )
     free = int((times <= fall.window[1]).sum())
     found = {
         "phones": per_phone, "fall": {"window": list(fall.window), "centres": fall.frames, "noise_px": fall.noise,
                                       "acceleration": acceleration},
         "scale": world.scale, "scale_sd": None if knowledge.scale is not None else fall.scale_sd,
-        "up": fall.up.tolist(), "up_sd_degrees": None if knowledge.up is not None else fall.up_sd, "ground_sd": ground_sd,
+        "up": fall.up.tolist(), "up_sd_degrees": None if knowledge.up is not None else fall.up_sd, "ground": floor,
         "radius": radius, "frames": len(times), "free_frames": free, "rate": float(1 / np.diff(times).mean()), "box": box,
         "start": float(times[0]), "interpolation": values["interpolation"], "world": world.written(), "command": command,
     }  # fmt: skip
@@ -205,20 +229,40 @@ def warnings_of(found: dict[str, Any], values: Mapping[str, Any], knowledge: Kno
     said = []
     g = values["gravity"]
     if found["scale_sd"] is not None and found["scale_sd"] > 0.03 * found["scale"]:
-        said.append(f"the scale is known to {found['scale_sd'] / found['scale']:.1%} only, and a modulus of elasticity to twice that: let "
-                    "it fall from higher up, or measure a distance and set scale=<metres per unit of the poses>")
+        said.append(
+            f"the scale is known to {found['scale_sd'] / found['scale']:.1%} only, and a modulus of elasticity to twice that: let "
+            "it fall from higher up, or measure a distance and set scale=<metres per unit of the poses>"
+        )
     if knowledge.scale is not None and abs(found["fall"]["acceleration"] / g - 1) > 0.03:
-        said.append(f"with the scale {knowledge.scale:.6g} the object falls with {found['fall']['acceleration']:.3g} m/s^2 in place of "
-                    f"{g:.3g}: check scale, fps and gravity")
+        said.append(
+            f"with the scale {knowledge.scale:.6g} the object falls with {found['fall']['acceleration']:.3g} m/s^2 in place of "
+            f"{g:.3g}: check scale, fps and gravity"
+        )
     for phone, record in zip(phones, found["phones"]):
         if record["jitter"] > 0.5:
-            said.append(f"{record['name']}: its frames are up to {record['jitter']:.2g} frames off an even rate; the file's times are used")
+            said.append(
+                f"{record['name']}: its frames are up to {record['jitter']:.2g} frames off an even rate; the file's times are used"
+            )
         if record["readout_sd"] > 0.006 and knowledge.readout_of(phone.name) is None:
-            said.append(f"{record['name']}: the fall does not tell how long its sensor takes to be read ({1e3 * record['readout']:.0f} +- "
-                        f"{1e3 * record['readout_sd']:.0f} ms, of which 15 +- 10 is assumed): each millisecond changes the scale")
+            said.append(
+                f"{record['name']}: the fall does not tell how long its sensor takes to be read ({1e3 * record['readout']:.0f} +- "
+                f"{1e3 * record['readout_sd']:.0f} ms, of which 15 +- 10 is assumed): each millisecond changes the scale"
+            )
         if np.hypot(*record["shift"]) > APART * record["radius_px"]:
-            said.append(f"{record['name']}: the object appears {np.hypot(*record['shift']):.1f} px from where the others see it: a pose or a "
-                        "matte that is off?")
+            said.append(
+                f"{record['name']}: the object appears {np.hypot(*record['shift']):.1f} px from where the others see it: a pose or a "
+                "matte that is off?"
+            )
+    if (tilt := found["ground"]["tilt_degrees"]) is not None and tilt > 1.5:
+        said.append(
+            f"the floor's points are tilted against the fall by {tilt:.1f} degrees: a slope, or an up that is off; scene.ground "
+            "is a level plane"
+        )
+    if found["ground"]["from"] == "lowest contact" and found["ground"]["sd"] > 0.05 * found["radius"]:
+        said.append(
+            f"the ground is known to {1e3 * found['ground']['sd']:.0f} mm only, from the body's outlines: name a point of the floor "
+            "with ground=[x, y, z], in the world of the poses, or film with a phone at the height of the floor"
+        )
     if found["free_frames"] < 3:
         said.append(f"only {found['free_frames']} frames of free fall are written: raise before=")
     return said

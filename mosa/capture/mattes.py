@@ -29,17 +29,25 @@ Matting = Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray]]
 @dataclass(frozen=True)
 class Track:
     """What one phone sees of the object. times: (T,) [s] of its own clock; centres: (T, 2) [px] of the matte, NaN where no whole
-    object is seen; radii: (T,) [px] of a disc of as many pixels; clip."""
+    object is seen; radii: (T,) [px] of a disc of as many pixels; masks: per frame first column and row [px] and a part (h, w) of bools, or None."""
 
     clip: Clip
     times: np.ndarray
     centres: np.ndarray
     radii: np.ndarray
+    masks: tuple[tuple[int, int, np.ndarray] | None, ...] = ()
 
     @property
     def seen(self) -> np.ndarray:
         """(T,) bool: frames with a whole object."""
         return np.isfinite(self.centres[:, 0])
+
+    def shows(self, frame: int, pixels: np.ndarray) -> np.ndarray:
+        """(N,) bool: whether the object covers pixels (N, 2) in a frame."""
+        x0, y0, part = self.masks[frame]
+        column, row = np.floor(pixels).astype(int).T - np.array([[x0], [y0]])
+        inside = (column >= 0) & (column < part.shape[1]) & (row >= 0) & (row < part.shape[0])
+        return inside & part[np.clip(row, 0, part.shape[0] - 1), np.clip(column, 0, part.shape[1] - 1)]
 
 
 def matting_of(kind: str, clip: Clip, *, plates: Path | None, plate_seconds, masks: Path | None) -> Matting:
@@ -87,8 +95,10 @@ def from_videos(folder: Path, clip: Clip) -> Matting:
         raise DataError(f"{folder}: expected a mask video named {clip.path.stem}, found {[f.name for f in find_videos(folder)]}")
     other = open_clip(named[0])
     if len(other.times) != len(clip.times) or other.size != clip.size:
-        raise DataError(f"{named[0]}: expected {len(clip.times)} frames of {clip.size[0]}x{clip.size[1]} px as {clip.path}, found "
-                        f"{len(other.times)} of {other.size[0]}x{other.size[1]}")
+        raise DataError(
+            f"{named[0]}: expected {len(clip.times)} frames of {clip.size[0]}x{clip.size[1]} px as {clip.path}, found "
+            f"{len(other.times)} of {other.size[0]}x{other.size[1]}"
+        )
     source: Iterator[tuple[int, np.ndarray]] | None = None
     at = -1
 
@@ -139,7 +149,9 @@ def centre_of(matte: np.ndarray) -> tuple[np.ndarray, float]:
     return np.array([x, y]), float(np.sqrt(total / np.pi))
 
 
-def matted_frames(clip: Clip, matting: Matting, first: int = 0, last: int | None = None) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+def matted_frames(
+    clip: Clip, matting: Matting, first: int = 0, last: int | None = None
+) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """(number, straight colour (H, W, 3), matte (H, W) of the whole object) of the frames first to last."""
     near = None
     for i, picture in frames_of(clip, first, last):
@@ -151,9 +163,13 @@ def matted_frames(clip: Clip, matting: Matting, first: int = 0, last: int | None
 
 
 def follow(clip: Clip, matting: Matting, progress: Callable[[], None] = lambda: None) -> Track:
-    """Centres and radii in all frames of a clip."""
+    """Centres, radii and masks in all frames of a clip."""
     centres, radii = np.full((len(clip.times), 2), np.nan), np.zeros(len(clip.times))
+    masks: list[tuple[int, int, np.ndarray] | None] = [None] * len(clip.times)
     for i, _, matte in matted_frames(clip, matting):
         centres[i], radii[i] = centre_of(matte)
+        if np.isfinite(centres[i, 0]):
+            x0, y0, w, h = cv2.boundingRect((matte > 0.5).astype(np.uint8))
+            masks[i] = x0, y0, matte[y0 : y0 + h, x0 : x0 + w] > 0.5
         progress()
-    return Track(clip, clip.times, centres, radii)
+    return Track(clip, clip.times, centres, radii, tuple(masks))

@@ -44,8 +44,11 @@ class Camera:
         if not self.fisheye and not any(self.coefficients.values()):
             return (seen @ self.K.T)[:, :2] / seen[:, 2:]
         none, K, shape = np.zeros(3), self.opencv_K(), (-1, 1, 3)
-        found = (cv2.fisheye.projectPoints(seen.reshape(shape), none, none, K, self.lens()) if self.fisheye
-                 else cv2.projectPoints(seen.reshape(shape), none, none, K, self.lens()))[0]
+        found = (
+            cv2.fisheye.projectPoints(seen.reshape(shape), none, none, K, self.lens())
+            if self.fisheye
+            else cv2.projectPoints(seen.reshape(shape), none, none, K, self.lens())
+        )[0]
         return found.reshape(-1, 2) + HALF
 
     def rays(self, pixels: np.ndarray) -> np.ndarray:

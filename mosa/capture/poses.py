@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mosa.capture.colmap import is_model, read_model
+from mosa.capture.colmap import is_model, read_model, read_points
 from mosa.capture.phones import Camera, Phone
 from mosa.data.footage import matrix, number, read_json, world_to_camera
 from mosa.data.lens import COEFFICIENTS, is_fisheye
@@ -36,8 +36,10 @@ def read_phones(videos: str | Path, poses: str | Path, sizes: dict[str, tuple[in
         video = folder / file
         mine = {name: camera for name, camera in cameras.items() if belongs(name, video.stem)}
         if not mine:
-            raise DataError(f"{poses}: no pose for {video}: expected an image named {video.stem}.<ending>, {video.stem}_<number>, or "
-                            f"in a folder {video.stem}, found {', '.join(list(cameras)[:8])}")
+            raise DataError(
+                f"{poses}: no pose for {video}: expected an image named {video.stem}.<ending>, {video.stem}_<number>, or "
+                f"in a folder {video.stem}, found {', '.join(list(cameras)[:8])}"
+            )
         one = still(mine, extent, video.stem)
         phones.append(Phone(video.stem, resized(one, size, video), video))
     if len(phones) < FEWEST:
@@ -48,14 +50,26 @@ def read_phones(videos: str | Path, poses: str | Path, sizes: dict[str, tuple[in
 def read_poses(path: str | Path) -> dict[str, Camera]:
     """Image name -> camera, of a COLMAP model's folder or a transforms.json (or a folder with one)."""
     place = Path(path)
+    if (model := model_folder(place)) is not None:
+        return read_model(model)
     if place.is_dir():
-        for folder in (place, place / "sparse" / "0", place / "sparse", place / "0"):
-            if is_model(folder):
-                return read_model(folder)
         if not (place / "transforms.json").is_file():
-            raise DataError(f"{place}: expected a COLMAP model (cameras.bin and images.bin, or .txt) or transforms.json, found neither")
+            raise DataError(
+                f"{place}: expected a COLMAP model (cameras.bin and images.bin, or .txt) or transforms.json, found neither"
+            )
         place = place / "transforms.json"
     return read_transforms_poses(place)
+
+
+def model_folder(place: Path) -> Path | None:
+    """Where a COLMAP model lies, in the folder or as COLMAP nests it; None where there is none."""
+    return next((f for f in (place, place / "sparse" / "0", place / "sparse", place / "0") if is_model(f)), None)
+
+
+def scene_points(path: str | Path) -> np.ndarray:
+    """(N, 3) points of the surroundings in the poses' world; none where poses bring none."""
+    model = model_folder(Path(path))
+    return np.zeros((0, 3)) if model is None else read_points(model)
 
 
 def read_transforms_poses(file: Path) -> dict[str, Camera]:
@@ -77,8 +91,9 @@ def read_transforms_poses(file: Path) -> dict[str, Camera]:
         if "fl_x" not in known and not 0 < known.get("camera_angle_x", 0) < math.pi:
             raise DataError(f"{where}: expected fl_x (and fl_y) in pixels or camera_angle_x in radians, found neither")
         focal = known.get("fl_x") or 0.5 * known["w"] / math.tan(0.5 * known["camera_angle_x"])
-        K = np.array([[focal, 0, known.get("cx", known["w"] / 2)], [0, known.get("fl_y", focal), known.get("cy", known["h"] / 2)],
-                      [0, 0, 1]])
+        K = np.array(
+            [[focal, 0, known.get("cx", known["w"] / 2)], [0, known.get("fl_y", focal), known.get("cy", known["h"] / 2)], [0, 0, 1]]
+        )
         fisheye = is_fisheye(both.get("camera_model"), both.get("is_fisheye"), where)
         w2c = world_to_camera(matrix(entry["transform_matrix"], (3, 4), f"{where}, transform_matrix"), where)
         lens = {name: known[name] for name in COEFFICIENTS if name in known}
@@ -103,8 +118,10 @@ def still(cameras: dict[str, Camera], extent: float, phone: str) -> Camera:
         turn = camera.w2c[:3, :3] @ one.w2c[:3, :3].T
         angle = math.degrees(math.acos(np.clip(0.5 * (np.trace(turn) - 1), -1, 1)))
         if away > MOVED * extent or angle > TURNED:
-            raise DataError(f"{camera.where}: phone {phone} stands elsewhere than in {name}, by {away:.3g} (the cameras span "
-                            f"{extent:.3g}) and {angle:.2g} degrees: expected phones that stand still; use one image of each")
+            raise DataError(
+                f"{camera.where}: phone {phone} stands elsewhere than in {name}, by {away:.3g} (the cameras span "
+                f"{extent:.3g}) and {angle:.2g} degrees: expected phones that stand still; use one image of each"
+            )
     return one
 
 
@@ -112,7 +129,9 @@ def resized(camera: Camera, size: tuple[int, int], video: Path) -> Camera:
     """The camera for frames of another size of the same field of view. Errors: DataError where the sides' ratio differs."""
     factor = size[0] / camera.size[0], size[1] / camera.size[1]
     if abs(factor[0] / factor[1] - 1) > 2e-3:
-        raise DataError(f"{camera.where}: intrinsics are for {camera.size[0]}x{camera.size[1]} px, but {video} has frames of "
-                        f"{size[0]}x{size[1]}: expected the poses of images with the video's field of view; take them from a frame "
-                        "of each video, not from photographs")
+        raise DataError(
+            f"{camera.where}: intrinsics are for {camera.size[0]}x{camera.size[1]} px, but {video} has frames of "
+            f"{size[0]}x{size[1]}: expected the poses of images with the video's field of view; take them from a frame "
+            "of each video, not from photographs"
+        )
     return replace(camera, K=np.diag([*factor, 1.0]) @ camera.K, size=size)

@@ -23,8 +23,16 @@ TILE = 180
 COLUMNS = 8
 
 
-def write_report(folder: Path, found: dict[str, Any], phones: list[Phone], tracks: list[Track], fall: Fall, exposures: list[Exposure],
-                 world: World, times: np.ndarray) -> None:
+def write_report(
+    folder: Path,
+    found: dict[str, Any],
+    phones: list[Phone],
+    tracks: list[Track],
+    fall: Fall,
+    exposures: list[Exposure],
+    world: World,
+    times: np.ndarray,
+) -> None:
     """capture.md, contact.png and fall.png into the folder."""
     cv2.imwrite(str(folder / "contact.png"), contact_sheet(folder, [phone.name for phone in phones], len(times), found))
     draw_fall(folder / "fall.png", phones, tracks, fall, exposures, world)
@@ -49,7 +57,12 @@ def page(found: dict[str, Any]) -> str:
         "|---|---|---|",
         f"| metres per unit of the poses | {found['scale']:.6g} | {sure(found['scale_sd'])} |",
         f"| up in the poses' world | {', '.join(f'{x:.4f}' for x in found['up'])} | {sure(found['up_sd_degrees'])} degrees |",
-        f"| ground [m] | 0, by definition | {sure(found['ground_sd'])} |",
+        f"| ground [m], from {found['ground']['from']} | 0, by definition | {sure(found['ground']['sd'])} |",
+        *(
+            [f"| tilt of the floor's points [degrees] | {found['ground']['tilt_degrees']:.2f} | |"]
+            if found["ground"]["tilt_degrees"] is not None
+            else []
+        ),
         f"| radius of the object [m] | {found['radius']:.3g} | |",
         f"| free fall [s, clock of {found['phones'][0]['name']}] | {fall['window'][0]:.3f} to {fall['window'][1]:.3f} | |",
         f"| acceleration in it [m/s^2] | {fall['acceleration']:.4g} | |",
@@ -67,7 +80,8 @@ def page(found: dict[str, Any]) -> str:
         gain = "" if p["gain"] is None else ", ".join(f"{g:.2f}" for g in p["gain"])
         lines.append(
             f"| {p['name']} | {p['fps']:.5g} | {p['seen']} of {p['frames']} frames | {1e3 * p['offset']:.2f} +- {1e3 * p['offset_sd']:.2f} | "
-            f"{1e3 * p['readout']:.1f} +- {1e3 * p['readout_sd']:.1f} ({p['scan']}) | {p['shift'][0]:.1f}, {p['shift'][1]:.1f} | {gain} |")
+            f"{1e3 * p['readout']:.1f} +- {1e3 * p['readout_sd']:.1f} ({p['scan']}) | {p['shift'][0]:.1f}, {p['shift'][1]:.1f} | {gain} |"
+        )
     return "\n".join([
         *lines, "",
         f"Clock: what is added to a phone's own time to have that of {found['phones'][0]['name']}. Readout: time from the first row of "
@@ -98,7 +112,9 @@ def contact_sheet(folder: Path, names: list[str], frames: int, found: dict[str, 
             tiles.append(cv2.copyMakeBorder(shown, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=(255, 255, 255)))
         rows.append(np.hstack(tiles))
     width = max(row.shape[1] for row in rows)
-    return np.vstack([cv2.copyMakeBorder(row, 0, 0, 0, width - row.shape[1], cv2.BORDER_CONSTANT, value=(255, 255, 255)) for row in rows])
+    return np.vstack(
+        [cv2.copyMakeBorder(row, 0, 0, 0, width - row.shape[1], cv2.BORDER_CONSTANT, value=(255, 255, 255)) for row in rows]
+    )
 
 
 def draw_fall(file: Path, phones: list[Phone], tracks: list[Track], fall: Fall, exposures: list[Exposure], world: World) -> None:

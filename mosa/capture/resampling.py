@@ -61,8 +61,9 @@ def exposure_of(v: int, phone: Phone, track: Track, fall: Fall, knowledge: Knowl
     return Exposure(phone, times, float(fall.readouts[v]), axis, sign, track.centres, path)
 
 
-def common_times(exposures: list[Exposure], window: tuple[float, float], *, before: float, after: float,
-                 rate: float | None) -> np.ndarray:
+def common_times(
+    exposures: list[Exposure], window: tuple[float, float], *, before: float, after: float, rate: float | None
+) -> np.ndarray:
     """(T,) [s], evenly spaced, from `before` seconds before the free fall ends to `after` after it, as far as every phone has a whole
     object in the frames around. rate [1/s]: None for the slowest phone's. Errors: DataError where less than five are left."""
     slowest = max(float(np.median(np.diff(e.times))) for e in exposures)
@@ -75,9 +76,11 @@ def common_times(exposures: list[Exposure], window: tuple[float, float], *, befo
     bad = np.flatnonzero(~good)
     begin, end = max(bad[bad <= low], default=-1) + 1, min(bad[bad > low], default=len(grid))
     if end - begin < 5 or low - begin < 1:
-        raise DataError(f"{end - begin} common frames ({low - begin} of them in free fall): expected at least five in which every phone "
-                        "sees the whole object, two of them before the end of the free fall; film with more room around, longer, or "
-                        "change before=, after=")
+        raise DataError(
+            f"{end - begin} common frames ({low - begin} of them in free fall): expected at least five in which every phone "
+            "sees the whole object, two of them before the end of the free fall; film with more room around, longer, or "
+            "change before=, after="
+        )
     return grid[begin:end]
 
 
@@ -129,8 +132,9 @@ def blended(one: np.ndarray, two: np.ndarray, share: float, centre: np.ndarray, 
     flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(grey(a), grey(b), None)
     x, y = np.meshgrid(np.arange(x1 - x0, dtype=np.float32), np.arange(y1 - y0, dtype=np.float32))
     from_one = cv2.remap(a, x - share * flow[..., 0], y - share * flow[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    from_two = cv2.remap(b, x + (1 - share) * flow[..., 0], y + (1 - share) * flow[..., 1], cv2.INTER_CUBIC,
-                         borderMode=cv2.BORDER_REPLICATE)
+    from_two = cv2.remap(
+        b, x + (1 - share) * flow[..., 0], y + (1 - share) * flow[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+    )
     found = (1 - share) * one + share * two
     found[y0:y1, x0:x1] = (1 - share) * from_one + share * from_two
     return found
@@ -155,8 +159,13 @@ def resampled(exposure: Exposure, track: Track, matting: Matting, times: np.ndar
         elif kind == "shift" or k0 == k1:
             picture = moved(frames[nearest], exposure, nearest, float(time))
         else:
-            picture = blended(moved(frames[k0], exposure, k0, float(time)), moved(frames[k1], exposure, k1, float(time)), share,
-                              exposure.path(float(time)), radius)
+            picture = blended(
+                moved(frames[k0], exposure, k0, float(time)),
+                moved(frames[k1], exposure, k1, float(time)),
+                share,
+                exposure.path(float(time)),
+                radius,
+            )
         found.append(straight(picture))
     return np.stack(found)
 

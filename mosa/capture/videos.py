@@ -54,7 +54,9 @@ def open_clip(path: Path, fps: float | None = None) -> Clip:
     """
     video = cv2.VideoCapture(str(path))
     if not video.isOpened():
-        raise DataError(f"{path}: expected a video that OpenCV can read, found a damaged or unknown one; export it as H.264 in .mp4")
+        raise DataError(
+            f"{path}: expected a video that OpenCV can read, found a damaged or unknown one; export it as H.264 in .mp4"
+        )
     times, nominal = [], float(video.get(cv2.CAP_PROP_FPS))
     while video.grab():
         times.append(1e-3 * float(video.get(cv2.CAP_PROP_POS_MSEC)))
@@ -68,7 +70,9 @@ def open_clip(path: Path, fps: float | None = None) -> Clip:
         stamps = np.arange(len(stamps)) / fps
     elif not (np.diff(stamps) > 0).all():
         if not 1 < nominal < 2000:
-            raise DataError(f"{path}: expected increasing times of frames, found none that can be used; set fps={{{path.stem}: 60}}")
+            raise DataError(
+                f"{path}: expected increasing times of frames, found none that can be used; set fps={{{path.stem}: 60}}"
+            )
         stamps = np.arange(len(stamps)) / nominal
     even = np.polyval(np.polyfit(np.arange(len(stamps)), stamps, 1), np.arange(len(stamps)))
     jitter = float(np.abs(stamps - even).max() / np.median(np.diff(stamps)))
@@ -108,13 +112,17 @@ def plate_of(folder: Path | None, clip: Clip, seconds: tuple[float, float] | Non
                     raise DataError(f"{file}: expected a readable picture, found a damaged one")
                 return fitting(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), clip, file).astype(np.float32) / 255
     if seconds is None:
-        raise DataError(f"{clip.path}: no background plate: expected {stem}.png (or .jpg, .mp4) of the empty scene in "
-                        f"{folder if folder is not None else 'the folder plates='}, or plate_seconds=[0, 0.5] where the video "
-                        "begins without the object, or another mattes=")
+        raise DataError(
+            f"{clip.path}: no background plate: expected {stem}.png (or .jpg, .mp4) of the empty scene in "
+            f"{folder if folder is not None else 'the folder plates='}, or plate_seconds=[0, 0.5] where the video "
+            "begins without the object, or another mattes="
+        )
     inside = np.flatnonzero((clip.times >= seconds[0]) & (clip.times <= seconds[1]))
     if len(inside) == 0:
-        raise ConfigError(f"plate_seconds: expected times within {clip.times[0]:.3g} to {clip.times[-1]:.3g} s of {clip.path}, "
-                          f"found {list(seconds)}")
+        raise ConfigError(
+            f"plate_seconds: expected times within {clip.times[0]:.3g} to {clip.times[-1]:.3g} s of {clip.path}, "
+            f"found {list(seconds)}"
+        )
     return median_of(clip, int(inside[0]), int(inside[-1]), clip)
 
 
@@ -127,6 +135,8 @@ def median_of(clip: Clip, first: int, last: int, like: Clip) -> np.ndarray:
 
 def fitting(picture: np.ndarray, clip: Clip, file: Path) -> np.ndarray:
     if picture.shape[1::-1] != clip.size:
-        raise DataError(f"{file}: expected {clip.size[0]}x{clip.size[1]} px as {clip.path}, found "
-                        f"{picture.shape[1]}x{picture.shape[0]}: film the plate with the same settings")
+        raise DataError(
+            f"{file}: expected {clip.size[0]}x{clip.size[1]} px as {clip.path}, found "
+            f"{picture.shape[1]}x{picture.shape[0]}: film the plate with the same settings"
+        )
     return picture

@@ -19,8 +19,12 @@ from mosa.errors import DataError
 from mosa.reconstruction.hull import occupancy
 
 FILE = "capture.json"
-REACH, PITCH = 2.2, 1 / 24
+REACH, PITCH = 2.2, 1 / 20
 """Radii of the object around its centre in which its lowest point is looked for, and steps of the search."""
+FOOT = 0.1
+"""Share of its widest level's area from which on a level of a hull is taken for the body's."""
+AROUND, LAYER, FEWEST = 10.0, 0.06, 15
+"""Radii around the landing in which points belong to the floor, half a layer's thickness in radii, and how many make one."""
 FLOOR = 3.0
 """Radii of the object around where it lands: of the floor that phones see there one colour is expected."""
 GAIN = 3.0
@@ -72,10 +76,14 @@ def read_world(folder: str | Path) -> World:
     document = read_json(file)
     found = document.get("world") if isinstance(document, Mapping) else None
     if not isinstance(found, Mapping) or not {"scale", "rotation", "origin"} <= set(found):
-        raise DataError(f"{file}: expected the record of a capture with the keys world.scale, rotation and origin; name the folder that "
-                        "mosa-capture wrote")
+        raise DataError(
+            f"{file}: expected the record of a capture with the keys world.scale, rotation and origin; name the folder that "
+            "mosa-capture wrote"
+        )
     origin = matrix([found["origin"]], (1, 3), f"{file}, world.origin")[0]
-    return World(number(found["scale"], f"{file}, world.scale"), matrix(found["rotation"], (3, 3), f"{file}, world.rotation"), origin)
+    return World(
+        number(found["scale"], f"{file}, world.scale"), matrix(found["rotation"], (3, 3), f"{file}, world.rotation"), origin
+    )
 
 
 def write_images(folder: Path, phone: Phone, pictures: np.ndarray) -> None:
@@ -103,37 +111,54 @@ def write_transforms(folder: Path, phones: list[Phone], times: np.ndarray, world
 
 
 def lowest_points(folder: Path, centres: np.ndarray, radius: float, scale: float) -> np.ndarray:
-    """(T,) [m] lowest height of the visual hull in each frame of a written capture; centres: (T, 3), radius [m]; scale: of the
-    images. NaN where the hull is empty there."""
+    """(T, 2) [m] heights of `lowest_of_hull` in each frame of a written capture; centres: (T, 3), radius [m]; scale: of the images."""
     footage = read_transforms(folder, scale=scale)
     return np.array([lowest_of_hull(footage, t, centre, radius) for t, centre in enumerate(centres)])
 
 
-def lowest_of_hull(footage: Footage, frame: int, centre: np.ndarray, radius: float) -> float:
-    """Height [m] at which the hull's largest matte value in a level crosses 1/2, between levels PITCH radii apart."""
-    across = np.arange(-REACH, REACH, PITCH)
-    levels = np.arange(-REACH, 0.0, PITCH)
-    grid = np.stack(np.meshgrid(across, levels, across, indexing="ij"), -1) * radius + centre
-    values = occupancy(torch.from_numpy(grid).float(), footage.mattes[:, frame], footage.cameras).amax((0, 2)).numpy()
-    inside = np.flatnonzero(values > 0.5)
+def lowest_of_hull(footage: Footage, frame: int, centre: np.ndarray, radius: float) -> tuple[float, float]:
+    """Heights [m] of the hull's tip, and of the lowest level with FOOT of its widest level's area. Below a flat underside a hull
+    ends in a cone of the lowest phone's slope, so that the ground lies between. NaNs where it is empty, or cut by the search."""
+    steps = np.arange(-REACH, REACH, PITCH)
+    grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1) * radius + centre
+    values = occupancy(torch.from_numpy(grid).float(), footage.mattes[:, frame], footage.cameras)
+    area = (values.clamp(0.0, 1.0) > 0.5).float().sum((0, 2)).numpy()
+    inside = np.flatnonzero(area)
     if len(inside) == 0 or inside[0] == 0:
-        return float("nan")
-    k = inside[0]
-    share = (0.5 - values[k - 1]) / (values[k] - values[k - 1])
-    return float(centre[1] + radius * (levels[k - 1] + share * PITCH))
+        return float("nan"), float("nan")
+    foot = np.flatnonzero(area >= FOOT * area.max())[0]
+    return tuple(float(centre[1] + radius * (steps[k] - 0.5 * PITCH)) for k in (inside[0], foot))
 
 
 def ground_height(lowest: np.ndarray, pixel: float) -> tuple[float, float]:
-    """Height [m] of the ground and what it may be off by, from the lowest heights (T,) of the body: the least, of medians of three
+    """Height [m] of the ground and what it may be off by, from (T, 2) heights of `lowest_of_hull`: the least, of medians of three
     frames, which a single bad matte does not lower. pixel [m]: at the object. Errors: DataError."""
-    good = lowest[np.isfinite(lowest)]
+    good = lowest[np.isfinite(lowest).all(1)]
     if len(good) < 3:
-        raise DataError("ground: the object's lowest point is not seen; name a point of the floor with ground=[x, y, z], in the "
-                        "world of the poses")
-    smooth = np.median(np.lib.stride_tricks.sliding_window_view(good, 3), axis=1)
-    height = float(smooth.min())
-    near = np.sort(np.abs(good - height))[: max(3, len(good) // 5)]
-    return height, max(pixel, float(np.median(near)))
+        raise DataError(
+            "ground: the object's lowest point is not seen; name a point of the floor with ground=[x, y, z], in the "
+            "world of the poses"
+        )
+    smooth = np.median(np.lib.stride_tricks.sliding_window_view(good, 3, axis=0), axis=2)
+    k = int(smooth[:, 1].argmin())
+    return float(smooth[k, 1]), max(pixel, float(smooth[k, 1] - smooth[k, 0]))
+
+
+def floor_of_points(points: np.ndarray, radius: float, near: float, apart: float) -> tuple[float, float, float] | None:
+    """(height [m], one standard deviation [m], tilt against level [degrees]) of the floor among points (N, 3) [m] of the surroundings,
+    the densest level within `apart` of `near`, where the object was lowest; None where there are too few of them."""
+    around = points[(np.hypot(points[:, 0], points[:, 2]) < AROUND * radius) & (np.abs(points[:, 1] - near) < apart)]
+    if len(around) < FEWEST:
+        return None
+    thick = LAYER * radius
+    inside = max((np.flatnonzero(np.abs(around[:, 1] - y) < thick) for y in around[:, 1]), key=len)
+    layer = around[inside]
+    if len(layer) < FEWEST:
+        return None
+    height = float(np.median(layer[:, 1]))
+    spread = 1.4826 * float(np.median(np.abs(layer[:, 1] - height)))
+    slope = np.linalg.lstsq(np.concatenate([layer[:, [0, 2]], np.ones((len(layer), 1))], 1), layer[:, 1], rcond=None)[0]
+    return height, max(1e-4, 1.25 * spread / len(layer) ** 0.5), float(np.degrees(np.arctan(np.hypot(slope[0], slope[1]))))
 
 
 def box_of(centres: np.ndarray, radius: float) -> list[list[float]]:
