@@ -1,8 +1,8 @@
 """Own capture against the truth: six simulated phones with their faults, mosa-capture on what they film, and what it found.
 
-    python benchmarks/capture.py film --folder /tmp/capture --name rabbit           # videos, plates, poses as COLMAP writes them
-    python benchmarks/capture.py compare --folder /tmp/capture                      # mosa-capture, and its errors
-    python benchmarks/capture.py footage --folder /tmp/capture                      # perfect footage and held-out drops, train commands
+    python benchmarks/capture.py film --folder /tmp/capture --name rabbit   # videos, plates, poses as COLMAP writes them
+    python benchmarks/capture.py compare --folder /tmp/capture              # mosa-capture, and its errors
+    python benchmarks/capture.py footage --folder /tmp/capture              # perfect footage and held-out drops, train commands
 
 `compare` prints errors of clocks, readouts, scale, up and ground, and how well the frames at common times are those of perfect
 cameras there, interpolated in three ways. `footage` writes what the fits need that `docs/capture.md` compares. Synthetic scenes.
@@ -24,7 +24,7 @@ from mosa.capture.resampling import KINDS
 from mosa.capture.world import World
 from mosa.commands import configuration
 
-SKEWED = 0.02
+STEP = 0.02
 """[s] between frames of held-out drops: as the built-in scenes'."""
 
 
@@ -74,7 +74,8 @@ def errors(truth: dict, found: dict) -> dict[str, float]:
         "clock_said_ms": float(1e3 * np.mean([p["offset_sd"] for p in found["phones"][1:]])),
         "readout_rms_ms": float(np.sqrt(np.square(readouts).mean())),
         "readout_said_ms": float(1e3 * np.mean([p["readout_sd"] for p in found["phones"]])),
-        "scale_percent": 100 * (found["scale"] / truth["scale"] - 1), "scale_said_percent": 100 * found["scale_sd"] / found["scale"],
+        "scale_percent": 100 * (found["scale"] / truth["scale"] - 1),
+        "scale_said_percent": 100 * found["scale_sd"] / found["scale"],
         "up_degrees": float(np.degrees(np.arccos(np.clip(up[1], -1, 1)))), "up_said_degrees": found["up_sd_degrees"],
         "ground_mm": 1e3 * float(b[1]), "ground_said_mm": 1e3 * found["ground"]["sd"],
     }  # fmt: skip
@@ -121,23 +122,25 @@ def compare(folder: Path, kinds: list[str]) -> dict:
     for name, unit in (("clock_rms", "ms"), ("readout_rms", "ms"), ("scale", "percent"), ("up", "degrees"), ("ground", "mm")):
         print(f"| {name} [{unit}] | {said[f'{name}_{unit}']:.3g} | {said[name.removesuffix('_rms') + f'_said_{unit}']:.3g} |")
     print(
-        "\n| frames at common times | overlap of mattes | worst | centres apart [px] | worst | PSNR inside [dB] |\n|---|---|---|---|---|---|"
+        "\n| frames at common times | overlap of mattes | worst | centres apart [px] | worst | PSNR inside [dB] |\n"
+        "|---|---|---|---|---|---|"
     )
     for kind in kinds:
         p = said[kind]
         print(
-            f"| {kind} | {p['overlap']:.4f} | {p['overlap_worst']:.4f} | {p['apart_px']:.2f} | {p['apart_worst_px']:.2f} | {p['psnr']:.1f} |"
+            f"| {kind} | {p['overlap']:.4f} | {p['overlap_worst']:.4f} | {p['apart_px']:.2f} | {p['apart_worst_px']:.2f} | "
+            f"{p['psnr']:.1f} |"
         )
     (folder / "compare.json").write_text(json.dumps(said, indent=1))
     return said
 
 
 def footage(folder: Path, held: list[str]) -> None:
-    """Held-out drops by perfect cameras with true particles, and the commands that learn from the phones and from perfect footage."""
+    """Held-out drops by perfect cameras with true particles, and the commands that learn from the phones and perfectly."""
     truth, found = (json.loads((folder / name).read_text()) for name in ("truth.json", "scene/capture.json"))
     world = gauge(truth, found_world(found))
     for sequence in held:
-        perfect(folder / "held_out" / sequence, truth, sequence=sequence, times=np.arange(15) * SKEWED, world=world, particles=True)
+        perfect(folder / "held_out" / sequence, truth, sequence=sequence, times=np.arange(15) * STEP, world=world, particles=True)
     tests = ",".join(f"{{path: {folder.resolve()}/held_out/{sequence}, particles: truth}}" for sequence in held)
     box = json.dumps(found["box"], separators=(",", ":"))
     for name in ("scene", "perfect"):

@@ -1,13 +1,15 @@
 """Six phones film a built-in body with all their faults, and six perfect cameras film the same: footage for benchmarks/capture.py.
 
-Faults: clocks that differ by fractions of a second, sensors read row by row, noise, H.264, exposure and white balance of each phone's
-own and other ones in its plate, poses that are a little wrong, in a world of any scale and orientation. Mattes are left to the program.
+Faults: clocks that differ by fractions of a second, sensors read row by row, noise, H.264, exposure and white balance of each
+phone's own and other ones in its plate, poses that are a little wrong, in a world of any scale and orientation. Mattes are left to
+the program.
 """
 
 from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -36,8 +38,8 @@ REST = 0.12
 
 @dataclass(frozen=True)
 class Faults:
-    """Of all phones; sizes of what is drawn for each. offset, readout [s]; noise: of 8-bit values over 255; exposure [stops]; balance:
-    of a colour channel; pose [degrees], place [m], focal: relative; quality: H.264's crf."""
+    """Of all phones; sizes of what is drawn for each. offset, readout [s]; noise: of 8-bit values over 255; exposure [stops];
+    balance: of a colour channel; pose [degrees], place [m], focal: relative; quality: H.264's crf."""
 
     offset: float = 0.4
     readout: tuple[float, float] = (0.008, 0.022)
@@ -133,7 +135,7 @@ class Shown:
         _, top, _, bottom = window(corners, K, w2c, width, height)
         bands = max(1, int(np.ceil(readout / (BAND if self.fall.shift(t + 0.5 * readout) is not None else 2 * BAND))))
         edges = np.linspace(0, height, bands + 1).round().astype(int)
-        for r0, r1 in zip(edges[:-1], edges[1:]):
+        for r0, r1 in pairwise(edges):
             if r1 > top and r0 < bottom:
                 x0, part = self.rows(t + readout * (0.5 * (r0 + r1) / height - 0.5), K, w2c, size, (r0, r1))
                 picture[r0:r1, x0 : x0 + part.shape[1]] = part
@@ -165,7 +167,7 @@ def smooth_noise(u: np.ndarray, v: np.ndarray, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     total = np.zeros_like(u)
     for _ in range(12):
-        a, b, c = rng.normal(0, 6, 2).tolist() + [rng.uniform(0, 2 * np.pi)]
+        a, b, c = *rng.normal(0, 6, 2).tolist(), rng.uniform(0, 2 * np.pi)
         total += np.sin(a * u + b * v + c)
     return total / 5
 
@@ -215,7 +217,8 @@ def film(
     faults: Faults | None = None,
     seed: int = 0,
 ) -> dict:
-    """Write videos/, plates/, sparse/ (a COLMAP model in text, floor points included) and truth.json into a folder; returns what truth.json says."""
+    """Write videos/, plates/, sparse/ (a COLMAP model in text, floor points included) and truth.json into a folder; returns
+    what truth.json says."""
     faults = faults or Faults()
     rng = np.random.default_rng([seed, 11])
     fall = Fall(name, "train", material, seconds + 0.06)

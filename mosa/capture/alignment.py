@@ -63,8 +63,8 @@ def disagreement(phones: tuple[Phone, Phone], tracks: tuple[Track, Track], offse
 def coarse_offsets(phones: list[Phone], tracks: list[Track], most: float) -> np.ndarray:
     """(V,) [s] to add to each phone's clock so that all have the first one's, to about half a frame.
 
-    Phones are placed one after the other against all that are placed, at each turn the one whose offset is told most sharply: of two
-    that stand opposite each other, with the object between them, nothing tells it. most [s]: offsets that are looked at. Errors:
+    Phones are placed one after the other against all that are placed, at each turn the one whose offset is told most sharply: of
+    two that face each other, with the object between them, nothing tells it. most [s]: offsets that are looked at. Errors:
     DataError naming the phone whose lines of sight meet the others' at none of them.
     """
     for phone, track in zip(phones, tracks):

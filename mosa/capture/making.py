@@ -106,7 +106,7 @@ def capture(values: Mapping[str, Any]) -> dict[str, Any]:
         write_transforms(folder, phones, times, world)
     found = figures(values, phones, clips, tracks, fall, knowledge, world, times, centres, radius, floor, gains)
     (folder / FILE).write_text(json.dumps(found, indent=1))
-    write_report(folder, found, phones, tracks, fall, exposures, world, times)
+    write_report(folder, found, phones, fall, exposures, world, times)
     for line in found["warnings"]:
         log.warning("warning: %s", line)
     log.info(
@@ -250,8 +250,8 @@ def warnings_of(found: dict[str, Any], values: Mapping[str, Any], knowledge: Kno
             )
         if np.hypot(*record["shift"]) > APART * record["radius_px"]:
             said.append(
-                f"{record['name']}: the object appears {np.hypot(*record['shift']):.1f} px from where the others see it: a pose or a "
-                "matte that is off?"
+                f"{record['name']}: the object appears {np.hypot(*record['shift']):.1f} px from where the others see it: a pose or "
+                "a matte that is off?"
             )
     if (tilt := found["ground"]["tilt_degrees"]) is not None and tilt > 1.5:
         said.append(
@@ -260,8 +260,8 @@ def warnings_of(found: dict[str, Any], values: Mapping[str, Any], knowledge: Kno
         )
     if found["ground"]["from"] == "lowest contact" and found["ground"]["sd"] > 0.05 * found["radius"]:
         said.append(
-            f"the ground is known to {1e3 * found['ground']['sd']:.0f} mm only, from the body's outlines: name a point of the floor "
-            "with ground=[x, y, z], in the world of the poses, or film with a phone at the height of the floor"
+            f"the ground is known to {1e3 * found['ground']['sd']:.0f} mm only, from the body's outlines: name a point of the "
+            "floor with ground=[x, y, z], in the world of the poses, or film with a phone at the height of the floor"
         )
     if found["free_frames"] < 3:
         said.append(f"only {found['free_frames']} frames of free fall are written: raise before=")

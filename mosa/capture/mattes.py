@@ -29,7 +29,8 @@ Matting = Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray]]
 @dataclass(frozen=True)
 class Track:
     """What one phone sees of the object. times: (T,) [s] of its own clock; centres: (T, 2) [px] of the matte, NaN where no whole
-    object is seen; radii: (T,) [px] of a disc of as many pixels; masks: per frame first column and row [px] and a part (h, w) of bools, or None."""
+    object is seen; radii: (T,) [px] of a disc of as many pixels; masks: per frame first column and row [px] and a part (h, w) of
+    bools, or None."""
 
     clip: Clip
     times: np.ndarray
@@ -106,9 +107,7 @@ def from_videos(folder: Path, clip: Clip) -> Matting:
         nonlocal source, at
         if source is None or i <= at:
             source = frames_of(other, i)
-        for at, mask in source:
-            if at == i:
-                break
+        at, mask = next(found for found in source if found[0] == i)
         # a compressed mask is never quite black or white
         return picture, np.clip((mask[..., 0].astype(np.float32) / 255 - 0.1) / 0.8, 0, 1)
 
@@ -119,7 +118,7 @@ def whole_object(matte: np.ndarray, near: np.ndarray | None = None) -> np.ndarra
     """A matte (H, W) of nothing but the object: the largest piece that does not touch the picture's border, with pieces of it that
     lie beside; all zero without one. Hands and threads that reach into the picture touch the border, and as long as they hold the
     object it is no whole one. near: centre (2,) [px] of the frame before, where the piece is the nearest large one."""
-    count, labels, stats, centroids = cv2.connectedComponentsWithStats((matte > 0.5).astype(np.uint8))
+    _, labels, stats, centroids = cv2.connectedComponentsWithStats((matte > 0.5).astype(np.uint8))
     height, width = matte.shape
     x, y, w, h, area = stats.T
     inside = (x > 0) & (y > 0) & (x + w < width) & (y + h < height) & (area >= SMALLEST)

@@ -69,8 +69,8 @@ def outline_centre(phone: Phone, points: np.ndarray, pitch: float) -> np.ndarray
 
 
 def corrected(phones: list[Phone], tracks: list[Track], fall: Fall, knowledge: Knowledge) -> list[Track] | None:
-    """The tracks with centres at which the body's own centre would be seen during the fall, outside of its window moved as at its end;
-    None where the mattes have no common hull."""
+    """The tracks with centres at which the body's own centre would be seen during the fall, outside of its window moved as at its
+    end; None where the mattes have no common hull."""
     points = hull_in_flight(phones, tracks, fall, knowledge)
     radius = radius_of(phones, tracks, fall)
     if len(points) * (PITCH * radius) ** 3 < 0.3 * radius**3:  # of a ball it is 4.2

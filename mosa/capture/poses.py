@@ -113,7 +113,7 @@ def still(cameras: dict[str, Camera], extent: float, phone: str) -> Camera:
     """The one camera that all poses of a phone are. Errors: DataError where they differ."""
     first, *others = cameras.items()
     name, one = first
-    for other, camera in others:
+    for _, camera in others:
         away = float(np.linalg.norm(camera.centre - one.centre))
         turn = camera.w2c[:3, :3] @ one.w2c[:3, :3].T
         angle = math.degrees(math.acos(np.clip(0.5 * (np.trace(turn) - 1), -1, 1)))

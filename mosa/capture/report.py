@@ -13,7 +13,6 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 from mosa.capture.fall import Fall
-from mosa.capture.mattes import Track
 from mosa.capture.phones import Phone
 from mosa.capture.resampling import Exposure
 from mosa.capture.world import World
@@ -27,15 +26,14 @@ def write_report(
     folder: Path,
     found: dict[str, Any],
     phones: list[Phone],
-    tracks: list[Track],
     fall: Fall,
     exposures: list[Exposure],
     world: World,
     times: np.ndarray,
 ) -> None:
     """capture.md, contact.png and fall.png into the folder."""
-    cv2.imwrite(str(folder / "contact.png"), contact_sheet(folder, [phone.name for phone in phones], len(times), found))
-    draw_fall(folder / "fall.png", phones, tracks, fall, exposures, world)
+    cv2.imwrite(str(folder / "contact.png"), contact_sheet(folder, [phone.name for phone in phones], len(times)))
+    draw_fall(folder / "fall.png", phones, fall, exposures, world)
     (folder / "capture.md").write_text(page(found))
 
 
@@ -79,17 +77,24 @@ def page(found: dict[str, Any]) -> str:
     for p in found["phones"]:
         gain = "" if p["gain"] is None else ", ".join(f"{g:.2f}" for g in p["gain"])
         lines.append(
-            f"| {p['name']} | {p['fps']:.5g} | {p['seen']} of {p['frames']} frames | {1e3 * p['offset']:.2f} +- {1e3 * p['offset_sd']:.2f} | "
-            f"{1e3 * p['readout']:.1f} +- {1e3 * p['readout_sd']:.1f} ({p['scan']}) | {p['shift'][0]:.1f}, {p['shift'][1]:.1f} | {gain} |"
+            f"| {p['name']} | {p['fps']:.5g} | {p['seen']} of {p['frames']} frames | "
+            f"{1e3 * p['offset']:.2f} +- {1e3 * p['offset_sd']:.2f} | {1e3 * p['readout']:.1f} +- {1e3 * p['readout_sd']:.1f} "
+            f"({p['scan']}) | {p['shift'][0]:.1f}, {p['shift'][1]:.1f} | {gain} |"
         )
-    return "\n".join([
-        *lines, "",
-        f"Clock: what is added to a phone's own time to have that of {found['phones'][0]['name']}. Readout: time from the first row of "
-        "the sensor to the last, and where the next row lies in the picture.", "",
-        "![frames and outlines of the mattes](contact.png)", "", "![height of the object's centre, and what is left](fall.png)", ""])  # fmt: skip
+    lines += [
+        "",
+        f"Clock: what is added to a phone's own time to have that of {found['phones'][0]['name']}. Readout: time from the sensor's "
+        "first row to its last, and where the next row lies in the picture.",
+        "",
+        "![frames and outlines of the mattes](contact.png)",
+        "",
+        "![height of the object's centre, and what is left](fall.png)",
+        "",
+    ]
+    return "\n".join(lines)
 
 
-def contact_sheet(folder: Path, names: list[str], frames: int, found: dict[str, Any]) -> np.ndarray:
+def contact_sheet(folder: Path, names: list[str], frames: int) -> np.ndarray:
     """A row of pictures per phone, at the same moments, around the object, with the matte's outline; BGR uint8."""
     chosen = np.unique(np.linspace(0, frames - 1, COLUMNS).round().astype(int))
     rows = []
@@ -117,14 +122,15 @@ def contact_sheet(folder: Path, names: list[str], frames: int, found: dict[str, 
     )
 
 
-def draw_fall(file: Path, phones: list[Phone], tracks: list[Track], fall: Fall, exposures: list[Exposure], world: World) -> None:
-    """Heights at which each phone sees the centre, with the parabola; and how far each sees it from there, in pixels."""
+def draw_fall(file: Path, phones: list[Phone], fall: Fall, exposures: list[Exposure], world: World) -> None:
+    """Heights at which each phone sees the centre, with the parabola; and how far each sees it from
+    there, in pixels, but for a constant."""
     figure, (above, below) = plt.subplots(2, 1, figsize=(8, 7), sharex=True, height_ratios=(2, 1))
     first, last = fall.window
     t = np.linspace(first, last, 100)
     above.plot(t, world.points(fall.at(t))[:, 1], "k-", lw=1, label="free fall")
     low, high = first - 0.05, last + 0.35
-    for v, (phone, track, exposure) in enumerate(zip(phones, tracks, exposures)):
+    for v, (phone, exposure) in enumerate(zip(phones, exposures)):
         when = exposure.seen_times
         inside = (when > low) & (when < high)
         pixels = exposure.path(when[inside])
@@ -137,6 +143,7 @@ def draw_fall(file: Path, phones: list[Phone], tracks: list[Track], fall: Fall, 
         line = above.plot(when[inside], heights, ".", ms=4, label=phone.name)[0]
         free = (when >= first) & (when <= last)
         off = exposure.path(when[free]) - fall.shifts[v] - phone.camera.project(fall.at(when[free]))
+        off -= off.mean(0)  # an outline's centre is not the body's
         below.plot(when[free], off[:, 0], "x", ms=3, color=line.get_color())
         below.plot(when[free], off[:, 1], ".", ms=4, color=line.get_color())
     above.set_ylabel("height of the centre [m]")

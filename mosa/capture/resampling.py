@@ -1,7 +1,7 @@
 """Frames of common times from phones that expose at times of their own, row by row.
 
-What a frame shows is first moved along the path of the object's centre in that picture, each row from the time it was read at to the
-wanted one; what is left between the frame before and the frame after, deformation and turning, is interpolated by optical flow.
+What a frame shows is first moved along the path of the object's centre in that picture, each row from the time it was read at to
+the wanted one; what is left between the frame before and the frame after, deformation and turning, is interpolated by optical flow.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ def exposure_of(v: int, phone: Phone, track: Track, fall: Fall, knowledge: Knowl
 def common_times(
     exposures: list[Exposure], window: tuple[float, float], *, before: float, after: float, rate: float | None
 ) -> np.ndarray:
-    """(T,) [s], evenly spaced, from `before` seconds before the free fall ends to `after` after it, as far as every phone has a whole
-    object in the frames around. rate [1/s]: None for the slowest phone's. Errors: DataError where less than five are left."""
+    """(T,) [s], evenly spaced, from `before` seconds before the free fall ends to `after` after it, as far as every phone has a
+    whole object in the frames around. rate [1/s]: None for the slowest phone's. Errors: DataError where less than five are left."""
     slowest = max(float(np.median(np.diff(e.times))) for e in exposures)
     step = slowest if rate is None else 1 / rate
     # the first phone's frames lie on the grid, so that of it nothing has to be made up
@@ -101,7 +101,7 @@ def between(exposure: Exposure, time: float) -> tuple[int, int] | None:
 
 
 def moved(picture: np.ndarray, exposure: Exposure, frame: int, time: float) -> np.ndarray:
-    """Frame (H, W, C) as it would have been exposed at one time, were the object's motion that of its centre in the picture."""
+    """Frame (H, W, C), 8 bits, in [0, 1] as it would have been exposed at one time, were the object's motion that of its centre in the picture."""
     height, width = picture.shape[:2]
     low, high = exposure.seen_times[[0, -1]]
     wanted = exposure.path(np.clip(time, low, high))
@@ -115,7 +115,9 @@ def moved(picture: np.ndarray, exposure: Exposure, frame: int, time: float) -> n
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     by = shift.astype(np.float32)
     dx, dy = (by[:, 0][:, None], by[:, 1][:, None]) if exposure.axis == 1 else (by[:, 0][None], by[:, 1][None])
-    return cv2.remap(picture, x + dx, y + dy, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    return cv2.remap(
+        picture.astype(np.float32) / 255, x + dx, y + dy, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT, borderValue=0
+    )
 
 
 def blended(one: np.ndarray, two: np.ndarray, share: float, centre: np.ndarray, radius: float) -> np.ndarray:
@@ -145,9 +147,11 @@ def resampled(exposure: Exposure, track: Track, matting: Matting, times: np.ndar
     (the nearest frame)."""
     pairs = [between(exposure, float(t)) for t in times]
     first, last = min(p[0] for p in pairs), max(p[1] for p in pairs)
-    frames = {}
+    frames, needed = {}, {k for pair in pairs for k in pair}
     for i, color, matte in matted_frames(track.clip, matting, first, last):
-        frames[i] = np.concatenate([color * matte[..., None], matte[..., None]], -1).astype(np.float32)
+        if i in needed:  # 8 bits: of slow motion in 4K there are gigabytes of them
+            both = np.concatenate([color * matte[..., None], matte[..., None]], -1)
+            frames[i] = np.round(255 * both).astype(np.uint8)
     radius = float(np.median(track.radii[track.seen]))
     found = []
     for time, (k0, k1) in zip(times, pairs):
@@ -155,7 +159,7 @@ def resampled(exposure: Exposure, track: Track, matting: Matting, times: np.ndar
         share = 0.0 if k0 == k1 else float((time - own[k0]) / (own[k1] - own[k0]))
         nearest = k0 if share <= 0.5 else k1
         if kind == "none":
-            picture = frames[nearest]
+            picture = frames[nearest].astype(np.float32) / 255
         elif kind == "shift" or k0 == k1:
             picture = moved(frames[nearest], exposure, nearest, float(time))
         else:

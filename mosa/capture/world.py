@@ -58,8 +58,8 @@ class World:
 
 
 def world_of(fall: Fall, phones: list[Phone], ground: np.ndarray | None) -> World:
-    """From scale and up of a fall; its origin below where the free fall ends, at the height of `ground` (3,), a point of the floor in
-    the poses' world, or at the height of the centre there."""
+    """From scale and up of a fall; its origin below where the free fall ends, at the height of `ground` (3,), a point of the floor
+    in the poses' world, or at the height of the centre there."""
     up = fall.up
     end = fall.at(np.array(fall.window[1]))
     towards = phones[0].camera.centre - end
@@ -111,7 +111,8 @@ def write_transforms(folder: Path, phones: list[Phone], times: np.ndarray, world
 
 
 def lowest_points(folder: Path, centres: np.ndarray, radius: float, scale: float) -> np.ndarray:
-    """(T, 2) [m] heights of `lowest_of_hull` in each frame of a written capture; centres: (T, 3), radius [m]; scale: of the images."""
+    """(T, 2) [m] heights of `lowest_of_hull` in each frame of a written capture; centres: (T, 3), radius [m]; scale: of
+    the images."""
     footage = read_transforms(folder, scale=scale)
     return np.array([lowest_of_hull(footage, t, centre, radius) for t, centre in enumerate(centres)])
 
@@ -145,8 +146,8 @@ def ground_height(lowest: np.ndarray, pixel: float) -> tuple[float, float]:
 
 
 def floor_of_points(points: np.ndarray, radius: float, near: float, apart: float) -> tuple[float, float, float] | None:
-    """(height [m], one standard deviation [m], tilt against level [degrees]) of the floor among points (N, 3) [m] of the surroundings,
-    the densest level within `apart` of `near`, where the object was lowest; None where there are too few of them."""
+    """(height [m], one standard deviation [m], tilt against level [degrees]) of the floor among points (N, 3) [m] of the
+    surroundings, the densest level within `apart` of `near`, where the object was lowest; None where there are too few of them."""
     around = points[(np.hypot(points[:, 0], points[:, 2]) < AROUND * radius) & (np.abs(points[:, 1] - near) < apart)]
     if len(around) < FEWEST:
         return None

@@ -15,7 +15,8 @@ from mosa.capture.videos import Clip
 G, HEIGHT, RELEASE = 9.81, 0.45, 0.10
 """[m/s^2]; [m] of the underside above the floor; [s] at which it is let go."""
 CONTACT = RELEASE + math.sqrt(2 * HEIGHT / G)
-BODY = np.array([[0.08 * np.cos(a), 0.0, 0.08 * np.sin(a)] for a in np.linspace(0, 2 * np.pi, 24, endpoint=False)] + [[0.0, 0.2, 0.0]])
+AROUND = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+BODY = np.array([*([0.08 * np.cos(a), 0.0, 0.08 * np.sin(a)] for a in AROUND), [0.0, 0.2, 0.0]])
 """Corners (M, 3) [m] of a cone that stands on its base."""
 COLOR, BEHIND = (0.85, 0.5, 0.2), (0.2, 0.3, 0.45)
 

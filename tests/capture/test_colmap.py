@@ -88,7 +88,7 @@ def test_a_cut_binary_model_is_named(tmp_path):
         whole = (tmp_path / name).read_bytes()
         for length in (4, len(whole) // 2, len(whole) - 30):
             (tmp_path / name).write_bytes(whole[:length])
-            with pytest.raises(DataError, match="damaged|end of the file"):
+            with pytest.raises(DataError, match=r"damaged|end of the file"):
                 read_model(tmp_path)
         (tmp_path / name).write_bytes(whole)
     (tmp_path / "cameras.bin").unlink()
@@ -132,6 +132,6 @@ def test_poses_that_do_not_fit_the_videos_are_named(tmp_path):
     (tmp_path / "images.txt").write_text(text)
     with pytest.raises(DataError, match=r"phone 1 stands elsewhere than in"):
         read_phones(tmp_path, tmp_path, {k: v for k, v in sizes.items() if "2" not in k})
-    with pytest.raises(DataError, match="expected a COLMAP model .* or transforms.json, found neither"):
+    with pytest.raises(DataError, match=r"expected a COLMAP model .* or transforms.json, found neither"):
         (tmp_path / "empty").mkdir()
         read_poses(tmp_path / "empty")

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from filming import CONTACT, G, RELEASE, WORLD, filmed, phones_and_tracks
+from filming import CONTACT, RELEASE, WORLD, G, filmed, phones_and_tracks
 
 from mosa.capture.alignment import coarse_offsets, disagreement
 from mosa.capture.fall import Knowledge, fit_fall, longest_parabola
@@ -65,7 +65,7 @@ def test_a_readout_that_is_ignored_spoils_the_scale(made):
 def test_an_object_at_rest_is_no_fall():
     times = np.arange(20) / 60
     rest = np.tile([0.1, 0.2, 0.3], (20, 1))
-    with pytest.raises(DataError, match="no free fall.*bends off a straight line"):
+    with pytest.raises(DataError, match=r"no free fall.*bends off a straight line"):
         longest_parabola(times, rest, 0.01)
     falling = rest + 0.5 * np.outer(np.maximum(times - 0.1, 0) ** 2, [0, -G, 0])
     first, last = longest_parabola(times, falling, 1e-4)

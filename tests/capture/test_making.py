@@ -54,7 +54,7 @@ def test_scale_up_and_clocks_are_found_and_the_scene_can_be_read(filmed_folder):
 
 def test_the_ground_is_where_the_cone_lands(filmed_folder):
     """Its base is flat and wide, which is the worst case: two rows of pixels."""
-    folder, films, found = filmed_folder
+    folder, _, found = filmed_folder
     world = read_world(folder / "scene")
     scale, R, shift = WORLD
     floor = world.points(R @ np.zeros(3) / scale + shift)[1]
@@ -81,7 +81,7 @@ def test_mistakes_are_named(filmed_folder, tmp_path):
         capture(keys(folder, phones={"phone9": {"fps": 60}}))
     with pytest.raises(ConfigError, match=r"phones\.phone1\.speed: expected the keys fps, scan, readout"):
         capture(keys(folder, phones={"phone1": {"speed": 60}}))
-    with pytest.raises(DataError, match="plates: folder .* not found"):
+    with pytest.raises(DataError, match=r"plates: folder .* not found"):
         capture(keys(folder, plates=str(tmp_path / "none")))
     with pytest.raises(DataError, match="expected the record of a capture"):
         (tmp_path / "capture.json").write_text("{}")

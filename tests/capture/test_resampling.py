@@ -16,8 +16,8 @@ def made(tmp_path, monkeypatch):
     film = filmed(size=(240, 180))[1]
     (phone,), (track,) = phones_and_tracks([film], tmp_path)
     none = np.zeros(3)
-    fall = Fall(0.0, none, none, none, np.array([film.begin]), np.array([film.readout]), np.zeros((1, 2)), (0.15, CONTACT), 1.0, none,
-                0.1, 1, np.zeros(1), np.zeros(1), 0.0, 0.0)  # fmt: skip
+    fall = Fall(0.0, none, none, none, np.array([film.begin]), np.array([film.readout]), np.zeros((1, 2)), (0.15, CONTACT), 1.0,
+                none, 0.1, 1, np.zeros(1), np.zeros(1), 0.0, 0.0)  # fmt: skip
 
     def frames(clip, matting, first, last):
         for k in range(first, last + 1):
@@ -49,7 +49,7 @@ def test_frames_are_brought_to_common_times(made):
 
 
 def test_a_time_lies_between_the_frames_around_it(made):
-    film, track, exposure = made
+    _, _, exposure = made
     own = exposure.own_times
     assert between(exposure, 0.5 * (own[20] + own[21])) == (20, 21)
     assert between(exposure, own[20] + 1e-5) == (20, 20)
