@@ -106,11 +106,11 @@ def pictures_errors(seen: Path, right: Path) -> dict[str, float]:
     }
 
 
-def compare(folder: Path, kinds: list[str]) -> dict:
+def compare(folder: Path, kinds: list[str], rate: float | None = None) -> dict:
     """mosa-capture with each interpolation; the last of `kinds` is what stays in scene/."""
     truth, said = json.loads((folder / "truth.json").read_text()), {}
     for kind in kinds:
-        found = capture(settings(folder, truth, interpolation=kind))
+        found = capture(settings(folder, truth, interpolation=kind, rate=rate))
         times = true_times(truth, found)
         if kind == kinds[0]:
             said |= errors(truth, found)
@@ -158,6 +158,7 @@ def main() -> None:
     parser.add_argument("--material", default="isotropic", choices=["isotropic", "anisotropic"])
     parser.add_argument("--size", default="960x720")
     parser.add_argument("--fps", type=float, default=60.0)
+    parser.add_argument("--rate", type=float, default=None, help="frames per second that mosa-capture writes")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kinds", default=",".join(reversed(KINDS)))
     parser.add_argument("--held", default="test_60,test_40")
@@ -174,7 +175,7 @@ def main() -> None:
             seed=options.seed,
         )
     elif options.what == "compare":
-        compare(options.folder, options.kinds.split(","))
+        compare(options.folder, options.kinds.split(","), options.rate)
     else:
         footage(options.folder, options.held.split(","))
 

@@ -19,7 +19,7 @@ from mosa.capture.outline import corrected, radius_of
 from mosa.capture.phones import Phone
 from mosa.capture.poses import read_phones, scene_points
 from mosa.capture.report import write_report
-from mosa.capture.resampling import common_times, exposure_of, resampled
+from mosa.capture.resampling import common_path, common_times, exposure_of, resampled
 from mosa.capture.videos import Clip, find_videos, open_clip, plate_of
 from mosa.capture.world import (
     FILE,
@@ -78,7 +78,8 @@ def capture(values: Mapping[str, Any]) -> dict[str, Any]:
     flight = None if values["flight"] is None else tuple(map(float, values["flight"]))
     fall = found_fall(phones, tracks, knowledge, float(values["max_offset"]), flight)
     log.info("fall: %.3f to %.3f s on the clock of %s, %d centres", *fall.window, phones[0].name, fall.frames)
-    exposures = [exposure_of(v, *pair, fall, knowledge) for v, pair in enumerate(zip(phones, tracks))]
+    common = common_path(phones, tracks, fall, knowledge)
+    exposures = [exposure_of(v, *pair, fall, knowledge, common) for v, pair in enumerate(zip(phones, tracks))]
     times = common_times(exposures, fall.window, before=values["before"], after=values["after"], rate=values["rate"])
     ground = None if values["ground"] is None else np.array(values["ground"], float)
     own = world is None

@@ -132,7 +132,7 @@ def draw_fall(file: Path, phones: list[Phone], fall: Fall, exposures: list[Expos
     low, high = first - 0.05, last + 0.35
     for v, (phone, exposure) in enumerate(zip(phones, exposures)):
         when = exposure.seen_times
-        inside = (when > low) & (when < high)
+        inside = (when > max(low, exposure.span[0])) & (when < min(high, exposure.span[1]))
         pixels = exposure.path(when[inside])
         # the height on the vertical through the parabola's centre, which is where the object is all the time
         point = np.broadcast_to(fall.at(np.array(last)), (int(inside.sum()), 3))

@@ -6,12 +6,13 @@ the wanted one; what is left between the frame before and the frame after, defor
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
 import numpy as np
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import BSpline
 
 from mosa.capture.fall import Fall, Knowledge, row_share
 from mosa.capture.mattes import Matting, Track, matted_frames
@@ -21,6 +22,10 @@ from mosa.errors import DataError
 KINDS = ("flow", "shift", "none")
 NEAR = 0.02
 """Share of a frame within which a wanted time is that of a frame."""
+KNOTS = 2
+"""Of the common path in the shortest time between frames."""
+SMOOTH = 1e-3
+"""Weight of the change of its acceleration from knot to knot, where a line of sight's distance has 1."""
 AROUND = 0.6
 """Radii of the object beside it in which flow is looked for."""
 
@@ -28,7 +33,8 @@ AROUND = 0.6
 @dataclass(frozen=True)
 class Exposure:
     """How a phone exposes. times: (T,) [s] of its frames' middle rows on the common clock; readout [s], along `axis` of a pixel in
-    the direction of `sign`; centres: (T, 2) [px] of the object; path: the same at any common time."""
+    the direction of `sign`; centres: (T, 2) [px] of the object; path: the same at any common time
+    within `span`."""
 
     phone: Phone
     times: np.ndarray
@@ -36,7 +42,8 @@ class Exposure:
     axis: int
     sign: int
     centres: np.ndarray
-    path: CubicSpline
+    path: Callable[[np.ndarray], np.ndarray]
+    span: tuple[float, float]
 
     @cached_property
     def own_times(self) -> np.ndarray:
@@ -47,18 +54,64 @@ class Exposure:
     @property
     def seen_times(self) -> np.ndarray:
         """(n,) common times at which the frames' own centres were read."""
-        return self.path.x
+        return self.own_times[np.isfinite(self.centres[:, 0])]
 
 
-def exposure_of(v: int, phone: Phone, track: Track, fall: Fall, knowledge: Knowledge) -> Exposure:
-    """Of phone v of a fall."""
+def common_path(phones: list[Phone], tracks: list[Track], fall: Fall, knowledge: Knowledge) -> tuple[BSpline, float, float]:
+    """(path (3,) of the object at a common time [s], first and last time of it), to which the lines of sight of all phones come nearest.
+
+    Six phones of 60 frames a second see the object 360 times a second: an impact that is over in two frames of one of them.
+    """
+    times, rows, values = [], [], []
+    step = min(track.clip.interval for track in tracks) / KNOTS
+    for v, (phone, track) in enumerate(zip(phones, tracks)):
+        seen = track.seen
+        own = track.times[seen] + fall.offsets[v] + fall.readouts[v] * row_share(phone, track.centres[seen], knowledge)
+        off = centre_shift(phone, own, track.centres[seen], fall)
+        rays = phone.camera.rays(track.centres[seen] - off)
+        across = np.eye(3) - rays[:, :, None] * rays[:, None]
+        times.append(own)
+        rows.append(across)
+        values.append(across @ phone.camera.centre)
+    every, across, values = np.concatenate(times), np.concatenate(rows), np.concatenate(values)
+    low, high = max(t.min() for t in times), min(t.max() for t in times)
+    inside = (every >= low) & (every <= high)
+    every, across, values = every[inside], across[inside], values[inside]
+    knots = np.concatenate([[low] * 3, np.linspace(low, high, max(4, int((high - low) / step))), [high] * 3])
+    basis = BSpline.design_matrix(np.clip(every, low, high), knots, 3).toarray()
+    n = basis.shape[1]
+    matrix = np.einsum("kab,ki,kj->iajb", across, basis, basis).reshape(3 * n, 3 * n)
+    right = np.einsum("ka,ki->ia", values, basis).ravel()
+    bend = np.diff(np.eye(n), 3, axis=0)  # where nobody looks the acceleration goes on
+    matrix += SMOOTH * np.kron(bend.T @ bend, np.eye(3))
+    return BSpline(knots, np.linalg.solve(matrix, right).reshape(n, 3), 3), float(low), float(high)
+
+
+def centre_shift(phone: Phone, times: np.ndarray, centres: np.ndarray, fall: Fall) -> np.ndarray:
+    """(2,) [px] mean of where a phone sees the object minus where it falls: of its pose, and of its side of the object."""
+    free = (times >= fall.window[0]) & (times <= fall.window[1])
+    return (centres[free] - phone.camera.project(fall.at(times[free]))).mean(0)
+
+
+def exposure_of(
+    v: int, phone: Phone, track: Track, fall: Fall, knowledge: Knowledge, common: tuple[BSpline, float, float]
+) -> Exposure:
+    """Of phone v of a fall; common: of `common_path`. What of a phone's own centres lies beside that path is interpolated linearly."""
+    spline, low, high = common
     times = track.times + fall.offsets[v]
     seen = track.seen
     own = times[seen] + fall.readouts[v] * row_share(phone, track.centres[seen], knowledge)
-    increasing = np.concatenate([[True], np.diff(own) > 1e-6])
+    inside = (own >= low) & (own <= high)
+    beside = track.centres[seen][inside] - phone.camera.project(spline(own[inside]))
+
+    def path(time: np.ndarray) -> np.ndarray:
+        t = np.clip(np.atleast_1d(time), low, high)
+        rest = np.stack([np.interp(t, own[inside], beside[:, axis]) for axis in (0, 1)], -1)
+        found = phone.camera.project(spline(t)) + rest
+        return found if np.ndim(time) else found[0]
+
     axis, sign = knowledge.scan_of(phone.name)
-    path = CubicSpline(own[increasing], track.centres[seen][increasing])
-    return Exposure(phone, times, float(fall.readouts[v]), axis, sign, track.centres, path)
+    return Exposure(phone, times, float(fall.readouts[v]), axis, sign, track.centres, path, (low, high))
 
 
 def common_times(
@@ -101,16 +154,16 @@ def between(exposure: Exposure, time: float) -> tuple[int, int] | None:
 
 
 def moved(picture: np.ndarray, exposure: Exposure, frame: int, time: float) -> np.ndarray:
-    """Frame (H, W, C), 8 bits, in [0, 1] as it would have been exposed at one time, were the object's motion that of its centre in the picture."""
+    """A frame (H, W, C) of 8 bits as it would have been exposed at one time, were the object's motion that of its centre in the
+    picture; in [0, 1]."""
     height, width = picture.shape[:2]
-    low, high = exposure.seen_times[[0, -1]]
-    wanted = exposure.path(np.clip(time, low, high))
+    wanted = exposure.path(np.asarray(time))
     size = (width, height)[exposure.axis]
     line = np.arange(size) + 0.5
     source, shift = line, np.zeros((size, 2))
     for _ in range(4):  # where a row comes from depends on when it was read: a contraction by velocity times readout over size
         when = exposure.times[frame] + exposure.readout * exposure.sign * (source / size - 0.5)
-        shift = exposure.path(np.clip(when, low, high)) - wanted
+        shift = exposure.path(when) - wanted
         source = line + shift[:, exposure.axis]
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     by = shift.astype(np.float32)
@@ -167,7 +220,7 @@ def resampled(exposure: Exposure, track: Track, matting: Matting, times: np.ndar
                 moved(frames[k0], exposure, k0, float(time)),
                 moved(frames[k1], exposure, k1, float(time)),
                 share,
-                exposure.path(float(time)),
+                exposure.path(np.asarray(time)),
                 radius,
             )
         found.append(straight(picture))
