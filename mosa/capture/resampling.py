@@ -58,7 +58,8 @@ class Exposure:
 
 
 def common_path(phones: list[Phone], tracks: list[Track], fall: Fall, knowledge: Knowledge) -> tuple[BSpline, float, float]:
-    """(path (3,) of the object at a common time [s], first and last time of it), to which the lines of sight of all phones come nearest.
+    """(path (3,) of the object at a common time [s], first and last time of it), to which the lines of sight of all phones
+    come nearest.
 
     Six phones of 60 frames a second see the object 360 times a second: an impact that is over in two frames of one of them.
     """
@@ -96,7 +97,8 @@ def centre_shift(phone: Phone, times: np.ndarray, centres: np.ndarray, fall: Fal
 def exposure_of(
     v: int, phone: Phone, track: Track, fall: Fall, knowledge: Knowledge, common: tuple[BSpline, float, float]
 ) -> Exposure:
-    """Of phone v of a fall; common: of `common_path`. What of a phone's own centres lies beside that path is interpolated linearly."""
+    """Of phone v of a fall; common: of `common_path`. What of a phone's own centres lies beside that path is interpolated
+    linearly."""
     spline, low, high = common
     times = track.times + fall.offsets[v]
     seen = track.seen
