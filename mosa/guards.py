@@ -13,7 +13,7 @@ from mosa.data.agreement import lines_of_sight, misses
 from mosa.data.splat_files import check_formats
 from mosa.errors import ConfigError, DataError
 from mosa.extensions import registered_keys
-from mosa.keys import EVALUATION, SIMULATION, SPLATS, TRAINING
+from mosa.keys import CAPTURE, EVALUATION, SIMULATION, SPLATS, TRAINING
 from mosa.known import check_known, conf_folder
 from mosa.limits import machine_memory
 from mosa.modules.body import Body, Start, World
@@ -53,6 +53,13 @@ def check_splats(values: Mapping[str, Any]) -> None:
     check_formats(values["formats"])
     if values["simulation"]["particles"] != "auto":
         check_particles("simulation.particles", values["simulation"]["particles"])
+
+
+def check_capture(values: Mapping[str, Any]) -> None:
+    """All that the configuration of `python -m mosa.capture` says by itself. Errors: ConfigError naming the key."""
+    if (conf := conf_folder()) is not None:
+        check_known(values, conf, "capture", CAPTURE)
+    check(values, CAPTURE)
 
 
 def check_particles(key: str, count: float) -> None:

@@ -203,3 +203,31 @@ SPLATS: dict[str, Kind] = {
     "video": FLAG,
 }
 """Of conf/splats.yaml."""
+PERIOD = Kind("two numbers [from, to] in seconds",
+              lambda v: isinstance(v, list) and len(v) == 2 and all(map(is_number, v)) and v[0] < v[1])
+CAPTURE: dict[str, Kind] = {
+    **{name: TEXT for name in ("videos", "poses", "output")},
+    **{name: or_null(TEXT) for name in ("like", "plates", "masks")},
+    "mattes": one_of("plates", "rembg", "masks"),
+    "plate_seconds": or_null(PERIOD),
+    "fps": or_null(POSITIVE),
+    "scan": one_of("auto", "down", "up", "left", "right"),
+    "readout": or_null(number(0, 0.1)),
+    "phones": or_null(SECTION),
+    "phones.*": SECTION,
+    "phones.*.fps": or_null(POSITIVE),
+    "phones.*.scan": one_of("auto", "down", "up", "left", "right"),
+    "phones.*.readout": or_null(number(0, 0.1)),
+    "max_offset": POSITIVE,
+    "flight": or_null(PERIOD),
+    "gravity": POSITIVE,
+    "scale": or_null(POSITIVE),
+    "up": or_null(THREE),
+    "ground": or_null(THREE),
+    "rate": or_null(POSITIVE),
+    "before": POSITIVE,
+    "after": POSITIVE,
+    "interpolation": one_of("flow", "shift", "none"),
+    "colours": one_of("floor", "none"),
+}
+"""Of conf/capture.yaml."""

@@ -1,0 +1,186 @@
+"""COLMAP's sparse models: cameras, images and points of either form (https://colmap.github.io/format.html)."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mosa.capture.phones import Camera
+from mosa.errors import DataError
+
+MODELS = {
+    "SIMPLE_PINHOLE": (0, ("f", "cx", "cy")),
+    "PINHOLE": (1, ("fx", "fy", "cx", "cy")),
+    "SIMPLE_RADIAL": (2, ("f", "cx", "cy", "k1")),
+    "RADIAL": (3, ("f", "cx", "cy", "k1", "k2")),
+    "OPENCV": (4, ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
+    "OPENCV_FISHEYE": (5, ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")),
+    "SIMPLE_RADIAL_FISHEYE": (8, ("f", "cx", "cy", "k1")),
+    "RADIAL_FISHEYE": (9, ("f", "cx", "cy", "k1", "k2")),
+}
+"""Model -> number in binary files, names of its parameters. Others (FULL_OPENCV, FOV, THIN_PRISM_FISHEYE) are refused."""
+BY_NUMBER = {number: name for name, (number, _) in MODELS.items()}
+MOST = 100_000
+"""Cameras or images of a model: of a damaged file the count is any number."""
+
+Intrinsics = tuple[np.ndarray, dict[str, float], bool, tuple[int, int]]
+
+
+def is_model(folder: Path) -> bool:
+    return any((folder / f"images{ending}").is_file() for ending in (".bin", ".txt"))
+
+
+def read_model(folder: Path) -> dict[str, Camera]:
+    """Image name -> camera. Errors: DataError naming file and line, or entry."""
+    readers = {".bin": (binary_cameras, binary_images), ".txt": (text_cameras, text_images)}
+    for ending, (cameras_of, images_of) in readers.items():
+        images, cameras = folder / f"images{ending}", folder / f"cameras{ending}"
+        if images.is_file():
+            if not cameras.is_file():
+                raise DataError(f"{cameras}: file not found; a COLMAP model has it beside {images.name}")
+            try:
+                return assembled(cameras_of(cameras), images_of(images), images)
+            except (struct.error, UnicodeDecodeError) as error:
+                raise DataError(f"{folder}: expected a COLMAP model, found a damaged file ({error}); export it again") from error
+    raise DataError(f"{folder}: expected images.bin or images.txt of a COLMAP model, found neither")
+
+
+def assembled(
+    cameras: dict[int, Intrinsics], images: list[tuple[str, int, np.ndarray, np.ndarray]], file: Path
+) -> dict[str, Camera]:
+    found = {}
+    for name, number, quaternion, shift in images:
+        where = f"{file}, image {name}"
+        if number not in cameras:
+            raise DataError(f"{where}: expected one of the cameras {sorted(cameras)}, found CAMERA_ID {number}")
+        norm = float(np.linalg.norm(quaternion))
+        if not np.isfinite([*quaternion, *shift]).all() or abs(norm - 1) > 1e-3:
+            raise DataError(
+                f"{where}: expected a unit quaternion and a finite translation, found {list(quaternion)}, {list(shift)}"
+            )
+        K, coefficients, fisheye, size = cameras[number]
+        w2c = np.eye(4)
+        w2c[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()  # COLMAP writes w first, scipy last
+        w2c[:3, 3] = shift
+        found[name] = Camera(K, w2c, size, where, coefficients, fisheye)
+    if not found:
+        raise DataError(f"{file}: expected registered images, found none")
+    return found
+
+
+def intrinsics(model: str, width: int, height: int, values: list[float], where: str) -> Intrinsics:
+    if model not in MODELS:
+        raise DataError(
+            f"{where}: expected a camera model of {', '.join(MODELS)}, found {model}; undistort the images, or choose "
+            "one of these in COLMAP (ImageReader.camera_model)"
+        )
+    names = MODELS[model][1]
+    if len(values) != len(names):
+        raise DataError(f"{where}: expected the {len(names)} parameters {', '.join(names)} of {model}, found {len(values)}")
+    given = dict(zip(names, values))
+    fx, fy = given.get("fx", given.get("f")), given.get("fy", given.get("f"))
+    if not (np.isfinite(values).all() and fx > 0 and fy > 0 and 0 < width < 1e5 and 0 < height < 1e5):
+        raise DataError(f"{where}: expected positive focal lengths and sizes, found {given} for {width}x{height} px")
+    K = np.array([[fx, 0, given["cx"]], [0, fy, given["cy"]], [0, 0, 1]])
+    coefficients = {name: value for name, value in given.items() if name[0] in "kp"}
+    return K, coefficients, model.endswith("FISHEYE"), (width, height)
+
+
+def numbers(words: list[str], where: str) -> list[float]:
+    try:
+        return [float(word) for word in words]
+    except ValueError as error:
+        raise DataError(f"{where}: expected numbers, found {' '.join(words)[:80]!r}") from error
+
+
+def lines_of(file: Path) -> list[tuple[int, str]]:
+    """Numbered lines that are no comments, empty ones included."""
+    return [(i, line.strip()) for i, line in enumerate(file.read_text().splitlines(), 1) if not line.startswith("#")]
+
+
+def text_cameras(file: Path) -> dict[int, Intrinsics]:
+    found = {}
+    for i, line in lines_of(file):
+        words, where = line.split(), f"{file}, line {i}"
+        if not words:
+            continue
+        if len(words) < 5:
+            raise DataError(f"{where}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {line[:80]!r}")
+        number, width, height = (int(v) for v in numbers([words[0], *words[2:4]], where))
+        found[number] = intrinsics(words[1], width, height, numbers(words[4:], where), where)
+    return found
+
+
+def text_images(file: Path) -> list[tuple[str, int, np.ndarray, np.ndarray]]:
+    """An image takes two lines, the second of which (its points, maybe none) is passed over."""
+    found = []
+    for i, line in lines_of(file)[::2]:
+        if not line:
+            continue
+        words, where = line.split(maxsplit=9), f"{file}, line {i}"
+        if len(words) < 10:
+            raise DataError(f"{where}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, found {line[:80]!r}")
+        values = numbers(words[:9], where)
+        found.append((words[9], int(values[8]), np.array(values[1:5]), np.array(values[5:8])))
+    return found
+
+
+def binary_cameras(file: Path) -> dict[int, Intrinsics]:
+    data, found = file.read_bytes(), {}
+    count, at = counted(data, file), 8
+    for _ in range(count):
+        number, model, width, height = struct.unpack_from("<iiQQ", data, at)
+        where = f"{file}, camera {number}"
+        if model not in BY_NUMBER:
+            raise DataError(f"{where}: expected a camera model of {', '.join(MODELS)}, found number {model}; undistort the images")
+        names = MODELS[BY_NUMBER[model]][1]
+        values = struct.unpack_from(f"<{len(names)}d", data, at + 24)
+        at += 24 + 8 * len(names)
+        found[number] = intrinsics(BY_NUMBER[model], width, height, list(values), where)
+    return found
+
+
+def binary_images(file: Path) -> list[tuple[str, int, np.ndarray, np.ndarray]]:
+    data, found = file.read_bytes(), []
+    count, at = counted(data, file), 8
+    for _ in range(count):
+        _, *values, number = struct.unpack_from("<i7di", data, at)
+        end = data.find(b"\0", at + 64)
+        if end < 0:
+            raise DataError(f"{file}: expected an image's name, found the end of the file; export the model again")
+        name = data[at + 64 : end].decode()
+        (points,) = struct.unpack_from("<Q", data, end + 1)
+        at = end + 9 + 24 * points
+        found.append((name, number, np.array(values[:4]), np.array(values[4:])))
+    return found
+
+
+def read_points(folder: Path) -> np.ndarray:
+    """(N, 3) points of a model, none where it has no file of them. Errors: DataError."""
+    text, binary = folder / "points3D.txt", folder / "points3D.bin"
+    if binary.is_file():
+        data, at, found = binary.read_bytes(), 8, []
+        try:
+            for _ in range(counted(data, binary, 100 * MOST)):
+                found.append(struct.unpack_from("<3d", data, at + 8))
+                at += 51 + 8 * struct.unpack_from("<Q", data, at + 43)[0]
+        except struct.error as error:
+            raise DataError(
+                f"{binary}: expected points of a COLMAP model, found a damaged file ({error}); export it again"
+            ) from error
+    elif text.is_file():
+        found = [numbers(line.split()[1:4], f"{text}, line {i}") for i, line in lines_of(text) if line]
+    else:
+        return np.zeros((0, 3))
+    points = np.array(found, float).reshape(-1, 3)
+    return points[np.isfinite(points).all(1)]
+
+
+def counted(data: bytes, file: Path, most: int = MOST) -> int:
+    (count,) = struct.unpack_from("<Q", data, 0)
+    if count > most:
+        raise DataError(f"{file}: expected at most {most} entries, found {count}: not a file of a COLMAP model")
+    return count

@@ -1,0 +1,269 @@
+"""The way of a capture: videos, poses, mattes, clocks, the fall, the world, frames at common times, and a page on all of it."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+from mosa.capture.alignment import centres_at, coarse_offsets
+from mosa.capture.fall import SCANS, Fall, Knowledge, fit_fall
+from mosa.capture.mattes import Matting, Track, follow, matting_of
+from mosa.capture.outline import corrected, radius_of
+from mosa.capture.phones import Phone
+from mosa.capture.poses import read_phones, scene_points
+from mosa.capture.report import write_report
+from mosa.capture.resampling import common_path, common_times, exposure_of, resampled
+from mosa.capture.videos import Clip, find_videos, open_clip, plate_of
+from mosa.capture.world import (
+    FILE,
+    World,
+    box_of,
+    floor_gains,
+    floor_of_points,
+    ground_height,
+    lowest_points,
+    read_world,
+    world_of,
+    write_images,
+    write_transforms,
+)  # fmt: skip
+from mosa.config import plain
+from mosa.errors import ConfigError, DataError
+from mosa.guards import check_capture
+from mosa.progress import tqdm
+
+log = logging.getLogger(__name__)
+
+TURNED = {0: "down", 90: "left", 180: "up", 270: "right"}
+"""Degrees by which a video is turned to be shown -> where the sensor's next row lies in it then."""
+OWN = ("fps", "scan", "readout")
+"""What one phone may have otherwise than the others."""
+APART = 0.12
+"""Radii of the object from where the others see it, from which on a phone is suspected."""
+CORRECTIONS = 2
+"""Times that the fall is fitted again, with the outlines that its hull has."""
+COARSE = 320
+"""Pixels of images in which the ground is looked for."""
+
+
+def make(cfg: DictConfig) -> dict[str, Any]:
+    """`python -m mosa.capture`: write the scene and its report; returns what capture.json says. Errors: ConfigError, DataError."""
+    for key, example in (("videos", "<folder>"), ("poses", "<COLMAP model>"), ("output", "<folder>")):
+        if OmegaConf.is_missing(cfg, key):
+            raise ConfigError(f"{key}: expected a folder, found none; python -m mosa.capture {key}={example} ...")
+    values = plain(cfg)
+    check_capture(values)
+    return capture(values)
+
+
+def capture(values: Mapping[str, Any]) -> dict[str, Any]:
+    """From the keys of conf/capture.yaml. Errors: ConfigError, DataError."""
+    folder = Path(values["output"])
+    clips = [open_clip(file, of_phone(values, file.stem, "fps")) for file in find_videos(values["videos"])]
+    refuse_unknown_phones(values, [clip.path.stem for clip in clips])
+    phones = read_phones(values["videos"], values["poses"], {clip.path.name: clip.size for clip in clips})
+    plates = plates_folder(values)
+    mattings = [matting_of(values["mattes"], clip, plates=plates, plate_seconds=values["plate_seconds"],
+                           masks=None if values["masks"] is None else Path(values["masks"])) for clip in clips]  # fmt: skip
+    tracks = followed(clips, mattings)
+    world = None if values["like"] is None else read_world(values["like"])
+    knowledge = known(values, clips, world)
+    flight = None if values["flight"] is None else tuple(map(float, values["flight"]))
+    fall = found_fall(phones, tracks, knowledge, float(values["max_offset"]), flight)
+    log.info("fall: %.3f to %.3f s on the clock of %s, %d centres", *fall.window, phones[0].name, fall.frames)
+    common = common_path(phones, tracks, fall, knowledge)
+    exposures = [exposure_of(v, *pair, fall, knowledge, common) for v, pair in enumerate(zip(phones, tracks))]
+    times = common_times(exposures, fall.window, before=values["before"], after=values["after"], rate=values["rate"])
+    ground = None if values["ground"] is None else np.array(values["ground"], float)
+    own = world is None
+    world = world_of(fall, phones, ground) if own else world
+    gains = gains_of(values, phones, clips, plates, world, tracks, fall)
+    for v, phone in enumerate(tqdm(phones, desc="frames at common times", unit="phone")):
+        pictures = resampled(exposures[v], tracks[v], mattings[v], times, values["interpolation"])
+        if gains is not None:
+            pictures[..., :3] = np.round(np.clip(pictures[..., :3] * gains[v], 0, 255))
+        write_images(folder, phone, pictures)
+    write_transforms(folder, phones, times, world)
+    centres = world.points(centres_of(exposures, phones, times))
+    radius = radius_of(phones, tracks, fall) * world.scale
+    floor = {"from": "like" if not own else "ground", "sd": None, "tilt_degrees": None}
+    if own and ground is None:
+        scale = min(1.0, COARSE / max(phones[0].camera.size))
+        pixel = world.scale * np.mean([np.linalg.norm(p.camera.centre - fall.position) / p.camera.K[0, 0] for p in phones])
+        height, error = ground_height(lowest_points(folder, centres, radius, scale), float(pixel))
+        floor = {"from": "lowest contact", "sd": error, "tilt_degrees": None}
+        level = floor_of_points(world.points(scene_points(values["poses"])), radius, height, max(3 * error, 0.3 * radius))
+        if level is not None:
+            height, floor = level[0], {"from": "points of the model", "sd": level[1], "tilt_degrees": level[2]}
+        world = world.lowered(height)
+        centres = centres - [0, height, 0]
+        write_transforms(folder, phones, times, world)
+    found = figures(values, phones, clips, tracks, fall, knowledge, world, times, centres, radius, floor, gains)
+    (folder / FILE).write_text(json.dumps(found, indent=1))
+    write_report(folder, found, phones, fall, exposures, world, times)
+    for line in found["warnings"]:
+        log.warning("warning: %s", line)
+    log.info(
+        "%d frames of %d phones in %s; what was found is in %s\n%s",
+        len(times),
+        len(phones),
+        folder,
+        folder / "capture.md",
+        found["command"],
+    )
+    return found
+
+
+def found_fall(
+    phones: list[Phone], tracks: list[Track], knowledge: Knowledge, most: float, flight: tuple[float, float] | None = None
+) -> Fall:
+    """The fall from nothing but tracks: rough clocks, a parabola, and again with the outlines that the hull has. most [s]: of
+    offsets; flight: first and last time [s], where they are known. Errors: DataError."""
+    fall = fit_fall(phones, tracks, coarse_offsets(phones, tracks, most), knowledge, flight)
+    for _ in range(CORRECTIONS):
+        better = corrected(phones, tracks, fall, knowledge)
+        if better is None:
+            log.warning("warning: the mattes have no common hull in the free fall: poses, or mattes, are off")
+            break
+        fall = fit_fall(phones, better, fall.offsets, knowledge, fall.window if flight is None else flight)
+    return fall
+
+
+def of_phone(values: Mapping[str, Any], name: str, key: str):
+    """A key that phones may have of their own."""
+    return ((values["phones"] or {}).get(name) or {}).get(key, values[key])
+
+
+def refuse_unknown_phones(values: Mapping[str, Any], names: list[str]) -> None:
+    for name, section in (values["phones"] or {}).items():
+        if name not in names:
+            raise ConfigError(f"phones.{name}: no video of that name; there are {', '.join(names)}")
+        if unknown := sorted(set(section) - set(OWN)):
+            raise ConfigError(f"phones.{name}.{unknown[0]}: expected the keys {', '.join(OWN)} only")
+
+
+def plates_folder(values: Mapping[str, Any]) -> Path | None:
+    """The folder of plates: named, in the videos' folder, or beside it."""
+    if values["plates"] is not None:
+        if not Path(values["plates"]).is_dir():
+            raise DataError(f"plates: folder {values['plates']} not found")
+        return Path(values["plates"])
+    videos = Path(values["videos"])
+    return next((folder for folder in (videos / "plates", videos.parent / "plates") if folder.is_dir()), None)
+
+
+def followed(clips: list[Clip], mattings: list[Matting]) -> list[Track]:
+    with tqdm(total=sum(len(clip.times) for clip in clips), desc="mattes", unit="frame") as bar:
+        return [follow(clip, matting, bar.update) for clip, matting in zip(clips, mattings)]
+
+
+def known(values: Mapping[str, Any], clips: list[Clip], world: World | None) -> Knowledge:
+    """What the keys say beforehand; an earlier capture knows scale and up."""
+    names = [clip.path.stem for clip in clips]
+    scans = {}
+    for clip, name in zip(clips, names):
+        scan = of_phone(values, name, "scan")
+        scans[name] = TURNED.get(clip.turned, "down") if scan == "auto" else scan
+        if scans[name] not in SCANS:
+            raise ConfigError(f"phones.{name}.scan: expected auto, {', '.join(SCANS)}, found {scan!r}")
+    readouts = {name: of_phone(values, name, "readout") for name in names}
+    up = None if values["up"] is None else np.array(values["up"], float)
+    knowledge = Knowledge(values["gravity"], values["scale"], up, readouts, scans)
+    return knowledge if world is None else replace(knowledge, scale=world.scale, up=world.R[1])
+
+
+def gains_of(values, phones, clips, plates, world, tracks, fall) -> np.ndarray | None:
+    """(V, 3) factors on the phones' colours, or None."""
+    if values["colours"] == "none" or values["mattes"] != "plates":
+        return None
+    pictures = [plate_of(plates, clip, values["plate_seconds"]) for clip in clips]
+    return floor_gains(phones, pictures, world, radius_of(phones, tracks, fall) * world.scale)
+
+
+def centres_of(exposures, phones: list[Phone], times: np.ndarray) -> np.ndarray:
+    """(T, 3) in units of the poses, where the lines of sight meet at common times."""
+    tracks = [Track(None, times, e.path(times), np.ones(len(times))) for e in exposures]
+    return centres_at(phones, tracks, np.zeros(len(phones)), times)
+
+
+def figures(
+    values, phones, clips, tracks, fall: Fall, knowledge: Knowledge, world: World, times, centres, radius, floor, gains
+) -> dict[str, Any]:
+    """All that capture.json says."""
+    box = box_of(centres, radius)
+    folder = Path(values["output"])
+    acceleration = float(np.linalg.norm(fall.acceleration)) * world.scale
+    per_phone = []
+    for v, (phone, clip, track) in enumerate(zip(phones, clips, tracks)):
+        per_phone.append({
+            "name": phone.name, "size": list(clip.size), "fps": round(1 / clip.interval, 4), "frames": len(clip.times),
+            "seen": int(track.seen.sum()), "offset": float(fall.offsets[v]), "offset_sd": float(fall.offsets_sd[v]),
+            "readout": float(fall.readouts[v]), "readout_sd": float(fall.readouts_sd[v]), "scan": knowledge.scan[phone.name],
+            "shift": fall.shifts[v].tolist(), "jitter": clip.jitter, "radius_px": float(np.median(track.radii[track.seen])),
+            "gain": None if gains is None else gains[v].tolist(),
+        })  # fmt: skip
+    command = (
+        f"python train.py scene=transforms scene.path={folder} scene.up=[0,1,0] "
+        f"scene.gravity=[0,-{values['gravity']:g},0] 'scene.box={json.dumps(box, separators=(',', ':'))}' prior=neo_hookean"
+    )
+    free = int((times <= fall.window[1]).sum())
+    found = {
+        "phones": per_phone, "fall": {"window": list(fall.window), "centres": fall.frames, "noise_px": fall.noise,
+                                      "acceleration": acceleration},
+        "scale": world.scale, "scale_sd": None if knowledge.scale is not None else fall.scale_sd,
+        "up": fall.up.tolist(), "up_sd_degrees": None if knowledge.up is not None else fall.up_sd, "ground": floor,
+        "radius": radius, "frames": len(times), "free_frames": free, "rate": float(1 / np.diff(times).mean()), "box": box,
+        "start": float(times[0]), "interpolation": values["interpolation"], "world": world.written(), "command": command,
+    }  # fmt: skip
+    return found | {"warnings": warnings_of(found, values, knowledge, phones)}
+
+
+def warnings_of(found: dict[str, Any], values: Mapping[str, Any], knowledge: Knowledge, phones: list[Phone]) -> list[str]:
+    """What a reader has to know before training on it."""
+    said = []
+    g = values["gravity"]
+    if found["scale_sd"] is not None and found["scale_sd"] > 0.03 * found["scale"]:
+        said.append(
+            f"the scale is known to {found['scale_sd'] / found['scale']:.1%} only, and a modulus of elasticity to twice that: let "
+            "it fall from higher up, or measure a distance and set scale=<metres per unit of the poses>"
+        )
+    if knowledge.scale is not None and abs(found["fall"]["acceleration"] / g - 1) > 0.03:
+        said.append(
+            f"with the scale {knowledge.scale:.6g} the object falls with {found['fall']['acceleration']:.3g} m/s^2 in place of "
+            f"{g:.3g}: check scale, fps and gravity"
+        )
+    for phone, record in zip(phones, found["phones"]):
+        if record["jitter"] > 0.5:
+            said.append(
+                f"{record['name']}: its frames are up to {record['jitter']:.2g} frames off an even rate; the file's times are used"
+            )
+        if record["readout_sd"] > 0.006 and knowledge.readout_of(phone.name) is None:
+            said.append(
+                f"{record['name']}: the fall does not tell how long its sensor takes to be read ({1e3 * record['readout']:.0f} +- "
+                f"{1e3 * record['readout_sd']:.0f} ms, of which 15 +- 10 is assumed): each millisecond changes the scale"
+            )
+        if np.hypot(*record["shift"]) > APART * record["radius_px"]:
+            said.append(
+                f"{record['name']}: the object appears {np.hypot(*record['shift']):.1f} px from where the others see it: a pose or "
+                "a matte that is off?"
+            )
+    if (tilt := found["ground"]["tilt_degrees"]) is not None and tilt > 1.5:
+        said.append(
+            f"the floor's points are tilted against the fall by {tilt:.1f} degrees: a slope, or an up that is off; scene.ground "
+            "is a level plane"
+        )
+    if found["ground"]["from"] == "lowest contact" and found["ground"]["sd"] > 0.05 * found["radius"]:
+        said.append(
+            f"the ground is known to {1e3 * found['ground']['sd']:.0f} mm only, from the body's outlines: name a point of the "
+            "floor with ground=[x, y, z], in the world of the poses, or film with a phone at the height of the floor"
+        )
+    if found["free_frames"] < 3:
+        said.append(f"only {found['free_frames']} frames of free fall are written: raise before=")
+    return said

@@ -1,0 +1,89 @@
+"""The centre of an outline is not the projected centre of a body, and less so the more the side from which it is seen changes.
+
+A phone looks at a body that falls past it first from below, then from above: its outline's centre wanders against the body by a few
+hundredths of its size, which looks like another acceleration. The visual hull of the rigid body in flight, from frames of the
+whole fall, says by how much.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from mosa.capture.fall import Fall, Knowledge, row_share
+from mosa.capture.mattes import Track
+from mosa.capture.phones import Phone
+
+PITCH = 1 / 18
+"""Of the hull's grid, in radii of the object."""
+REACH = 2.2
+VIEWS = 3
+"""Frames of each phone that carve it."""
+SAMPLES = 9
+"""Times of the fall at which the outline is looked at; a parabola in time goes through them."""
+MOST = 0.3
+"""Radii: an outline's centre further from the body's says that the hull is none."""
+
+
+def radius_of(phones: list[Phone], tracks: list[Track], fall: Fall) -> float:
+    """Of the object, in units of the poses."""
+    return float(
+        np.median(
+            [
+                np.median(track.radii[track.seen]) / phone.camera.K[0, 0] * np.linalg.norm(phone.camera.centre - fall.position)
+                for phone, track in zip(phones, tracks)
+            ]
+        )
+    )
+
+
+def hull_in_flight(phones: list[Phone], tracks: list[Track], fall: Fall, knowledge: Knowledge) -> np.ndarray:
+    """(N, 3) points of the visual hull relative to the falling centre, in units of the poses; the body does not turn."""
+    radius = radius_of(phones, tracks, fall)
+    steps = np.arange(-REACH, REACH + PITCH, PITCH) * radius
+    points = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
+    first, last = fall.window
+    for v, (phone, track) in enumerate(zip(phones, tracks)):
+        times = track.times + fall.offsets[v]
+        inside = np.flatnonzero(track.seen & (times >= first) & (times <= last))
+        for k in np.unique(inside[np.linspace(0, len(inside) - 1, VIEWS + 2)[1:-1].round().astype(int)]) if len(inside) else ():
+            own = times[k] + fall.readouts[v] * row_share(phone, track.centres[k], knowledge)
+            pixels = phone.camera.project(points + fall.at(own))
+            when = times[k] + fall.readouts[v] * row_share(phone, pixels, knowledge)  # each point when its row is read
+            pixels = phone.camera.project(points + fall.at(when))
+            points = points[track.shows(k, pixels)]
+    return points
+
+
+def outline_centre(phone: Phone, points: np.ndarray, pitch: float) -> np.ndarray:
+    """(2,) [px] centre of what points (N, 3), `pitch` apart, cover in a phone's picture."""
+    pixels = phone.camera.project(points)
+    depth = np.linalg.norm(points.mean(0) - phone.camera.centre)
+    cell = pitch / depth * phone.camera.K[0, 0]
+    x, y = np.floor((pixels - pixels.min(0)) / cell).astype(int).T
+    covered = np.zeros((y.max() + 1, x.max() + 1), bool)
+    covered[y, x] = True
+    rows, columns = np.nonzero(covered)
+    return pixels.min(0) + cell * np.array([columns.mean() + 0.5, rows.mean() + 0.5])
+
+
+def corrected(phones: list[Phone], tracks: list[Track], fall: Fall, knowledge: Knowledge) -> list[Track] | None:
+    """The tracks with centres at which the body's own centre would be seen during the fall, outside of its window moved as at its
+    end; None where the mattes have no common hull."""
+    points = hull_in_flight(phones, tracks, fall, knowledge)
+    radius = radius_of(phones, tracks, fall)
+    if len(points) * (PITCH * radius) ** 3 < 0.3 * radius**3:  # of a ball it is 4.2
+        return None
+    times = np.linspace(*fall.window, SAMPLES)
+    middle = points.mean(0)  # a place of the body's own, or the centre would wander from one correction to the next
+    found = []
+    for v, (phone, track) in enumerate(zip(phones, tracks)):
+        places = fall.at(times)
+        off = np.stack([outline_centre(phone, points + c, PITCH * radius) for c in places]) - phone.camera.project(places + middle)
+        if np.abs(off).max() > MOST * float(np.median(track.radii[track.seen])):
+            return None
+        curve = np.polyfit(times - fall.origin, off, 2)
+        t = np.clip(track.times + fall.offsets[v], *fall.window) - fall.origin
+        found.append(replace(track, centres=track.centres - (curve[0] * t[:, None] ** 2 + curve[1] * t[:, None] + curve[2])))
+    return found

@@ -1,0 +1,137 @@
+"""Which pose belongs to which video: COLMAP models, or transforms.json as Nerfstudio and Blender write it."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from mosa.capture.colmap import is_model, read_model, read_points
+from mosa.capture.phones import Camera, Phone
+from mosa.data.footage import matrix, number, read_json, world_to_camera
+from mosa.data.lens import COEFFICIENTS, is_fisheye
+from mosa.errors import DataError
+
+VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
+FEWEST = 3
+"""Phones from which places and clocks can be told."""
+MOVED, TURNED = 0.01, 0.5
+"""Share of the distance between cameras, and degrees, by which poses of one phone may differ: it stands still."""
+
+
+def read_phones(videos: str | Path, poses: str | Path, sizes: dict[str, tuple[int, int]]) -> list[Phone]:
+    """One phone for each of the videos whose frame sizes [px] are given (name of the file -> width, height).
+
+    Errors: DataError naming the video without a pose, or the poses that do not belong together.
+    """
+    folder = Path(videos)
+    cameras = read_poses(poses)
+    centres = np.array([camera.centre for camera in cameras.values()])
+    extent = float(np.ptp(centres, axis=0).max())
+    phones = []
+    for file, size in sizes.items():
+        video = folder / file
+        mine = {name: camera for name, camera in cameras.items() if belongs(name, video.stem)}
+        if not mine:
+            raise DataError(
+                f"{poses}: no pose for {video}: expected an image named {video.stem}.<ending>, {video.stem}_<number>, or "
+                f"in a folder {video.stem}, found {', '.join(list(cameras)[:8])}"
+            )
+        one = still(mine, extent, video.stem)
+        phones.append(Phone(video.stem, resized(one, size, video), video))
+    if len(phones) < FEWEST:
+        raise DataError(f"{folder}: expected at least {FEWEST} videos, one of each phone, found {len(phones)}")
+    return phones
+
+
+def read_poses(path: str | Path) -> dict[str, Camera]:
+    """Image name -> camera, of a COLMAP model's folder or a transforms.json (or a folder with one)."""
+    place = Path(path)
+    if (model := model_folder(place)) is not None:
+        return read_model(model)
+    if place.is_dir():
+        if not (place / "transforms.json").is_file():
+            raise DataError(
+                f"{place}: expected a COLMAP model (cameras.bin and images.bin, or .txt) or transforms.json, found neither"
+            )
+        place = place / "transforms.json"
+    return read_transforms_poses(place)
+
+
+def model_folder(place: Path) -> Path | None:
+    """Where a COLMAP model lies, in the folder or as COLMAP nests it; None where there is none."""
+    return next((f for f in (place, place / "sparse" / "0", place / "sparse", place / "0") if is_model(f)), None)
+
+
+def scene_points(path: str | Path) -> np.ndarray:
+    """(N, 3) points of the surroundings in the poses' world; none where poses bring none."""
+    model = model_folder(Path(path))
+    return np.zeros((0, 3)) if model is None else read_points(model)
+
+
+def read_transforms_poses(file: Path) -> dict[str, Camera]:
+    """Poses and lenses of a transforms.json; its images are not read. Errors: DataError naming entry and key."""
+    document = read_json(file)
+    if not isinstance(document, dict) or not isinstance(document.get("frames"), list) or not document["frames"]:
+        raise DataError(f"{file}: expected an object with a list `frames`, one entry per image")
+    found = {}
+    for i, entry in enumerate(document["frames"]):
+        where = f"{file}, frames[{i}]"
+        for key in ("file_path", "transform_matrix"):
+            if not isinstance(entry, dict) or key not in entry:
+                raise DataError(f"{where}: expected the key {key}")
+        keys = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", *COEFFICIENTS)
+        both = {**document, **entry}
+        known = {key: number(both[key], f"{where}, {key}") for key in keys if both.get(key) is not None}
+        if not {"w", "h"} <= set(known):
+            raise DataError(f"{where}: expected the images' size in pixels, w and h, found {sorted(known)}")
+        if "fl_x" not in known and not 0 < known.get("camera_angle_x", 0) < math.pi:
+            raise DataError(f"{where}: expected fl_x (and fl_y) in pixels or camera_angle_x in radians, found neither")
+        focal = known.get("fl_x") or 0.5 * known["w"] / math.tan(0.5 * known["camera_angle_x"])
+        K = np.array(
+            [[focal, 0, known.get("cx", known["w"] / 2)], [0, known.get("fl_y", focal), known.get("cy", known["h"] / 2)], [0, 0, 1]]
+        )
+        fisheye = is_fisheye(both.get("camera_model"), both.get("is_fisheye"), where)
+        w2c = world_to_camera(matrix(entry["transform_matrix"], (3, 4), f"{where}, transform_matrix"), where)
+        lens = {name: known[name] for name in COEFFICIENTS if name in known}
+        found[str(entry["file_path"])] = Camera(K, w2c, (int(known["w"]), int(known["h"])), where, lens, fisheye)
+    return found
+
+
+def belongs(image: str, phone: str) -> bool:
+    """Whether an image of that name is one of a phone's: phone.jpg, phone_0003.png, images/phone/17.jpg."""
+    path = Path(image)
+    if phone in path.parts[:-1]:
+        return True
+    return re.fullmatch(re.escape(phone) + r"([ _.-]+\d+|[ _.-]*frame[ _.-]*\d+)?", path.stem) is not None
+
+
+def still(cameras: dict[str, Camera], extent: float, phone: str) -> Camera:
+    """The one camera that all poses of a phone are. Errors: DataError where they differ."""
+    first, *others = cameras.items()
+    name, one = first
+    for _, camera in others:
+        away = float(np.linalg.norm(camera.centre - one.centre))
+        turn = camera.w2c[:3, :3] @ one.w2c[:3, :3].T
+        angle = math.degrees(math.acos(np.clip(0.5 * (np.trace(turn) - 1), -1, 1)))
+        if away > MOVED * extent or angle > TURNED:
+            raise DataError(
+                f"{camera.where}: phone {phone} stands elsewhere than in {name}, by {away:.3g} (the cameras span "
+                f"{extent:.3g}) and {angle:.2g} degrees: expected phones that stand still; use one image of each"
+            )
+    return one
+
+
+def resized(camera: Camera, size: tuple[int, int], video: Path) -> Camera:
+    """The camera for frames of another size of the same field of view. Errors: DataError where the sides' ratio differs."""
+    factor = size[0] / camera.size[0], size[1] / camera.size[1]
+    if abs(factor[0] / factor[1] - 1) > 2e-3:
+        raise DataError(
+            f"{camera.where}: intrinsics are for {camera.size[0]}x{camera.size[1]} px, but {video} has frames of "
+            f"{size[0]}x{size[1]}: expected the poses of images with the video's field of view; take them from a frame "
+            "of each video, not from photographs"
+        )
+    return replace(camera, K=np.diag([*factor, 1.0]) @ camera.K, size=size)

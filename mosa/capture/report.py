@@ -1,0 +1,157 @@
+"""The page of a capture: what was found, how sure it is, and pictures to check it by eye."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import matplotlib
+import numpy as np
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+from mosa.capture.fall import Fall
+from mosa.capture.phones import Phone
+from mosa.capture.resampling import Exposure
+from mosa.capture.world import World
+
+TILE = 180
+"""[px] height of a picture on the contact sheet."""
+COLUMNS = 8
+
+
+def write_report(
+    folder: Path,
+    found: dict[str, Any],
+    phones: list[Phone],
+    fall: Fall,
+    exposures: list[Exposure],
+    world: World,
+    times: np.ndarray,
+) -> None:
+    """capture.md, contact.png and fall.png into the folder."""
+    cv2.imwrite(str(folder / "contact.png"), contact_sheet(folder, [phone.name for phone in phones], len(times)))
+    draw_fall(folder / "fall.png", phones, fall, exposures, world)
+    (folder / "capture.md").write_text(page(found))
+
+
+def page(found: dict[str, Any]) -> str:
+    """What was found, in Markdown."""
+    fall, said = found["fall"], found["warnings"]
+    sure = lambda value, digits=2: "given" if value is None else f"{value:.{digits}g}"  # noqa: E731
+    lines = [
+        f"# A capture by {len(found['phones'])} phones",
+        "",
+        *(["**To be looked at first:**", "", *(f"- {line}" for line in said), ""] if said else ["Nothing unusual was found.", ""]),
+        "Learn from it:",
+        "",
+        f"    {found['command']}",
+        "",
+        "## What the fall says",
+        "",
+        "| | found | one standard deviation |",
+        "|---|---|---|",
+        f"| metres per unit of the poses | {found['scale']:.6g} | {sure(found['scale_sd'])} |",
+        f"| up in the poses' world | {', '.join(f'{x:.4f}' for x in found['up'])} | {sure(found['up_sd_degrees'])} degrees |",
+        f"| ground [m], from {found['ground']['from']} | 0, by definition | {sure(found['ground']['sd'])} |",
+        *(
+            [f"| tilt of the floor's points [degrees] | {found['ground']['tilt_degrees']:.2f} | |"]
+            if found["ground"]["tilt_degrees"] is not None
+            else []
+        ),
+        f"| radius of the object [m] | {found['radius']:.3g} | |",
+        f"| free fall [s, clock of {found['phones'][0]['name']}] | {fall['window'][0]:.3f} to {fall['window'][1]:.3f} | |",
+        f"| acceleration in it [m/s^2] | {fall['acceleration']:.4g} | |",
+        f"| centres used, and their noise [px] | {fall['centres']} | {fall['noise_px']:.2f} |",
+        f"| frames written, of them free | {found['frames']}, {found['free_frames']} | at {found['rate']:.5g} per second |",
+        "",
+        "A modulus of elasticity is known to twice the relative error of the scale, beside all else.",
+        "",
+        "## Phones",
+        "",
+        "| phone | frames/s | whole object in | clock [ms] | readout [ms] | appears off by [px] | colour factors |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for p in found["phones"]:
+        gain = "" if p["gain"] is None else ", ".join(f"{g:.2f}" for g in p["gain"])
+        lines.append(
+            f"| {p['name']} | {p['fps']:.5g} | {p['seen']} of {p['frames']} frames | "
+            f"{1e3 * p['offset']:.2f} +- {1e3 * p['offset_sd']:.2f} | {1e3 * p['readout']:.1f} +- {1e3 * p['readout_sd']:.1f} "
+            f"({p['scan']}) | {p['shift'][0]:.1f}, {p['shift'][1]:.1f} | {gain} |"
+        )
+    lines += [
+        "",
+        f"Clock: what is added to a phone's own time to have that of {found['phones'][0]['name']}. Readout: time from the sensor's "
+        "first row to its last, and where the next row lies in the picture.",
+        "",
+        "![frames and outlines of the mattes](contact.png)",
+        "",
+        "![height of the object's centre, and what is left](fall.png)",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def contact_sheet(folder: Path, names: list[str], frames: int) -> np.ndarray:
+    """A row of pictures per phone, at the same moments, around the object, with the matte's outline; BGR uint8."""
+    chosen = np.unique(np.linspace(0, frames - 1, COLUMNS).round().astype(int))
+    rows = []
+    for name in names:
+        pictures = [cv2.imread(str(folder / "images" / f"{name}_{k:03d}.png"), cv2.IMREAD_UNCHANGED) for k in chosen]
+        covered = np.max([p[..., 3] for p in pictures], 0) > 127
+        y, x = (np.flatnonzero(covered.any(axis)) for axis in (1, 0))
+        spare = 10
+        y0, y1, x0, x1 = max(0, y[0] - spare), y[-1] + spare, max(0, x[0] - spare), x[-1] + spare
+        tiles = []
+        for picture, k in zip(pictures, chosen):
+            part = picture[y0:y1, x0:x1]
+            alpha = part[..., 3:].astype(np.float32) / 255
+            shown = np.ascontiguousarray((part[..., :3] * alpha + 200 * (1 - alpha)).astype(np.uint8))
+            outline, _ = cv2.findContours((part[..., 3] > 127).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+            cv2.drawContours(shown, outline, -1, (0, 0, 220), 1)
+            factor = TILE / shown.shape[0]
+            shown = cv2.resize(shown, (max(60, round(shown.shape[1] * factor)), TILE), interpolation=cv2.INTER_AREA)
+            cv2.putText(shown, f"{name} {k}", (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, cv2.LINE_AA)
+            tiles.append(cv2.copyMakeBorder(shown, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=(255, 255, 255)))
+        rows.append(np.hstack(tiles))
+    width = max(row.shape[1] for row in rows)
+    return np.vstack(
+        [cv2.copyMakeBorder(row, 0, 0, 0, width - row.shape[1], cv2.BORDER_CONSTANT, value=(255, 255, 255)) for row in rows]
+    )
+
+
+def draw_fall(file: Path, phones: list[Phone], fall: Fall, exposures: list[Exposure], world: World) -> None:
+    """Heights at which each phone sees the centre, with the parabola; and how far each sees it from
+    there, in pixels, but for a constant."""
+    figure, (above, below) = plt.subplots(2, 1, figsize=(8, 7), sharex=True, height_ratios=(2, 1))
+    first, last = fall.window
+    t = np.linspace(first, last, 100)
+    above.plot(t, world.points(fall.at(t))[:, 1], "k-", lw=1, label="free fall")
+    low, high = first - 0.05, last + 0.35
+    for v, (phone, exposure) in enumerate(zip(phones, exposures)):
+        when = exposure.seen_times
+        inside = (when > max(low, exposure.span[0])) & (when < min(high, exposure.span[1]))
+        pixels = exposure.path(when[inside])
+        # the height on the vertical through the parabola's centre, which is where the object is all the time
+        point = np.broadcast_to(fall.at(np.array(last)), (int(inside.sum()), 3))
+        rays, arm = phone.camera.rays(pixels - fall.shifts[v]), point - phone.camera.centre
+        across = rays - (rays @ fall.up)[:, None] * fall.up
+        way = (arm * across).sum(1) / np.square(across).sum(1)
+        heights = world.points(phone.camera.centre + way[:, None] * rays)[:, 1]
+        line = above.plot(when[inside], heights, ".", ms=4, label=phone.name)[0]
+        free = (when >= first) & (when <= last)
+        off = exposure.path(when[free]) - fall.shifts[v] - phone.camera.project(fall.at(when[free]))
+        off -= off.mean(0)  # an outline's centre is not the body's
+        below.plot(when[free], off[:, 0], "x", ms=3, color=line.get_color())
+        below.plot(when[free], off[:, 1], ".", ms=4, color=line.get_color())
+    above.set_ylabel("height of the centre [m]")
+    above.legend(fontsize=8)
+    below.set_ylabel("off the parabola [px]\n(x across, . down)")
+    below.set_xlabel(f"time [s], clock of {phones[0].name}")
+    for axis in (above, below):
+        axis.grid(alpha=0.3)
+    figure.tight_layout()
+    figure.savefig(file, dpi=110)
+    plt.close(figure)

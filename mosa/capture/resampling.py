@@ -1,0 +1,237 @@
+"""Frames of common times from phones that expose at times of their own, row by row.
+
+What a frame shows is first moved along the path of the object's centre in that picture, each row from the time it was read at to
+the wanted one; what is left between the frame before and the frame after, deformation and turning, is interpolated by optical flow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from scipy.interpolate import BSpline
+
+from mosa.capture.fall import Fall, Knowledge, row_share
+from mosa.capture.mattes import Matting, Track, matted_frames
+from mosa.capture.phones import Phone
+from mosa.errors import DataError
+
+KINDS = ("flow", "shift", "none")
+NEAR = 0.02
+"""Share of a frame within which a wanted time is that of a frame."""
+KNOTS = 2
+"""Of the common path in the shortest time between frames."""
+SMOOTH = 1e-3
+"""Weight of the change of its acceleration from knot to knot, where a line of sight's distance has 1."""
+AROUND = 0.6
+"""Radii of the object beside it in which flow is looked for."""
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """How a phone exposes. times: (T,) [s] of its frames' middle rows on the common clock; readout [s], along `axis` of a pixel in
+    the direction of `sign`; centres: (T, 2) [px] of the object; path: the same at any common time
+    within `span`."""
+
+    phone: Phone
+    times: np.ndarray
+    readout: float
+    axis: int
+    sign: int
+    centres: np.ndarray
+    path: Callable[[np.ndarray], np.ndarray]
+    span: tuple[float, float]
+
+    @cached_property
+    def own_times(self) -> np.ndarray:
+        """(T,) [s] at which the object's centre was read in each frame, that of the middle row where it is not seen."""
+        place = self.centres[:, self.axis] / self.phone.camera.size[self.axis] - 0.5
+        return self.times + self.readout * self.sign * np.nan_to_num(place)
+
+    @property
+    def seen_times(self) -> np.ndarray:
+        """(n,) common times at which the frames' own centres were read."""
+        return self.own_times[np.isfinite(self.centres[:, 0])]
+
+
+def common_path(phones: list[Phone], tracks: list[Track], fall: Fall, knowledge: Knowledge) -> tuple[BSpline, float, float]:
+    """(path (3,) of the object at a common time [s], first and last time of it), to which the lines of sight of all phones
+    come nearest.
+
+    Six phones of 60 frames a second see the object 360 times a second: an impact that is over in two frames of one of them.
+    """
+    times, rows, values = [], [], []
+    step = min(track.clip.interval for track in tracks) / KNOTS
+    for v, (phone, track) in enumerate(zip(phones, tracks)):
+        seen = track.seen
+        own = track.times[seen] + fall.offsets[v] + fall.readouts[v] * row_share(phone, track.centres[seen], knowledge)
+        off = centre_shift(phone, own, track.centres[seen], fall)
+        rays = phone.camera.rays(track.centres[seen] - off)
+        across = np.eye(3) - rays[:, :, None] * rays[:, None]
+        times.append(own)
+        rows.append(across)
+        values.append(across @ phone.camera.centre)
+    every, across, values = np.concatenate(times), np.concatenate(rows), np.concatenate(values)
+    low, high = max(t.min() for t in times), min(t.max() for t in times)
+    inside = (every >= low) & (every <= high)
+    every, across, values = every[inside], across[inside], values[inside]
+    knots = np.concatenate([[low] * 3, np.linspace(low, high, max(4, int((high - low) / step))), [high] * 3])
+    basis = BSpline.design_matrix(np.clip(every, low, high), knots, 3).toarray()
+    n = basis.shape[1]
+    matrix = np.einsum("kab,ki,kj->iajb", across, basis, basis).reshape(3 * n, 3 * n)
+    right = np.einsum("ka,ki->ia", values, basis).ravel()
+    bend = np.diff(np.eye(n), 3, axis=0)  # where nobody looks the acceleration goes on
+    matrix += SMOOTH * np.kron(bend.T @ bend, np.eye(3))
+    return BSpline(knots, np.linalg.solve(matrix, right).reshape(n, 3), 3), float(low), float(high)
+
+
+def centre_shift(phone: Phone, times: np.ndarray, centres: np.ndarray, fall: Fall) -> np.ndarray:
+    """(2,) [px] mean of where a phone sees the object minus where it falls: of its pose, and of its side of the object."""
+    free = (times >= fall.window[0]) & (times <= fall.window[1])
+    return (centres[free] - phone.camera.project(fall.at(times[free]))).mean(0)
+
+
+def exposure_of(
+    v: int, phone: Phone, track: Track, fall: Fall, knowledge: Knowledge, common: tuple[BSpline, float, float]
+) -> Exposure:
+    """Of phone v of a fall; common: of `common_path`. What of a phone's own centres lies beside that path is interpolated
+    linearly."""
+    spline, low, high = common
+    times = track.times + fall.offsets[v]
+    seen = track.seen
+    own = times[seen] + fall.readouts[v] * row_share(phone, track.centres[seen], knowledge)
+    inside = (own >= low) & (own <= high)
+    beside = track.centres[seen][inside] - phone.camera.project(spline(own[inside]))
+
+    def path(time: np.ndarray) -> np.ndarray:
+        t = np.clip(np.atleast_1d(time), low, high)
+        rest = np.stack([np.interp(t, own[inside], beside[:, axis]) for axis in (0, 1)], -1)
+        found = phone.camera.project(spline(t)) + rest
+        return found if np.ndim(time) else found[0]
+
+    axis, sign = knowledge.scan_of(phone.name)
+    return Exposure(phone, times, float(fall.readouts[v]), axis, sign, track.centres, path, (low, high))
+
+
+def common_times(
+    exposures: list[Exposure], window: tuple[float, float], *, before: float, after: float, rate: float | None
+) -> np.ndarray:
+    """(T,) [s], evenly spaced, from `before` seconds before the free fall ends to `after` after it, as far as every phone has a
+    whole object in the frames around. rate [1/s]: None for the slowest phone's. Errors: DataError where less than five are left."""
+    slowest = max(float(np.median(np.diff(e.times))) for e in exposures)
+    step = slowest if rate is None else 1 / rate
+    # the first phone's frames lie on the grid, so that of it nothing has to be made up
+    first = exposures[0].times[np.abs(exposures[0].times - window[1]).argmin()]
+    low, high = int(np.floor(before / step)), int(np.floor(after / step))
+    grid = first + step * np.arange(-low, high + 1)
+    good = np.array([all(between(e, t) is not None for e in exposures) and t > window[0] for t in grid])
+    bad = np.flatnonzero(~good)
+    begin, end = max(bad[bad <= low], default=-1) + 1, min(bad[bad > low], default=len(grid))
+    if end - begin < 5 or low - begin < 1:
+        raise DataError(
+            f"{end - begin} common frames ({low - begin} of them in free fall): expected at least five in which every phone "
+            "sees the whole object, two of them before the end of the free fall; film with more room around, longer, or "
+            "change before=, after="
+        )
+    return grid[begin:end]
+
+
+def between(exposure: Exposure, time: float) -> tuple[int, int] | None:
+    """The frames that were taken before and after a time, where the object was; the same twice where one was taken at it. None
+    where there is no such pair with a whole object."""
+    own = exposure.own_times
+    after = int(np.searchsorted(own, time))
+    if not 0 < after < len(own):
+        return None
+    gap = own[after] - own[after - 1]
+    for k in (after - 1, after):
+        if abs(own[k] - time) < NEAR * gap and np.isfinite(exposure.centres[k, 0]):
+            return k, k
+    if not np.isfinite(exposure.centres[after - 1 : after + 1, 0]).all() or gap > 2.5 * float(np.median(np.diff(exposure.times))):
+        return None
+    return after - 1, after
+
+
+def moved(picture: np.ndarray, exposure: Exposure, frame: int, time: float) -> np.ndarray:
+    """A frame (H, W, C) of 8 bits as it would have been exposed at one time, were the object's motion that of its centre in the
+    picture; in [0, 1]."""
+    height, width = picture.shape[:2]
+    wanted = exposure.path(np.asarray(time))
+    size = (width, height)[exposure.axis]
+    line = np.arange(size) + 0.5
+    source, shift = line, np.zeros((size, 2))
+    for _ in range(4):  # where a row comes from depends on when it was read: a contraction by velocity times readout over size
+        when = exposure.times[frame] + exposure.readout * exposure.sign * (source / size - 0.5)
+        shift = exposure.path(when) - wanted
+        source = line + shift[:, exposure.axis]
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    by = shift.astype(np.float32)
+    dx, dy = (by[:, 0][:, None], by[:, 1][:, None]) if exposure.axis == 1 else (by[:, 0][None], by[:, 1][None])
+    return cv2.remap(
+        picture.astype(np.float32) / 255, x + dx, y + dy, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT, borderValue=0
+    )
+
+
+def blended(one: np.ndarray, two: np.ndarray, share: float, centre: np.ndarray, radius: float) -> np.ndarray:
+    """Between two premultiplied RGBA pictures (H, W, 4), of which `two` counts for `share`: each moved along the flow between."""
+    height, width = one.shape[:2]
+    reach = (1 + AROUND) * 2 * radius
+    x0, y0 = (max(0, int(c - reach)) for c in centre)
+    x1, y1 = min(width, int(centre[0] + reach) + 1), min(height, int(centre[1] + reach) + 1)
+    a, b = (np.ascontiguousarray(p[y0:y1, x0:x1]) for p in (one, two))
+
+    def grey(p: np.ndarray) -> np.ndarray:
+        return np.round(255 * np.clip(p[..., :3].mean(-1) + 1 - p[..., 3], 0, 1)).astype(np.uint8)
+
+    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(grey(a), grey(b), None)
+    x, y = np.meshgrid(np.arange(x1 - x0, dtype=np.float32), np.arange(y1 - y0, dtype=np.float32))
+    from_one = cv2.remap(a, x - share * flow[..., 0], y - share * flow[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    from_two = cv2.remap(
+        b, x + (1 - share) * flow[..., 0], y + (1 - share) * flow[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+    )
+    found = (1 - share) * one + share * two
+    found[y0:y1, x0:x1] = (1 - share) * from_one + share * from_two
+    return found
+
+
+def resampled(exposure: Exposure, track: Track, matting: Matting, times: np.ndarray, kind: str = "flow") -> np.ndarray:
+    """(T, H, W, 4) uint8, straight alpha, of a phone at common times (T,) [s]. kind: flow | shift (the nearest frame, moved) | none
+    (the nearest frame)."""
+    pairs = [between(exposure, float(t)) for t in times]
+    first, last = min(p[0] for p in pairs), max(p[1] for p in pairs)
+    frames, needed = {}, {k for pair in pairs for k in pair}
+    for i, color, matte in matted_frames(track.clip, matting, first, last):
+        if i in needed:  # 8 bits: of slow motion in 4K there are gigabytes of them
+            both = np.concatenate([color * matte[..., None], matte[..., None]], -1)
+            frames[i] = np.round(255 * both).astype(np.uint8)
+    radius = float(np.median(track.radii[track.seen]))
+    found = []
+    for time, (k0, k1) in zip(times, pairs):
+        own = exposure.own_times
+        share = 0.0 if k0 == k1 else float((time - own[k0]) / (own[k1] - own[k0]))
+        nearest = k0 if share <= 0.5 else k1
+        if kind == "none":
+            picture = frames[nearest].astype(np.float32) / 255
+        elif kind == "shift" or k0 == k1:
+            picture = moved(frames[nearest], exposure, nearest, float(time))
+        else:
+            picture = blended(
+                moved(frames[k0], exposure, k0, float(time)),
+                moved(frames[k1], exposure, k1, float(time)),
+                share,
+                exposure.path(np.asarray(time)),
+                radius,
+            )
+        found.append(straight(picture))
+    return np.stack(found)
+
+
+def straight(picture: np.ndarray) -> np.ndarray:
+    """uint8 with straight alpha of a premultiplied one; below a percent of coverage there is nothing."""
+    alpha = np.clip(picture[..., 3:], 0, 1)
+    alpha = np.where(alpha < 0.01, 0, alpha)
+    color = np.where(alpha > 0, picture[..., :3] / np.maximum(alpha, 0.01), 1.0)
+    return np.round(255 * np.clip(np.concatenate([color, alpha], -1), 0, 1)).astype(np.uint8)

@@ -1,0 +1,137 @@
+"""COLMAP models, both forms, against the numbers they were written from; and what is said of damaged ones."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+from filming import cameras, in_world
+from scipy.spatial.transform import Rotation
+
+from mosa.capture.colmap import MODELS, read_model, read_points
+from mosa.capture.phones import Camera
+from mosa.capture.poses import belongs, read_phones, read_poses, scene_points
+from mosa.data.footage import OPENGL_TO_OPENCV
+from mosa.errors import DataError
+
+LENS = (0.05, -0.02, 0.001, -0.002)
+
+
+def model(folder, *, binary: bool, count: int = 3, lens: str = "OPENCV") -> list[Camera]:
+    """Write a model of the first cameras; returns them."""
+    made = [in_world(camera) for camera in cameras()[:count]]
+    number = MODELS[lens][0]
+    cams, images, points = [struct.pack("<Q", count)], [struct.pack("<Q", count)], [struct.pack("<Q", 2)]
+    text = [["# one", ""], ["# one"], ["# one"]]
+    for i, camera in enumerate(made):
+        values = [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2], *LENS]
+        q, t = np.roll(Rotation.from_matrix(camera.w2c[:3, :3]).as_quat(), 1), camera.w2c[:3, 3]
+        name = f"shots/phone {i}.jpg"
+        cams.append(struct.pack("<iiQQ8d", 10 + i, number, *camera.size, *values))
+        images.append(struct.pack("<i7di", 5 + i, *q, *t, 10 + i) + name.encode() + b"\0" + struct.pack("<Q", 1)
+                      + struct.pack("<ddq", 1.0, 2.0, -1))  # fmt: skip
+        text[0].append(f"{10 + i} {lens} {camera.size[0]} {camera.size[1]} " + " ".join(map(repr, map(float, values))))
+        text[1] += [f"{5 + i} " + " ".join(repr(float(x)) for x in [*q, *t]) + f" {10 + i} {name}", "1.0 2.0 -1" if i else ""]
+    for i, xyz in enumerate(([0.1, 0.2, 0.3], [4.0, 5.0, 6.0])):
+        points.append(struct.pack("<Q3d3BdQii", i, *xyz, 1, 2, 3, 0.5, 1, 5, 0))
+        text[2].append(f"{i} " + " ".join(map(str, xyz)) + " 1 2 3 0.5 5 0")
+    for name, parts, lines in zip(("cameras", "images", "points3D"), (cams, images, points), text):
+        if binary:
+            (folder / f"{name}.bin").write_bytes(b"".join(parts))
+        else:
+            (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
+    return made
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_a_model_is_read_as_it_was_written(tmp_path, binary):
+    made = model(tmp_path, binary=binary)
+    found = read_model(tmp_path)
+    assert list(found) == [f"shots/phone {i}.jpg" for i in range(3)]
+    for camera, other in zip(made, found.values()):
+        np.testing.assert_allclose(other.K, camera.K)
+        np.testing.assert_allclose(other.w2c, camera.w2c, atol=1e-12)
+        assert other.size == camera.size and dict(other.coefficients) == dict(zip(("k1", "k2", "p1", "p2"), LENS))
+    np.testing.assert_array_equal(read_points(tmp_path), [[0.1, 0.2, 0.3], [4, 5, 6]])
+    np.testing.assert_array_equal(scene_points(tmp_path), read_points(tmp_path))
+
+
+def test_rays_undo_the_projection_through_a_lens():
+    plain = cameras()[0]
+    points = np.random.default_rng(0).uniform([-0.2, 0.1, -0.2], [0.2, 0.5, 0.2], (20, 3))
+    for lens, fisheye in (({}, False), ({"k1": 0.1, "p2": 0.01}, False), ({"k1": 0.05, "k3": 0.01}, True)):
+        camera = Camera(plain.K, plain.w2c, plain.size, "", lens, fisheye)
+        way = points - camera.centre
+        np.testing.assert_allclose(camera.rays(camera.project(points)), way / np.linalg.norm(way, axis=1, keepdims=True), atol=1e-6)
+
+
+@pytest.mark.parametrize("name, damage, said", [
+    ("images.txt", lambda text: text.replace(" 11 shots", " 99 shots"), r"images\.txt.*CAMERA_ID 99"),
+    ("images.txt", lambda text: text.replace("5 -0.", "5 -7."), r"images\.txt.*unit quaternion"),
+    ("cameras.txt", lambda text: text.replace("OPENCV", "FOV"), r"cameras\.txt, line 3.*undistort"),
+    ("cameras.txt", lambda text: text.replace("0.05 ", ""), r"cameras\.txt, line 3.*8 parameters"),
+    ("cameras.txt", lambda text: text.replace("160", "wide"), r"cameras\.txt, line 3.*numbers"),
+])  # fmt: skip
+def test_a_damaged_text_model_is_named(tmp_path, name, damage, said):
+    model(tmp_path, binary=False)
+    file = tmp_path / name
+    before = file.read_text()
+    file.write_text(damage(before))
+    assert file.read_text() != before
+    with pytest.raises(DataError, match=said):
+        read_model(tmp_path)
+
+
+def test_a_cut_binary_model_is_named(tmp_path):
+    model(tmp_path, binary=True)
+    for name in ("cameras.bin", "images.bin"):
+        whole = (tmp_path / name).read_bytes()
+        for length in (4, len(whole) // 2, len(whole) - 30):
+            (tmp_path / name).write_bytes(whole[:length])
+            with pytest.raises(DataError, match=r"damaged|end of the file"):
+                read_model(tmp_path)
+        (tmp_path / name).write_bytes(whole)
+    (tmp_path / "cameras.bin").unlink()
+    with pytest.raises(DataError, match=r"cameras\.bin: file not found"):
+        read_model(tmp_path)
+
+
+def test_transforms_and_colmap_say_the_same(tmp_path):
+    made = model(tmp_path, binary=True)
+    frames = []
+    for i, camera in enumerate(made):
+        pose = np.linalg.inv(camera.w2c) @ OPENGL_TO_OPENCV
+        frames.append({"file_path": f"images/phone {i}.jpg", "transform_matrix": pose.tolist(), "fl_x": camera.K[0, 0],
+                       "fl_y": camera.K[1, 1], "cx": camera.K[0, 2], "cy": camera.K[1, 2]})  # fmt: skip
+    (tmp_path / "ns").mkdir()
+    document = {"w": 160, "h": 120, "camera_model": "OPENCV", **dict(zip(("k1", "k2", "p1", "p2"), LENS)), "frames": frames}
+    (tmp_path / "ns" / "transforms.json").write_text(json.dumps(document))
+    for one, other in zip(read_poses(tmp_path).values(), read_poses(tmp_path / "ns").values()):
+        np.testing.assert_allclose(one.w2c, other.w2c, atol=1e-9)
+        np.testing.assert_allclose(one.project(np.array([[0.1, 0.2, 0.3]])), other.project(np.array([[0.1, 0.2, 0.3]])))
+
+
+def test_a_pose_belongs_to_the_video_of_its_name():
+    mine = ("phone1.jpg", "a/phone1.png", "phone1/0001.jpg", "phone1_12.jpg", "phone1 frame 3.png", "phone1-frame0003.png")
+    assert all(belongs(name, "phone1") for name in mine)
+    assert not any(belongs(name, "phone1") for name in ("phone12.jpg", "phone.jpg", "phone1b.jpg", "phone10/1.jpg", "1.jpg"))
+
+
+def test_poses_that_do_not_fit_the_videos_are_named(tmp_path):
+    model(tmp_path, binary=False)
+    sizes = {f"phone {i}.mp4": (320, 240) for i in range(3)}
+    phones = read_phones(tmp_path, tmp_path, sizes)
+    np.testing.assert_allclose(phones[1].camera.K[:2], 2 * read_model(tmp_path)["shots/phone 1.jpg"].K[:2])
+    with pytest.raises(DataError, match=r"no pose for .*other\.mp4"):
+        read_phones(tmp_path, tmp_path, {**sizes, "other.mp4": (320, 240)})
+    with pytest.raises(DataError, match=r"frames of 320x180: expected the poses of images with the video's field of view"):
+        read_phones(tmp_path, tmp_path, {**sizes, "phone 1.mp4": (320, 180)})
+    with pytest.raises(DataError, match="at least 3 videos"):
+        read_phones(tmp_path, tmp_path, {"phone 1.mp4": (320, 240)})
+    text = (tmp_path / "images.txt").read_text().replace("phone 2.jpg", "phone 1_7.jpg")
+    (tmp_path / "images.txt").write_text(text)
+    with pytest.raises(DataError, match=r"phone 1 stands elsewhere than in"):
+        read_phones(tmp_path, tmp_path, {k: v for k, v in sizes.items() if "2" not in k})
+    with pytest.raises(DataError, match=r"expected a COLMAP model .* or transforms.json, found neither"):
+        (tmp_path / "empty").mkdir()
+        read_poses(tmp_path / "empty")

@@ -1,0 +1,109 @@
+"""The whole way on a film of a cone, 160 x 120 px: what is found, what is written, what is said of mistakes."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from filming import BODY, CONTACT, HEIGHT, WORLD, filmed, write_films
+from omegaconf import OmegaConf
+
+from mosa.capture.making import capture, make
+from mosa.capture.world import floor_of_points, ground_height, read_world
+from mosa.commands import configuration
+from mosa.data.scene import load_scene
+from mosa.errors import ConfigError, DataError
+
+ROOT = Path(__file__).parents[2]
+
+
+def keys(folder, **changes) -> dict:
+    values = OmegaConf.to_container(OmegaConf.load(Path(configuration()) / "capture.yaml"))
+    values.pop("defaults")
+    return values | {"videos": str(folder / "videos"), "poses": str(folder / "sparse"), "output": str(folder / "scene"),
+                     "max_offset": 0.5} | changes  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def filmed_folder(tmp_path_factory):
+    folder, films = tmp_path_factory.mktemp("capture") / "cone", filmed()
+    write_films(films, folder)
+    return folder, films, capture(keys(folder))
+
+
+def test_scale_up_and_clocks_are_found_and_the_scene_can_be_read(filmed_folder):
+    folder, films, found = filmed_folder
+    true = np.array([film.begin for film in films]) - films[0].begin
+    assert abs(found["scale"] / WORLD[0] - 1) < 0.03 and np.degrees(np.arccos(np.array(found["up"]) @ WORLD[1][:, 1])) < 1
+    assert np.abs(np.array([p["offset"] for p in found["phones"]]) - true).max() < 3e-3
+    scene = load_scene(format="transforms", path=str(folder / "scene"), up=[0, 1, 0], gravity=[0, -9.81, 0], box=found["box"],
+                       ground={"height": 0.0}, scale=1.0)  # fmt: skip
+    assert scene.frames == found["frames"] >= 15 and found["free_frames"] >= 4 and len(scene.cameras) == 6
+    # the cone is 0.2 m high and stands on the floor at contact
+    contact = int(np.searchsorted(np.arange(scene.frames) / found["rate"], CONTACT - films[0].begin - found["start"]))
+    assert abs(scene.times[1] - 1 / 60) < 1e-6 and 0 < contact < scene.frames
+    page = (folder / "scene" / "capture.md").read_text()
+    assert "phone5" in page and found["command"] in page and (folder / "scene" / "contact.png").stat().st_size > 1000
+    assert (folder / "scene" / "fall.png").is_file()
+    assert json.loads((folder / "scene" / "capture.json").read_text()) == found
+
+
+def test_the_ground_is_where_the_cone_lands(filmed_folder):
+    """Its base is flat and wide, which is the worst case: two rows of pixels."""
+    folder, _, found = filmed_folder
+    world = read_world(folder / "scene")
+    scale, R, shift = WORLD
+    floor = world.points(R @ np.zeros(3) / scale + shift)[1]
+    assert abs(floor) < 0.015 and found["ground"]["from"] == "lowest contact" and found["ground"]["sd"] < 0.03
+    assert BODY[-1, 1] == 0.2 and HEIGHT == 0.45
+
+
+def test_a_second_drop_gets_the_first_ones_world_and_points_give_the_floor(filmed_folder, tmp_path):
+    folder, _, found = filmed_folder
+    again = capture(keys(folder, output=str(tmp_path), like=str(folder / "scene"), interpolation="none", rate=30.0))
+    assert again["world"] == found["world"] and again["rate"] == pytest.approx(30) and again["scale_sd"] is None
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.uniform(-1, 1, (60, 3)) * [1, 0.001, 1] + [0, 0.02, 0], rng.uniform(-1, 1, (60, 3))])
+    height, sd, tilt = floor_of_points(points, 0.1, 0.01, 0.05)
+    assert abs(height - 0.02) < 1e-3 and sd < 1e-3 and tilt < 0.5
+    assert floor_of_points(points[60:66], 0.1, 0.01, 0.05) is None
+    with pytest.raises(DataError, match="ground: the object's lowest point is not seen"):
+        ground_height(np.full((5, 2), np.nan), 0.001)
+
+
+def test_mistakes_are_named(filmed_folder, tmp_path):
+    folder, _, _ = filmed_folder
+    with pytest.raises(ConfigError, match=r"phones\.phone9: no video of that name"):
+        capture(keys(folder, phones={"phone9": {"fps": 60}}))
+    with pytest.raises(ConfigError, match=r"phones\.phone1\.speed: expected the keys fps, scan, readout"):
+        capture(keys(folder, phones={"phone1": {"speed": 60}}))
+    with pytest.raises(DataError, match=r"plates: folder .* not found"):
+        capture(keys(folder, plates=str(tmp_path / "none")))
+    with pytest.raises(DataError, match="expected the record of a capture"):
+        (tmp_path / "capture.json").write_text("{}")
+        read_world(tmp_path)
+
+
+def test_keys_are_checked_before_anything_is_read(filmed_folder):
+    folder, _, _ = filmed_folder
+    with pytest.raises(ConfigError, match=r"poses: expected a folder, found none"):
+        make(OmegaConf.create(keys(folder, poses="???")))
+    for wrong, said in ((dict(phones={"phone1": {"scan": "sideways"}}), r"phones\.phone1\.scan: expected auto or down"),
+                        (dict(plate_seconds=[2, 1]), r"plate_seconds: expected two numbers \[from, to\]"),
+                        (dict(fps=0), r"fps: expected a number above 0")):  # fmt: skip
+        with pytest.raises(ConfigError, match=said):
+            make(OmegaConf.create(keys(folder, **wrong)))
+
+
+def test_the_command_ends_in_one_message(filmed_folder, tmp_path):
+    folder, _, _ = filmed_folder
+    shutil.copytree(folder / "videos", tmp_path / "videos")
+    words = ["videos=videos", f"poses={folder / 'sparse'}", "output=scene"]
+    result = subprocess.run([sys.executable, "-m", "mosa.capture", *words], cwd=tmp_path, capture_output=True, text=True,
+                            env=os.environ | {"PYTHONPATH": str(ROOT)})  # fmt: skip
+    assert result.returncode == 2 and "Traceback" not in result.stderr, result.stderr[-2000:]
+    assert "DataError: videos/phone0.mp4: no background plate: expected phone0.png" in result.stderr
