@@ -83,7 +83,8 @@ def test_there_is_one_version_and_every_command_has_its_function():
     for target in project["project"]["scripts"].values():
         module, function = target.split(":")
         assert callable(getattr(__import__(module, fromlist=[function]), function))
-    assert set(project["project"]["scripts"]) == {"mosa-train", "mosa-eval", "mosa-view", "mosa-splats", "mosa-experiment"}
+    assert set(project["project"]["scripts"]) == {"mosa-train", "mosa-eval", "mosa-view", "mosa-splats", "mosa-environments",
+                                               "mosa-experiment"}
 
 
 @pytest.mark.parametrize("flag", ["--help", "-h"])
