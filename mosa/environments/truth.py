@@ -14,6 +14,7 @@ from mosa.data.builtin.published import PublishedMaterial
 from mosa.data.builtin.shapes import SHAPES
 from mosa.data.builtin.takes import built
 from mosa.modules.body import Body
+from mosa.modules.model import Model
 from mosa.modules.simulation_settings import SimulationSettings
 from mosa.modules.start import Start, World
 from mosa.twin import Twin
@@ -50,8 +51,8 @@ class TrueMaterial(nn.Module):
 class TrueBody(Body):
     """The truth's particles with the hidden material: the same in every `variant`."""
 
-    def parts(self, variant: str):
-        return self.material, self.contact, None, None
+    def model(self, variant: str = "adapted") -> Model:
+        return Model(self.material, self.contact)
 
 
 def true_twin(

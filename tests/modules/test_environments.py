@@ -60,6 +60,8 @@ def test_the_truth_is_what_the_films_show():
     assert np.abs(fall.positions[-1] - fall.positions[0])[:, 1].min() > 0.02
     for b in range(2):
         np.testing.assert_allclose(state.positions[b].numpy(), fall.positions[-1], atol=2e-6)
+    again = twin.simulate(variant="prior", frames=film_of.footage.frames)
+    np.testing.assert_allclose(again.x[-1].numpy(), fall.positions[-1], atol=2e-3)  # other substeps
     other = true_twin("tiny", material="isotropic", spacing=0.02)
     assert len(other.body.rest) < 0.5 * len(twin.body.rest) and float(other.body.material.true_kf.abs().max()) == 0
     with pytest.raises(ConfigError, match=r"scene\.name: expected one of the built-in"):
