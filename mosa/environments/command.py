@@ -37,6 +37,7 @@ def setting_of(values: dict) -> Setting:
         if found not in known:
             raise ConfigError(f"{key}: expected one of {', '.join(known)}, found {found!r}")
     fields = TASKS[values["task"]].__dataclass_fields__
+    values["options"] = {key: value for key, value in values["options"].items() if value is not None}
     if unknown := sorted(set(values["options"]) - (set(fields) - {"extents"})):
         raise ConfigError(f"options.{unknown[0]}: expected one of {', '.join(f for f in fields if f != 'extents')}, found it")
     return Setting(
