@@ -231,3 +231,32 @@ CAPTURE: dict[str, Kind] = {
     "colours": one_of("floor", "none"),
 }
 """Of conf/capture.yaml."""
+ENVIRONMENTS: dict[str, Kind] = {
+    **{name: SECTION for name in ("truth", "search", "options")},
+    "task": TEXT,
+    "policy": TEXT,
+    "checkpoint": or_null(TEXT),
+    "simulator": Kind("a name, or a list of names", lambda v: isinstance(v, str) or (NAMES.fits(v) and bool(v))),
+    "seed": whole(0, 2**32 - 1),
+    "seeds": Kind("a list of whole numbers", lambda v: isinstance(v, list) and bool(v) and all(map(whole(0, 2**32 - 1).fits, v))),
+    "trials": COUNT,
+    "device": TEXT,
+    "worlds": or_auto(COUNT),
+    "out": or_null(TEXT),
+    "options.steps": or_null(COUNT),
+    "options.*": or_null(Kind("a number", is_number)),
+    "truth.scene": or_null(TEXT),
+    "truth.spacing": or_null(POSITIVE),
+    "truth.train_spacing": or_null(POSITIVE),
+    "search.iterations": COUNT,
+    "search.batch": COUNT,
+    "search.rate": POSITIVE,
+    "search.clip": POSITIVE,
+    "search.every": COUNT,
+    "search.validation": COUNT,
+    "search.candidates": whole(4),
+    "search.elite": number(0, 1, above=True),
+    "search.spread": POSITIVE,
+    "decisions": COUNT,
+}
+"""Of conf/environments.yaml."""

@@ -84,6 +84,7 @@ def test_there_is_one_version_and_every_command_has_its_function():
         module, function = target.split(":")
         assert callable(getattr(__import__(module, fromlist=[function]), function))
     assert set(project["project"]["scripts"]) == {"mosa-train", "mosa-eval", "mosa-view", "mosa-splats", "mosa-capture",
+                                               "mosa-environments",
                                                "mosa-experiment"}
 
 

@@ -1,0 +1,193 @@
+"""Trials of a task, played in many worlds of a simulator at once: what Gymnasium's classes, the policies and the table stand on."""
+
+from __future__ import annotations
+
+import copy
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from mosa.environments.tasks import LAST, Task, Trials, View
+from mosa.environments.truth import true_twin
+from mosa.episode import TwinState
+from mosa.errors import ConfigError, SimulationDiverged
+from mosa.twin import Twin
+
+SIMULATORS = ("learned", "isotropic", "truth")
+"""The law that a run learned; the calibrated isotropic prior of the same run; the hidden truth of its built-in scene."""
+
+
+@dataclass(frozen=True)
+class Simulator:
+    """A twin and which of its laws is simulated. name: one of `SIMULATORS`."""
+
+    name: str
+    twin: Twin
+    variant: str = "adapted"
+
+
+def simulator_named(
+    name: str, checkpoint: str | Path | None = None, *, scene: str | None = None, device: str = "cpu", spacing: float | None = None
+) -> Simulator:
+    """learned | isotropic: of a run's checkpoint; truth: of the built-in scene that the run learned from, or of `scene`.
+
+    spacing [m]: of the truth's particles, None for the films' own. Errors: ConfigError, DataError naming what is missing.
+    """
+    if name not in SIMULATORS:
+        raise ConfigError(f"simulator: expected one of {', '.join(SIMULATORS)}, found {name!r}")
+    if checkpoint is None and (name != "truth" or scene is None):
+        wanted = "a run's checkpoint, or truth.scene=<a built-in scene>" if name == "truth" else "a run's checkpoint"
+        raise ConfigError(f"checkpoint: expected {wanted} for simulator={name}, found none")
+    learned = None if checkpoint is None else Twin.load(checkpoint, device)
+    if name != "truth":
+        return Simulator(name, learned, "adapted" if name == "learned" else "prior")
+    material, seed = "anisotropic", 0
+    if scene is None:
+        known = learned.config["cfg"]["scene"]
+        if known.get("format") != "builtin":
+            raise ConfigError(f"simulator: expected learned or isotropic for a run on a scene of format {known.get('format')}: the "
+                              "truth is known for built-in scenes only")
+        scene, material, seed = known["name"], known.get("material", material), known.get("seed", seed)
+    return Simulator(name, true_twin(scene, material=material, seed=seed, device=device, spacing=spacing))
+
+
+def look(state: TwinState, weights: Tensor, tool: int | None) -> View:
+    """weights: (N,) shares of the body's mass; tool: number of the driven solid."""
+    x, v = state.positions, state.v.to(weights)
+    share = weights.to(x)[:, None]
+    turned = (share[..., None] * state.F_tot.to(x)).sum(1)[:, :, 1]
+    return View(
+        (share * x).sum(1), (share * v).sum(1), torch.nn.functional.normalize(turned, dim=1), x[..., 1].amin(1),
+        None if tool is None else state.position[:, tool],
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Played:
+    """loss: (B,) of the last moments, with its graph where the play was differentiable; success, diverged: (B,) bool; states: of
+    worlds that were recorded, (x (T, B, N, 3), F_tot (T, B, N, 3, 3), tool (T, B, 3) or None)."""
+
+    loss: Tensor
+    success: Tensor
+    diverged: Tensor
+    states: tuple[Tensor, Tensor, Tensor | None] | None = None
+
+
+class Arena:
+    """`worlds` copies of a simulator's body at a task. One after the other: `reset` with trials, then `step` with actions."""
+
+    def __init__(self, simulator: Simulator, task: Task, worlds: int) -> None:
+        self.simulator, self.task, self.count = simulator, task, worlds
+        twin = copy.copy(simulator.twin)
+        twin.world = task.world(twin.world)
+        self.body, self.worlds = twin.body, twin.worlds(worlds)
+        self.gravity = float(twin.world.gravity.norm())
+        self.weights = (self.body.volume / self.body.volume.sum()).detach()
+        self.rest = (self.body.rest - self.body.center).detach()
+        names = [solid["name"] for solid in task.solids()]
+        self.tool = None if task.tool is None else names.index(task.tool)
+        self.trials: Trials | None = None
+        self.states: list[tuple[Tensor, Tensor, Tensor | None]] | None = None
+
+    def reset(self, trials: Trials, *, differentiable: bool = False, record: bool = False) -> Tensor:
+        """Begin these trials, one a world; the first observation (B, O). Errors: ConfigError."""
+        if len(trials) != self.count:
+            raise ConfigError(f"trials: expected one for each of {self.count} worlds, found {len(trials)}")
+        self.trials, self.differentiable, self.done = trials, differentiable, 0
+        self.diverged = torch.zeros(self.count, dtype=torch.bool)
+        self.last: list[Tensor] = []
+        self.states = [] if record else None
+        self.view: View | None = None
+        if self.task.tool is not None:
+            self._begin(None)
+        return self.task.observe(trials, self.view).cpu()
+
+    def step(self, action: Tensor) -> tuple[Tensor, bool]:
+        """(observation (B, O), whether the episode is over) after actions (B, A) in [-1, 1]; a task of one decision then is."""
+        if self.task.tool is None:
+            self._begin(action)
+            for _ in range(self.task.steps):
+                self._advance(None)
+        else:
+            self._advance(self.task.command(action))
+        return self.task.observe(self.trials, self.view).cpu(), self.done >= self.task.steps
+
+    def loss(self) -> Tensor:
+        """(B,) of the moments seen last; of a world that diverged the loss of a body far away."""
+        found = torch.stack(self.last[-LAST:]).mean(0)
+        return torch.where(self.diverged.to(found.device), found.new_tensor(LOST), found)
+
+    def success(self) -> Tensor:
+        """(B,) bool, now."""
+        return self.task.succeeded(self.trials, self.view).cpu() & ~self.diverged
+
+    def _begin(self, action: Tensor | None) -> None:
+        starts = self.task.starts(self.trials, action, self.rest, self.gravity)
+        state = self.worlds.reset(
+            starts, colliders=self.task.solids(), variant=self.simulator.variant, control_dt=self.task.control_dt,
+            frames=self.task.steps, differentiable=self.differentiable,
+        )  # fmt: skip
+        self._see(state)
+
+    def _advance(self, command) -> None:
+        self.done += 1
+        for _ in range(self.count + 1):
+            try:
+                state = self.worlds.step(command).state
+                break
+            except SimulationDiverged as error:
+                world = world_of(error)
+                if world is None or bool(self.diverged[world]):
+                    raise
+                # the trial is lost; its world goes on from its start, so that the others can
+                self.diverged[world] = True
+                self.worlds.restart([world])
+        self._see(state)
+        self.last.append(self.task.loss(self.trials, self.view))
+
+    def _see(self, state: TwinState) -> None:
+        self.view = look(state, self.weights, self.tool)
+        if self.states is not None:
+            tool = None if self.tool is None else state.position[:, self.tool].detach().cpu()
+            self.states.append((state.positions.detach().cpu(), state.F_tot.detach().cpu(), tool))
+
+
+LOST = 5.0
+"""Loss of a trial whose simulation diverged: log(1 + 12^2)."""
+
+
+def world_of(error: SimulationDiverged) -> int | None:
+    """Number of the world that the message names."""
+    found = re.search(r"world (\d+)", str(error))
+    return int(found.group(1)) if found else None
+
+
+def play(
+    arena: Arena, trials: Trials, policy: Callable[[Tensor], Tensor], *, differentiable: bool = False, record: bool = False
+) -> Played:
+    """All steps of one episode in each world. policy: observations (B, O) to actions (B, A) in [-1, 1]."""
+    with torch.set_grad_enabled(differentiable):
+        seen, over = arena.reset(trials, differentiable=differentiable, record=record), False
+        while not over:
+            seen, over = arena.step(policy(seen))
+        states = None
+        if record:
+            parts = list(zip(*arena.states))
+            states = (torch.stack(parts[0]), torch.stack(parts[1]), None if arena.tool is None else torch.stack(parts[2]))
+        return Played(arena.loss(), arena.success(), arena.diverged, states)
+
+
+def play_all(arena: Arena, trials: Trials, policy: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+    """(loss (n,), success (n,)) of any number of trials, as many at a time as the arena has worlds."""
+    losses, successes = [], []
+    for first in range(0, len(trials), arena.count):
+        which = torch.arange(first, first + arena.count) % len(trials)
+        kept = min(arena.count, len(trials) - first)
+        played = play(arena, trials.select(which), policy)
+        losses.append(played.loss.cpu()[:kept])
+        successes.append(played.success[:kept])
+    return torch.cat(losses), torch.cat(successes)

@@ -1,0 +1,231 @@
+"""The tasks by the conventions of Gymnasium, and its vector environments over worlds. Needs the extra `environments`.
+
+    from mosa.environments.gymnasium_api import TwinEnv, TwinVectorEnv
+    env = TwinVectorEnv("pushing", worlds=32, simulator="learned", checkpoint="outputs/train/.../checkpoints/last.ckpt")
+    observations, _ = env.reset(seed=0)
+
+or, after importing this module, gymnasium.make("mosa/Pushing-v0", checkpoint=...).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mosa.environments.arena import Arena, simulator_named
+from mosa.environments.pictures import picture
+from mosa.environments.tasks import TASKS, Task, task_named
+from mosa.errors import ConfigError
+
+try:
+    import gymnasium
+    from gymnasium import spaces
+    from gymnasium.vector import AutoresetMode, VectorEnv
+    from gymnasium.vector.utils import batch_space
+except ImportError as error:
+    raise ConfigError("mosa.environments.gymnasium_api: expected Gymnasium, found none; pip install 'mosa[environments]' "
+                      "(mosa.environments.arena and the gradient policy work without it)") from error
+
+
+def reinforcement_library():
+    """stable_baselines3. Errors: ConfigError where it is not installed."""
+    try:
+        import stable_baselines3
+    except ImportError as error:
+        raise ConfigError("policy: expected stable-baselines3 for sac and ppo, found none; pip install 'mosa[environments]', or "
+                          "policy=gradient, which needs nothing more") from error
+    return stable_baselines3
+
+
+def arena_of(task: str | Task, worlds: int, simulator: str, checkpoint, scene, device: str, spacing, options: dict | None) -> Arena:
+    """Errors: ConfigError, DataError."""
+    made = simulator_named(simulator, checkpoint, scene=scene, device=device, spacing=spacing)
+    return Arena(made, task if isinstance(task, Task) else task_named(task, made.twin.body.rest, **(options or {})), worlds)
+
+
+def action_space(task: Task) -> spaces.Box:
+    """Numbers in [-1, 1]; what they say is in `task.actions`."""
+    return spaces.Box(-1.0, 1.0, (len(task.actions),), np.float32)
+
+
+def observation_space(task: Task) -> spaces.Box:
+    """Of a start its drawn ranges, a little wider than rounding; of a motion no bounds, as a body may fly anywhere."""
+    if task.tool is not None:
+        return spaces.Box(-np.inf, np.inf, (len(task.observations),), np.float32)
+    low, high = (np.array([getattr(q, side) for q in task.observations], np.float32) for side in ("low", "high"))
+    return spaces.Box(low - 1e-6, high + 1e-6, dtype=np.float32)
+
+
+class _Worlds:
+    """What the environments share: an arena whose trials are drawn from a seed."""
+
+    arena: Arena
+
+    def _draw(self, random: np.random.Generator, record: bool) -> np.ndarray:
+        generator = torch.Generator().manual_seed(int(random.integers(2**62)))
+        task = self.arena.task
+        return _array(self.arena.reset(task.draw(self.arena.count, generator), record=record))
+
+    @torch.no_grad()
+    def _step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+        """(observations (B, O), rewards (B,), whether the episodes are over)."""
+        arena = self.arena
+        seen, over = arena.step(torch.as_tensor(np.asarray(actions, np.float32)).clamp(-1, 1))
+        loss = arena.loss() if arena.task.tool is None else arena.last[-1] / arena.task.steps
+        return _array(seen), -_array(loss).astype(np.float64), over
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().cpu().numpy().astype(np.float32)
+
+
+class TwinEnv(gymnasium.Env, _Worlds):
+    """One body at a task.
+
+    task: placement | hanging | pushing, or a `Task`; simulator: learned | isotropic (of `checkpoint`) | truth (of the built-in
+    scene that it learned from, or of `scene`); spacing [m]: of the truth's particles; options: of the task.
+    Actions: numbers in [-1, 1] that stand for `self.task.actions` (tilts [rad] and aims [m], or velocities [m/s]); observations:
+    `self.task.observations`, in their units. A hand that lets go decides once: its episode has one step, which plays the motion to
+    its end and terminates. A push has `task.steps` steps and is truncated. Reward: minus log(1 + squared misses in tolerances), 0
+    is the most; of a push its share in every step. `info["success"]`: what the table counts.
+    Rendering: `rgb_array`, what it looks like now; `rgb_array_list`, the last episode.
+    """
+
+    metadata: ClassVar[dict] = {"render_modes": ["rgb_array", "rgb_array_list"], "render_fps": 25}
+
+    def __init__(
+        self, task: str | Task = "pushing", *, simulator: str = "learned", checkpoint: str | Path | None = None,
+        scene: str | None = None, device: str = "cpu", spacing: float | None = None, options: dict | None = None,
+        render_mode: str | None = None, size: int = 240,
+    ) -> None:  # fmt: skip
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ConfigError(f"render_mode: expected one of {', '.join(self.metadata['render_modes'])}, found {render_mode!r}")
+        self.arena = arena_of(task, 1, simulator, checkpoint, scene, device, spacing, options)
+        self.task, self.render_mode, self.size = self.arena.task, render_mode, size
+        self.action_space, self.observation_space = action_space(self.task), observation_space(self.task)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        return self._draw(self.np_random, self.render_mode is not None)[0], {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        seen, reward, over = self._step(np.asarray(action)[None])
+        decided = self.task.tool is None
+        info = {"success": bool(self.arena.success()[0]), "diverged": bool(self.arena.diverged[0])}
+        return seen[0], float(reward[0]), over and decided, over and not decided, info
+
+    def render(self) -> np.ndarray | list[np.ndarray] | None:
+        if self.render_mode is None:
+            return None
+        shots = self.arena.states or [held(self.arena)]
+        pictures = [picture(self.arena, x[0], F[0], None if tool is None else tool[0], self.size)
+                    for x, F, tool in (shots if self.render_mode == "rgb_array_list" else shots[-1:])]  # fmt: skip
+        return pictures if self.render_mode == "rgb_array_list" else pictures[-1]
+
+
+def held(arena: Arena) -> tuple[Tensor, Tensor, None]:
+    """(x (B, N, 3), F_tot (B, N, 3, 3), None) of bodies in the hand, before it has decided: as if it aimed at the middle."""
+    nothing = torch.zeros(arena.count, len(arena.task.actions))
+    starts = arena.task.starts(arena.trials, nothing, arena.rest, arena.gravity)
+    turns = torch.stack([start["rotation"] for start in starts]).to(arena.rest)
+    x = arena.rest @ turns.mT
+    place = torch.stack([torch.as_tensor(start["position"]) for start in starts]).to(arena.rest)
+    place[:, 1] = torch.stack([torch.as_tensor(start["height"]) for start in starts]).to(arena.rest) - x[..., 1].amin(1)
+    return x + place[:, None], turns[:, None].expand(*x.shape, 3), None
+
+
+class TwinVectorEnv(VectorEnv, _Worlds):
+    """`worlds` bodies at a task, stepped together: on a GPU in the same launches. Arguments, actions, observations and rewards as
+    `TwinEnv`. All episodes end at once and begin anew in the same step (`AutoresetMode.SAME_STEP`): its observations are those of
+    the new trials, `info["final_obs"]` and `info["final_info"]["success"]` those of the ended ones."""
+
+    metadata: ClassVar[dict] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
+
+    def __init__(
+        self, task: str | Task = "pushing", worlds: int = 8, *, simulator: str = "learned", checkpoint: str | Path | None = None,
+        scene: str | None = None, device: str = "cpu", spacing: float | None = None, options: dict | None = None,
+    ) -> None:  # fmt: skip
+        self.arena = arena_of(task, worlds, simulator, checkpoint, scene, device, spacing, options)
+        self.task, self.num_envs, self.render_mode = self.arena.task, worlds, None
+        self.single_action_space, self.single_observation_space = action_space(self.task), observation_space(self.task)
+        self.action_space = batch_space(self.single_action_space, worlds)
+        self.observation_space = batch_space(self.single_observation_space, worlds)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        if seed is not None:
+            self._np_random, self._np_random_seed = gymnasium.utils.seeding.np_random(seed)
+        return self._draw(self.np_random, False), {}
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
+        seen, rewards, over = self._step(actions)
+        ended, never = np.full(self.num_envs, over), np.zeros(self.num_envs, bool)
+        info: dict[str, Any] = {"success": self.arena.success().numpy(), "diverged": self.arena.diverged.numpy().copy()}
+        if over:
+            last = np.empty(self.num_envs, dtype=object)
+            last[:] = list(seen)
+            info = {"final_obs": last, "_final_obs": ended.copy(), "final_info": info, "_final_info": ended.copy()}
+            seen = self._draw(self.np_random, False)
+        return (seen, rewards, ended, never, info) if self.task.tool is None else (seen, rewards, never, ended, info)
+
+
+for _name in TASKS:
+    gymnasium.register(id=f"mosa/{_name.capitalize()}-v0", entry_point=f"{__name__}:TwinEnv",
+                       vector_entry_point=f"{__name__}:_vector", kwargs={"task": _name})  # fmt: skip
+
+
+def _vector(num_envs: int = 8, **arguments) -> TwinVectorEnv:
+    """What gymnasium.make_vec calls."""
+    return TwinVectorEnv(worlds=num_envs, **arguments)
+
+
+def library_worlds(arena: Arena, seed: int):
+    """The arena as stable-baselines3's own kind of vector environment (`VecEnv`), whose `finished` keeps (decisions so far, reward,
+    success) of every episode."""
+    reinforcement_library()
+    from stable_baselines3.common.vec_env import VecEnv
+
+    class LibraryWorlds(VecEnv, _Worlds):
+        def __init__(self) -> None:
+            self.arena, self.render_mode, self.finished, self.decisions = arena, None, [], 0
+            super().__init__(arena.count, observation_space(arena.task), action_space(arena.task))
+            self.random, self.earned = np.random.default_rng(seed), np.zeros(arena.count)
+
+        def reset(self) -> np.ndarray:
+            self.earned[:] = 0
+            return self._draw(self.random, False)
+
+        def step_async(self, actions: np.ndarray) -> None:
+            self.actions = actions
+
+        def step_wait(self):
+            seen, rewards, over = self._step(self.actions)
+            self.decisions += self.num_envs
+            self.earned += rewards
+            infos: list[dict] = [{} for _ in range(self.num_envs)]
+            if over:
+                success = self.arena.success().tolist()
+                self.finished += [(self.decisions, value, won) for value, won in zip(self.earned.tolist(), success)]
+                infos = [{"terminal_observation": last, "TimeLimit.truncated": self.arena.task.tool is not None} for last in seen]
+                seen = self.reset()
+            return seen, rewards.astype(np.float32), np.full(self.num_envs, over), infos
+
+        def close(self) -> None:
+            pass
+
+        def get_attr(self, attr_name: str, indices=None) -> list:
+            return [getattr(self, attr_name)] * self.num_envs
+
+        def set_attr(self, attr_name: str, value, indices=None) -> None:
+            raise NotImplementedError("the worlds share one arena")
+
+        def env_method(self, method_name: str, *args, indices=None, **kwargs) -> list:
+            raise NotImplementedError("the worlds share one arena")
+
+        def env_is_wrapped(self, wrapper_class, indices=None) -> list[bool]:
+            return [False] * self.num_envs
+
+    return LibraryWorlds()

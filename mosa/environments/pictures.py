@@ -1,0 +1,127 @@
+"""What a camera sees of a task: the body's Gaussians among its solids and on the ground, which are drawn as Gaussians too."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mosa.analysis.figures import label, to_uint8, write_strip, write_video
+from mosa.environments.arena import Arena
+from mosa.modules.carried_splats import Seen, seen
+from mosa.physics.contact.motion import exponential
+from mosa.rendering.cameras import look_at
+from mosa.rendering.spherical_harmonics import constant_coefficients
+from mosa.types import Cameras
+
+PITCH = 0.011
+"""[m] between the Gaussians of a solid."""
+GROUND, TILE = 0.6, 0.03
+"""Half width of the ground that is drawn [m], and its pitch."""
+COLORS = {"box": (0.96, 0.96, 0.95), "paddle": (0.25, 0.45, 0.75), "arm left": (0.55, 0.57, 0.62), "arm right": (0.55, 0.57, 0.62),
+          "column": (0.45, 0.47, 0.52)}  # fmt: skip
+SKY = (0.80, 0.86, 0.92)
+
+
+def lattice(a: float, b: float, pitch: float) -> Tensor:
+    """(K, 2) points of a rectangle with edges a and b [m] about 0."""
+    ends = [max(2, round(edge / pitch)) for edge in (a, b)]
+    return torch.cartesian_prod(*(torch.linspace(-0.5 * edge, 0.5 * edge, n) for edge, n in zip((a, b), ends)))
+
+
+def box_surface(size: Sequence[float]) -> Tensor:
+    """(K, 3) points on a box with these edges [m]."""
+    faces = []
+    for axis in range(3):
+        u, v = (i for i in range(3) if i != axis)
+        flat = lattice(size[u], size[v], PITCH)
+        for side in (-0.5, 0.5):
+            face = torch.zeros(len(flat), 3)
+            face[:, u], face[:, v], face[:, axis] = flat[:, 0], flat[:, 1], side * size[axis]
+            faces.append(face)
+    return torch.cat(faces)
+
+
+def capsule_surface(radius: float, length: float) -> Tensor:
+    """(K, 3) points on a capsule along z [m]; its ends are left open."""
+    around = torch.linspace(0, 2 * torch.pi, max(8, round(2 * torch.pi * radius / PITCH)) + 1)[:-1]
+    along = torch.linspace(-0.5 * length - 0.6 * radius, 0.5 * length + 0.6 * radius, max(2, round(length / PITCH)))
+    angle, z = torch.cartesian_prod(around, along).unbind(1)
+    return torch.stack([radius * angle.cos(), radius * angle.sin(), z], 1)
+
+
+def solid_surface(solid: Mapping[str, Any], place: Tensor | None) -> Tensor:
+    """(K, 3) [m], where the solid is described, or at `place`. Rotations are (axis, degrees)."""
+    points = box_surface(solid["size"]) if solid["type"] == "box" else capsule_surface(solid["radius"], solid["length"])
+    if (turn := solid.get("rotation")) is not None:
+        axis = torch.tensor(turn[:3], dtype=torch.float64)
+        points = points @ exponential(torch.deg2rad(torch.tensor(turn[3], dtype=torch.float64)) * axis / axis.norm()).float().T
+    return points + (torch.tensor(solid["position"], dtype=torch.float32) if place is None else place.float())
+
+
+def scenery(solids: Sequence[Mapping[str, Any]], tool: int | None, place: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """(means (K, 3), standard deviations (K,) [m], colours (K, 3)) of ground and solids. tool: number of the solid at `place`."""
+    flat = lattice(2 * GROUND, 2 * GROUND, TILE)
+    ground = torch.stack([flat[:, 0], torch.full((len(flat),), -0.5 * TILE), flat[:, 1]], 1)
+    tiles = ((flat / 0.12).floor().sum(1) % 2)[:, None] * torch.tensor([0.08, 0.08, 0.08]) + torch.tensor([0.66, 0.65, 0.62])
+    parts = [(ground, torch.full((len(ground),), 0.5 * TILE), tiles)]
+    for k, solid in enumerate(solids):
+        points = solid_surface(solid, place if k == tool else None)
+        color = torch.tensor(COLORS.get(solid["name"], (0.5, 0.5, 0.5)))
+        # a little darker below: edges then show without a light
+        shade = 0.8 + 0.2 * (points[:, 1:2] - points[:, 1].min()) / (points[:, 1].max() - points[:, 1].min()).clamp_min(1e-6)
+        parts.append((points, torch.full((len(points),), 0.45 * PITCH), color * shade))
+    return tuple(torch.cat(values) for values in zip(*parts))
+
+
+def camera_of(arena: Arena, size: int) -> Cameras:
+    """One camera that sees what the body falls on, or the way that it is pushed."""
+    focal = 1.5 * size
+    top = getattr(arena.task, "top", 0.1)
+    target = torch.tensor([0.05, top + 0.05, 0.0])
+    eye = target + torch.tensor([0.55, 0.42, 1.05])
+    K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
+    device = arena.rest.device
+    w2c = look_at(eye, target, torch.tensor([0.0, 1.0, 0.0]))
+    return Cameras(K[None].to(device), w2c[None].to(device), size, size, ("view",))
+
+
+@torch.no_grad()
+def picture(arena: Arena, x: Tensor, F_tot: Tensor, tool: Tensor | None, size: int = 240) -> np.ndarray:
+    """(size, size, 3) uint8 of a body with particles x (N, 3) [m], F_tot (N, 3, 3), and the tool at (3,) [m]."""
+    device = arena.rest.device
+    body = seen(arena.body, x[None].to(arena.rest), F_tot[None].to(arena.rest))
+    means, widths, colors = (part.to(arena.rest) for part in scenery(arena.task.solids(), arena.tool, tool))
+    round_ = widths.square()[:, None, None] * torch.eye(3, device=device)
+    everything = Seen(
+        torch.cat([body.means[0], means])[None], torch.cat([body.covariances[0], round_])[None],
+        torch.cat([body.opacities, torch.full_like(widths, 0.95)]),
+        constant_coefficients(torch.cat([body.colors()[0], colors])),
+    )  # fmt: skip
+    image = everything.images(camera_of(arena, size), torch.tensor(SKY).to(arena.rest))[0, 0]
+    return to_uint8(image.clamp(0, 1).cpu())
+
+
+def film(arena: Arena, states: tuple[Tensor, Tensor, Tensor | None], world: int, frames: int, size: int = 240) -> list[np.ndarray]:
+    """`frames` pictures, from the first to the last moment, of one recorded world (`Played.states`)."""
+    x, F_tot, tool = states
+    chosen = np.linspace(0, len(x) - 1, min(frames, len(x))).round().astype(int)
+    return [picture(arena, x[t, world], F_tot[t, world], None if tool is None else tool[t, world], size) for t in chosen]
+
+
+def write_films(folder: Path, films: Mapping[str, list[np.ndarray]], name: str) -> list[Path]:
+    """`<name>.png`, a row of pictures for each film, and `<name>.mp4` with the films beside each other; where no ffmpeg is
+    installed only the former. The paths written."""
+    count = min(len(pictures) for pictures in films.values())
+    rows = {title: np.stack(pictures[:count]) for title, pictures in films.items()}
+    written = [write_strip(folder / f"{name}.png", rows, frames=6)]
+    frames = [np.concatenate([label(rows[title][t], title) for title in rows], 1) for t in range(count)]
+    try:
+        written.append(write_video(folder / f"{name}.mp4", frames, fps=12))
+    except (ImportError, RuntimeError, ValueError, OSError):  # imageio without ffmpeg says it in several ways
+        (folder / f"{name}.mp4").unlink(missing_ok=True)
+    return written

@@ -1,0 +1,204 @@
+"""Policies of few numbers, and how they are found: by gradients through the simulator, or by reinforcement learning."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from mosa.environments.arena import Arena, play, play_all
+from mosa.environments.tasks import Task
+from mosa.errors import ConfigError, DataError
+
+METHODS = ("gradient", "cem", "sac", "ppo")
+
+
+class LinearPolicy(nn.Module):
+    """Actions tanh(W o + b) in [-1, 1] of observations scaled to their ranges: (O + 1) A numbers, 16 for a release and 18 for the
+    paddle. It begins as the task says: with weights 0, at the middle of what may be asked of a hand."""
+
+    def __init__(self, task: Task) -> None:
+        super().__init__()
+        low, high = (torch.tensor([getattr(q, side) for q in task.observations]) for side in ("low", "high"))
+        self.register_buffer("middle", 0.5 * (low + high))
+        self.register_buffer("spread", 0.5 * (high - low))
+        weight, bias = task.starting_weights()
+        self.weight, self.bias = nn.Parameter(weight.clone()), nn.Parameter(bias.clone())
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """(B, A) of (B, O)."""
+        return torch.tanh((observation.to(self.weight) - self.middle) / self.spread @ self.weight.T + self.bias)
+
+    def written(self) -> dict[str, list]:
+        """Plain numbers, fit for JSON; `read` gives the same policy."""
+        return {name: value.tolist() for name, value in self.state_dict().items()}
+
+    @classmethod
+    def read(cls, task: Task, written: Mapping[str, Any]) -> LinearPolicy:
+        """Errors: DataError where it is no policy of this task."""
+        policy = cls(task)
+        try:
+            policy.load_state_dict({name: torch.tensor(value) for name, value in written.items()})
+        except (RuntimeError, TypeError, ValueError) as error:
+            reason = " ".join(str(error).split())[:200]
+            raise DataError(f"policy: expected the numbers of a policy for {task.name}, found {reason}") from error
+        return policy
+
+
+@dataclass(frozen=True)
+class Search:
+    """Of a policy's numbers. iterations, each on `batch` newly drawn trials; every `every` of them the policy is tried on
+    `validation` trials of the simulator it is trained in, and the best one is kept.
+
+    By gradients: Adam at `rate`; `clip`: largest norm of a trial's gradient with respect to one action, as one that bounces off an
+    edge may have any. By the cross-entropy method: `candidates` policies an iteration, drawn with a standard deviation of `spread`
+    at first, of which the best `elite` share gives the next mean and spread."""
+
+    iterations: int = 60
+    batch: int = 16
+    rate: float = 0.02
+    clip: float = 0.5
+    every: int = 10
+    validation: int = 32
+    candidates: int = 32
+    elite: float = 0.2
+    spread: float = 0.4
+
+
+@dataclass(frozen=True)
+class Found:
+    """policy: (B, O) to (B, A); history: one entry for each look at it; seconds: of the search; trials: played."""
+
+    policy: Callable[[Tensor], Tensor]
+    history: list[dict[str, float]]
+    seconds: float
+    trials: int
+
+
+def by_gradient(
+    train: Arena, check: Arena, search: Search, seed: int, say: Callable[[str], None] = lambda line: None
+) -> Found:
+    """The mean loss descended through the simulator, contact and all. train, check: of the same simulator and task."""
+    began, task = time.perf_counter(), train.task
+    generator = torch.Generator().manual_seed(seed)
+    validation = task.draw(search.validation, torch.Generator().manual_seed(10**6 + seed))
+    policy, history, played = LinearPolicy(task), [], 0
+    optimiser = torch.optim.Adam(policy.parameters(), lr=search.rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, search.iterations, 0.1 * search.rate)
+    best: tuple[float, dict] = (math.inf, {})
+
+    def bounded(observation: Tensor) -> Tensor:
+        action = policy(observation)
+        action.register_hook(lambda g: _clipped(g, search.clip))
+        return action
+
+    for iteration in range(search.iterations + 1):
+        if iteration % search.every == 0 or iteration == search.iterations:
+            loss, success = play_all(check, validation, policy)
+            played += len(validation)
+            history.append({"iteration": iteration, "loss": float(loss.mean()), "success": float(success.float().mean())})
+            say(f"iteration {iteration}: loss {history[-1]['loss']:.3f}, success {history[-1]['success']:.2f}")
+            if history[-1]["loss"] < best[0]:
+                best = history[-1]["loss"], {name: value.clone() for name, value in policy.state_dict().items()}
+        if iteration == search.iterations:
+            break
+        outcome = play(train, task.draw(train.count, generator), bounded, differentiable=True)
+        played += train.count
+        optimiser.zero_grad()
+        kept = (~outcome.diverged).to(outcome.loss)
+        if bool(kept.any()):
+            (outcome.loss * kept).sum().backward()
+            for parameter in policy.parameters():  # the mean of clipped trials
+                parameter.grad /= train.count
+            optimiser.step()
+        schedule.step()
+    policy.load_state_dict(best[1])
+    return Found(policy.requires_grad_(False), history, time.perf_counter() - began, played)
+
+
+@torch.no_grad()
+def by_elites(train: Arena, check: Arena, search: Search, seed: int, say: Callable[[str], None] = lambda line: None) -> Found:
+    """The cross-entropy method: candidates are compared on the same trials, and gradients are not used. train, check: of the same
+    simulator and task, the former with `search.candidates` times `search.batch` worlds."""
+    began, task, count = time.perf_counter(), train.task, search.candidates
+    if train.count != count * search.batch:
+        raise ConfigError(f"search: expected {count} candidates times {search.batch} trials as worlds, found {train.count}")
+    generator = torch.Generator().manual_seed(seed)
+    validation = task.draw(search.validation, torch.Generator().manual_seed(10**6 + seed))
+    policy, history, played = LinearPolicy(task), [], 0
+    mean = torch.nn.utils.parameters_to_vector(policy.parameters()).clone()
+    spread, best = torch.full_like(mean, search.spread), (math.inf, mean.clone())
+    elites = max(2, round(search.elite * count))
+    for iteration in range(search.iterations + 1):
+        if iteration % search.every == 0 or iteration == search.iterations:
+            torch.nn.utils.vector_to_parameters(mean, policy.parameters())
+            loss, success = play_all(check, validation, policy)
+            played += len(validation)
+            history.append({"iteration": iteration, "loss": float(loss.mean()), "success": float(success.float().mean())})
+            say(f"iteration {iteration}: loss {history[-1]['loss']:.3f}, success {history[-1]['success']:.2f}")
+            if history[-1]["loss"] < best[0]:
+                best = history[-1]["loss"], mean.clone()
+        if iteration == search.iterations:
+            break
+        drawn = mean + spread * torch.randn(count, len(mean), generator=generator)
+        drawn[0] = mean
+        trials = task.draw(search.batch, generator)
+        outcome = play(train, trials.select(torch.arange(search.batch).repeat(count)), _side_by_side(policy, drawn, search.batch))
+        played += train.count
+        order = outcome.loss.cpu().view(count, search.batch).mean(1).argsort()
+        chosen = drawn[order[:elites]]
+        # the spread falls by half at most in one iteration: a few elites agree by chance
+        mean, spread = chosen.mean(0), torch.maximum(chosen.std(0), 0.5 * spread)
+    torch.nn.utils.vector_to_parameters(best[1], policy.parameters())
+    return Found(policy.requires_grad_(False), history, time.perf_counter() - began, played)
+
+
+def _side_by_side(policy: LinearPolicy, numbers: Tensor, batch: int) -> Callable[[Tensor], Tensor]:
+    """Policies of numbers (P, (O + 1) A), the first in the first `batch` worlds, and so on."""
+    actions, seen = policy.weight.shape
+    weight = numbers[:, : actions * seen].view(-1, actions, seen).repeat_interleave(batch, 0)
+    bias = numbers[:, actions * seen :].repeat_interleave(batch, 0)
+
+    def act(observation: Tensor) -> Tensor:
+        scaled = (observation.to(weight) - policy.middle) / policy.spread
+        return torch.tanh((weight @ scaled[..., None])[..., 0] + bias)
+
+    return act
+
+
+def _clipped(gradient: Tensor, most: float) -> Tensor:
+    """Rows (B, A) of at most that norm; 0 where one is not finite."""
+    gradient = torch.where(torch.isfinite(gradient).all(1, keepdim=True), gradient, torch.zeros_like(gradient))
+    return gradient * (most / gradient.norm(dim=1, keepdim=True).clamp_min(1e-12)).clamp_max(1.0)
+
+
+def by_reinforcement(method: str, train: Arena, steps: int, seed: int, options: Mapping[str, Any] | None = None) -> Found:
+    """stable-baselines3's SAC or PPO on the arena's worlds. steps: decisions in all worlds together; options: of the algorithm.
+
+    Errors: ConfigError for another method, or where stable-baselines3 is not installed."""
+    if method not in METHODS[2:]:
+        raise ConfigError(f"policy: expected one of {', '.join(METHODS)}, found {method!r}")
+    from mosa.environments.gymnasium_api import library_worlds, reinforcement_library
+
+    library = reinforcement_library()
+    began = time.perf_counter()
+    worlds = library_worlds(train, seed)
+    given = {"sac": {"learning_starts": 4 * train.count, "batch_size": 64, "gradient_steps": -1, "train_freq": 1,
+                     "policy_kwargs": {"net_arch": [64, 64]}},
+             "ppo": {"n_steps": max(2, train.task.steps if train.task.tool else 4), "batch_size": 64,
+                     "policy_kwargs": {"net_arch": [64, 64]}}}[method] | dict(options or {})  # fmt: skip
+    model = getattr(library, method.upper())("MlpPolicy", worlds, seed=seed, device="cpu", verbose=0, **given)
+    model.learn(steps)
+
+    def policy(observation: Tensor) -> Tensor:
+        action, _ = model.predict(observation.detach().cpu().numpy(), deterministic=True)
+        return torch.as_tensor(action).clamp(-1, 1)
+
+    episodes = worlds.finished
+    history = [{"iteration": k, "loss": float(-value), "success": float(success)} for k, value, success in episodes]
+    return Found(policy, history, time.perf_counter() - began, len(episodes))

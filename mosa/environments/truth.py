@@ -1,0 +1,94 @@
+"""The hidden truth of a built-in scene as a twin: it is reset, stepped and put into many worlds as a learned one is."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from mosa.data.builtin import BOX
+from mosa.data.builtin.drop import CONTACT_CELLS, COURANT, GRAVITY, place
+from mosa.data.builtin.hidden import Hidden
+from mosa.data.builtin.objects import drop_named, object_named
+from mosa.data.builtin.published import PublishedMaterial
+from mosa.data.builtin.shapes import SHAPES
+from mosa.data.builtin.takes import built
+from mosa.modules.body import Body
+from mosa.modules.model import Model
+from mosa.modules.simulation_settings import SimulationSettings
+from mosa.modules.start import Start, World
+from mosa.twin import Twin
+from mosa.types import Ground
+
+MAX_SUBSTEPS = 5000
+APPEARANCE = (0.8, 0.35)
+"""Opacity of a particle in pictures, and its standard deviation in spacings."""
+
+
+class TrueMaterial(nn.Module):
+    """A hidden material where a `Body` asks for its law: nothing of it is learned."""
+
+    def __init__(self, hidden: Hidden | PublishedMaterial, rest: Tensor) -> None:
+        super().__init__()
+        self.law, self.hidden = hidden.law, hidden
+        self.names = tuple(hidden.parameters(rest))
+        for name, value in hidden.parameters(rest).items():
+            self.register_buffer(f"true_{name}", value)
+
+    def per_particle(self, factor: Tensor | float = 1.0) -> dict[str, Tensor]:
+        """Values the simulator takes, (N,) or (N, k); the stiffness's own variation is among them, `factor` is the learner's."""
+        return {name: getattr(self, f"true_{name}") for name in self.names}
+
+    def max_modulus(self, factor: Tensor | float = 1.0) -> float:
+        """P wave modulus [Pa]."""
+        return self.hidden.wave_modulus()
+
+    def max_viscosity(self, factor: Tensor | float = 1.0) -> float:
+        """[Pa s]."""
+        return self.hidden.viscosity()
+
+
+class TrueBody(Body):
+    """The truth's particles with the hidden material: the same in every `variant`."""
+
+    def model(self, variant: str = "adapted") -> Model:
+        return Model(self.material, self.contact)
+
+
+def true_twin(
+    name: str, sequence: str = "train", *, material: str = "anisotropic", seed: int = 0, device: str = "cpu",
+    spacing: float | None = None,
+) -> Twin:  # fmt: skip
+    """A twin of what a built-in scene's films show: particles, grid, hidden law and contact are those of `data.builtin.drop`.
+
+    name: of the scene; sequence: whose start is the training start; material: anisotropic | isotropic; seed: of the scene's
+    particles; spacing [m]: of the particles, None for the films' own (a coarser one is a quicker, poorer truth).
+    Rest positions are those of the training sequence's frame 0, as a learned twin's are. Errors: ConfigError naming the key.
+    """
+    body, drop = object_named(name), drop_named(name, sequence)
+    spacing = body.spacing if spacing is None else float(spacing)
+    surface, particles, _ = built(body.shape, body.pitch, spacing, seed)
+    hidden = body.material.variant(material)
+    center = particles.mean(0)
+    center[[0, 2]] = 0.0
+    rest, _ = place(particles, center, drop_named(name, "train"), surface.vertices)
+    begun, _ = place(particles, center, drop, surface.vertices)
+    colors = SHAPES[body.shape].color(particles, np.random.default_rng([seed, 1]))
+    opacity, width = APPEARANCE
+    n, dx = len(rest), 2 * spacing
+    points = torch.tensor(rest, dtype=torch.float32)
+    made = TrueBody(
+        rest=points, volume=torch.full((n,), spacing**3), colors=torch.tensor(colors, dtype=torch.float32),
+        opacities=torch.full((n,), opacity), covariances=((width * spacing) ** 2 * torch.eye(3)).repeat(n, 1, 1),
+        density=hidden.density, material=TrueMaterial(hidden, points), heterogeneity=None, adapter=None,
+        settings=SimulationSettings(dx=dx, stride=1, max_substeps=MAX_SUBSTEPS, courant=COURANT), law_options=hidden.options,
+    )  # fmt: skip
+    with torch.no_grad():
+        made.contact.cells.fill_(CONTACT_CELLS)
+    made.requires_grad_(False)
+    tensor = lambda a: torch.tensor(a, dtype=torch.float32)  # noqa: E731
+    reach = BOX[1][0] if body.reach is None else body.reach
+    box = torch.tensor([[-reach, BOX[0][1], -reach], [reach, BOX[1][1], reach]])
+    world = World(Ground(0.0, "sticky"), tensor(GRAVITY), torch.tensor([0.0, 1.0, 0.0]), box)
+    start = Start(tensor(drop.rotation), tensor(begun.mean(0)), tensor([0.0, -drop.speed, 0.0]), torch.zeros(3))
+    return Twin(made.to(device).eval(), world, 1 / body.footage.fps, {}, start)

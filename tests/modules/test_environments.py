@@ -1,0 +1,310 @@
+"""Tasks on a body of 120 particles: what success is, trials in many worlds, the search by gradients, the table, and the truth as a
+twin."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+from small_bodies import small_body, start
+
+from mosa.data.builtin.drop import simulate
+from mosa.data.builtin.objects import object_named
+from mosa.data.builtin.takes import built
+from mosa.environments import command, study
+from mosa.environments.arena import LOST, Arena, Simulator, play, play_all, simulator_named, world_of
+from mosa.environments.pictures import film
+from mosa.environments.policies import LinearPolicy, Search, _side_by_side, by_elites, by_gradient, by_reinforcement
+from mosa.environments.study import Bench, Setting
+from mosa.environments.tasks import CLEARANCE, TASKS, View, task_named
+from mosa.environments.truth import true_twin
+from mosa.errors import ConfigError, DataError, SimulationDiverged
+from mosa.modules.start import World
+from mosa.twin import Twin
+from mosa.types import Ground
+
+WORLD = World(Ground(0.0, "sticky"), torch.tensor([0.0, -9.8, 0.0]), torch.tensor([0.0, 1.0, 0.0]),
+              torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))  # fmt: skip
+SHORT = {"placement": 8, "hanging": 8, "pushing": 8}
+
+
+def simulator(name="learned", E=6e4, precision=32):
+    body = small_body(precision=precision, contact=True, adapter=False, E=E)
+    dtype = torch.float64 if precision == 64 else torch.float32
+    return Simulator(name, Twin(body, WORLD, 1 / 60, {}, start(dtype=dtype)))
+
+
+def arena(task="pushing", worlds=3, steps=None, precision=32, **options):
+    made = simulator(precision=precision)
+    return Arena(made, task_named(task, made.twin.body.rest, steps=steps or SHORT[task], **options), worlds)
+
+
+def drawn(made, count, seed=0):
+    return made.task.draw(count, torch.Generator().manual_seed(seed))
+
+
+def test_the_truth_is_what_the_films_show():
+    """Also of a drop that was not for training, and in two worlds."""
+    film_of, sequence = object_named("tiny"), "test_60"
+    surface, particles, _ = built(film_of.shape, film_of.pitch, film_of.spacing, 0)
+    drops = film_of.drops
+    fall = simulate(film_of, film_of.material, particles, surface.vertices, drops[sequence], drops["train"])
+    twin = true_twin("tiny", sequence)
+    np.testing.assert_allclose(twin.body.rest.numpy(), fall.rest, atol=1e-6)
+    worlds = twin.worlds(2)
+    worlds.reset(substeps=fall.substeps)
+    for _ in range(1, film_of.footage.frames):
+        state, _ = worlds.step()
+    assert np.abs(fall.positions[-1] - fall.positions[0])[:, 1].min() > 0.02
+    for b in range(2):
+        np.testing.assert_allclose(state.positions[b].numpy(), fall.positions[-1], atol=2e-6)
+    again = twin.simulate(variant="prior", frames=film_of.footage.frames)
+    np.testing.assert_allclose(again.x[-1].numpy(), fall.positions[-1], atol=2e-3)  # other substeps
+    other = true_twin("tiny", material="isotropic", spacing=0.02)
+    assert len(other.body.rest) < 0.5 * len(twin.body.rest) and float(other.body.material.true_kf.abs().max()) == 0
+    with pytest.raises(ConfigError, match=r"scene\.name: expected one of the built-in"):
+        true_twin("unicorn")
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_the_sizes_follow_from_the_body_and_numbers_have_units(name):
+    task = task_named(name, torch.tensor([[0.0, 0, 0], [0.2, 0.24, 0.16]]))
+    double = task_named(name, torch.tensor([[0.0, 0, 0], [0.4, 0.48, 0.32]]))
+    assert [s["name"] for s in task.solids()] == [s["name"] for s in double.solids()] != []
+    for quantity in (*task.actions, *task.observations, *task.drawn[0], *task.drawn[1]):
+        assert quantity.unit in ("m", "rad", "m/s", "1") and quantity.low < quantity.high
+    low, high = task.physical(-torch.ones(1, len(task.actions))), task.physical(torch.ones(1, len(task.actions)))
+    assert low[0].tolist() == pytest.approx([q.low for q in task.actions])
+    assert high[0].tolist() == pytest.approx([q.high for q in task.actions])
+    a, b = (task.draw(5, torch.Generator().manual_seed(s)) for s in (1, 2))
+    assert not torch.equal(a.observed, b.observed)
+    assert torch.equal(a.observed, task.draw(5, torch.Generator().manual_seed(1)).observed)
+    with pytest.raises(ConfigError, match=r"up = \[0, 1, 0\]"):
+        task.world(replace(WORLD, up=torch.tensor([0.0, 0.0, 1.0])))
+    with pytest.raises(ConfigError, match="task: expected one of placement, hanging, pushing"):
+        task_named("juggling", torch.zeros(2, 3))
+
+
+def view(task, center=(0.0, 0.0, 0.0), lean=0.0, lowest=0.0, speed=0.0):
+    up = torch.tensor([[np.sin(lean), np.cos(lean), 0.0]]).float()
+    return View(torch.tensor([center]), torch.tensor([[speed, 0.0, 0.0]]), up, torch.tensor([lowest]), torch.zeros(1, 3))
+
+
+def test_success_is_what_the_task_says_and_the_loss_falls_towards_it():
+    rest = torch.tensor([[0.0, 0, 0], [0.2, 0.24, 0.16]])
+    placement, hanging, pushing = (task_named(name, rest) for name in TASKS)
+    nothing = {task.name: task.draw(1, torch.Generator()) for task in (placement, hanging, pushing)}
+    top, under = placement.top, hanging.top
+    tx, tz = nothing["pushing"].observed[0].tolist()
+    good = {placement: {"center": (0.01, top + 0.1, 0.0), "lowest": top},
+            hanging: {"center": (0.01, under, 0.0), "lowest": under - 0.04}, pushing: {"center": (tx, 0.1, tz)}}  # fmt: skip
+    bad = {placement: ({"center": (0.08, top + 0.1, 0.0)}, {"lean": 0.6}, {"lowest": 0.0}, {"speed": 0.5}),
+           hanging: ({"center": (0.08, under, 0.0)}, {"lowest": 0.02}, {"lowest": under - 0.01}, {"speed": 0.5}),
+           pushing: ({"center": (tx + 0.05, 0.1, tz)}, {"lean": 0.6}, {"speed": 0.3})}  # fmt: skip
+    for task, values in good.items():
+        trials, fine = nothing[task.name], view(task, **values)
+        assert bool(task.succeeded(trials, fine))
+        for worse in bad[task]:
+            wrong = view(task, **{**values, **worse})
+            assert not bool(task.succeeded(trials, wrong)), (task.name, worse)
+        farther = view(task, **{**values, "center": tuple(c + d for c, d in zip(values["center"], (0.3, -0.1, 0.1)))})
+        assert float(task.loss(trials, farther)) > float(task.loss(trials, fine)) + 1
+
+
+def test_a_hand_reaches_its_aim_in_free_fall():
+    made = arena("hanging", worlds=4, steps=1)
+    trials, action = drawn(made, 4), torch.tensor([[0.5, -0.5, 0.4, -0.8]]).repeat(4, 1)
+    starts = made.task.starts(trials, action, made.rest, made.gravity)
+    made.reset(trials)
+    made.step(action)
+    told = made.task.physical(action) + trials.hidden
+    upright = made.rest @ made.task.held.float().T
+    for b, begun in enumerate(starts):
+        time = torch.sqrt(2 * (trials.observed[b, 0] - CLEARANCE) / made.gravity)
+        flown = trials.observed[b, 1:3] + time * begun["velocity"][[0, 2]]
+        torch.testing.assert_close(flown, told[b, 2:4], atol=1e-6, rtol=0)
+        turned = made.rest @ begun["rotation"].T
+        assert float(turned[:, 1].min()) < float(upright[:, 1].min())  # tilted: it reaches further down
+    first = made.worlds.reset(starts, colliders=made.task.solids(), control_dt=made.task.control_dt)
+    torch.testing.assert_close(first.positions[..., 1].amin(1), torch.full((4,), made.task.top + CLEARANCE), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_every_trial_is_its_own_world(name):
+    """The same trials in three worlds and in one at a time; the recorded motion ends where the view is."""
+    many, alone = arena(name, 3), arena(name, 1)
+    trials, policy = drawn(many, 3), LinearPolicy(many.task)
+    together, apart = play(many, trials, policy, record=True), [play(alone, trials.select([b]), policy) for b in range(3)]
+    torch.testing.assert_close(together.loss, torch.cat([p.loss for p in apart]), rtol=1e-4, atol=1e-5)
+    assert together.success.tolist() == [bool(p.success) for p in apart] and not together.diverged.any()
+    x, F, tool = together.states
+    assert x.shape[:2] == (many.task.steps + 1, 3) and F.shape == (*x.shape, 3) and (tool is None) == (many.task.tool is None)
+    torch.testing.assert_close(x[-1][..., 1].amin(1), many.view.lowest)
+    losses, _ = play_all(many, drawn(many, 5), policy)  # more than there are worlds
+    assert losses.shape == (5,)
+
+
+@pytest.mark.parametrize("name", ["placement", "pushing"])
+def test_gradients_of_the_loss_reach_the_policy(name):
+    """Against central differences, in float64."""
+    made = arena(name, 2, steps=12, precision=64)
+    trials, policy = drawn(made, 2, seed=3), LinearPolicy(made.task).double()
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in policy.parameters():
+            parameter += 0.1 * torch.randn(parameter.shape, generator=generator)
+    played = play(made, trials, policy, differentiable=True)
+    found = torch.autograd.grad(played.loss.sum(), list(policy.parameters()))
+    assert all(float(g.abs().max()) > 1e-4 for g in found)
+    direction = [torch.randn(g.shape, generator=generator) for g in found]
+    kept, sides, step = [p.detach().clone() for p in policy.parameters()], [], 1e-5
+    for side in (step, -step):
+        with torch.no_grad():
+            for parameter, value, d in zip(policy.parameters(), kept, direction):
+                parameter.copy_(value + side * d)
+        sides.append(float(play(made, trials, policy).loss.sum()))
+    slope = (sides[0] - sides[1]) / (2 * step)
+    assert sum(float((g * d).sum()) for g, d in zip(found, direction)) == pytest.approx(slope, rel=1e-3)
+
+
+def test_descent_through_the_simulator_lowers_the_loss():
+    train, check = arena("pushing", 2), arena("pushing", 2)
+    found = by_gradient(train, check, Search(iterations=4, batch=2, rate=0.2, every=4, validation=2), seed=0)
+    losses = [entry["loss"] for entry in found.history]
+    assert len(losses) == 2 and losses[1] < losses[0] - 0.02 and found.trials == 4 * 2 + 2 * 2
+    validation = check.task.draw(2, torch.Generator().manual_seed(10**6))
+    kept, _ = play_all(check, validation, LinearPolicy.read(check.task, found.policy.written()))
+    assert float(kept.mean()) == pytest.approx(min(losses))
+    with pytest.raises(DataError, match="policy: expected the numbers of a policy for pushing"):
+        LinearPolicy.read(check.task, {"weight": [[1.0]]})
+
+
+def test_the_best_of_drawn_policies_lead():
+    """Without gradients: candidates see the same trials, and their numbers are those of their own worlds."""
+    search = Search(iterations=3, batch=1, every=3, validation=2, candidates=6, elite=0.34, spread=0.8)
+    train, check = arena("pushing", 6), arena("pushing", 2)
+    found = by_elites(train, check, search, seed=1)
+    losses = [entry["loss"] for entry in found.history]
+    assert losses[-1] < losses[0] - 0.02 and found.trials == 3 * 6 + 2 * 2
+    policy = LinearPolicy(check.task)
+    numbers = torch.randn(3, sum(p.numel() for p in policy.parameters()), generator=torch.Generator().manual_seed(0))
+    seen = torch.randn(6, len(check.task.observations), generator=torch.Generator().manual_seed(1))
+    together = _side_by_side(policy, numbers, 2)(seen)
+    for k, own in enumerate(numbers):
+        torch.nn.utils.vector_to_parameters(own, policy.parameters())
+        torch.testing.assert_close(together[2 * k : 2 * k + 2], policy(seen[2 * k : 2 * k + 2]).detach())
+    with pytest.raises(ConfigError, match="search: expected 6 candidates times 1 trials as worlds, found 2"):
+        by_elites(check, check, search, seed=1)
+
+
+def test_a_trial_that_diverges_is_lost_and_the_others_go_on(monkeypatch):
+    made = arena("pushing", 3)
+    trials, policy = drawn(made, 3), LinearPolicy(made.task)
+    whole = play(made, trials, policy)
+    step, calls = made.worlds.step, []
+
+    def failing(command):
+        calls.append(0)
+        if len(calls) == 4:
+            raise SimulationDiverged("world 1: substep 3, particle 5: position is outside the box")
+        return step(command)
+
+    monkeypatch.setattr(made.worlds, "step", failing)
+    lost = play(made, trials, policy)
+    assert lost.diverged.tolist() == [False, True, False] and float(lost.loss[1]) == LOST and not bool(lost.success[1])
+    torch.testing.assert_close(lost.loss[[0, 2]], whole.loss[[0, 2]], rtol=1e-5, atol=1e-6)
+    assert world_of(SimulationDiverged("substep 3")) is None
+    calls.clear()
+
+    def always(command):
+        raise SimulationDiverged("world 0: no")
+
+    monkeypatch.setattr(made.worlds, "step", always)
+    with pytest.raises(SimulationDiverged):
+        play(made, trials, policy)
+
+
+def test_a_simulator_is_named_and_what_is_missing_is_said():
+    truth = simulator_named("truth", scene="tiny", spacing=0.03)
+    assert truth.variant == "adapted" and len(truth.twin.body.rest) < 300
+    for name, given, message in (("real", {}, "simulator: expected one of learned, isotropic, truth"),
+                                 ("learned", {"scene": "tiny"}, "checkpoint: expected a run's checkpoint for simulator=learned"),
+                                 ("truth", {}, "or truth.scene=<a built-in scene>")):  # fmt: skip
+        with pytest.raises(ConfigError, match=message):
+            simulator_named(name, **given)
+
+
+def small_bench(tmp_path, monkeypatch, **changes):
+    """A study of which no simulator comes from a file: the truth is softer than what was learned."""
+    search = Search(iterations=1, batch=2, rate=0.1, every=1, validation=2)
+    values = {"task": "pushing", "checkpoint": None, "scene": "tiny", "device": "cpu", "policy": "gradient", "search": search,
+              "decisions": 8, "trials": 3, "worlds": 2, "spacing": None, "train_spacing": None,
+              "options": {"steps": 4}}  # fmt: skip
+    made = {"learned": simulator(), "isotropic": simulator("isotropic", E=1.2e5), "truth": simulator("truth", E=3e4)}
+    monkeypatch.setattr(study, "simulator_named", lambda name, *a, **k: made[name])
+    return Bench(Setting(**{**values, **changes}))
+
+
+def test_the_table_is_made_once_and_resumed(tmp_path, monkeypatch):
+    bench = small_bench(tmp_path, monkeypatch)
+    page = study.table(bench, ["learned", "isotropic", "truth"], [0], tmp_path)
+    text, jobs = page.read_text(), sorted(p.name for p in (tmp_path / "jobs").iterdir())
+    assert jobs == [f"pushing_{name}_0.json" for name in ("isotropic", "learned", "none", "truth")]
+    assert all(f"\n| {name} " in text for name in ("none", "learned", "isotropic", "truth"))
+    rows = (tmp_path / "pushing.csv").read_text().splitlines()
+    assert rows[0] == "task,trained_in,seed,tested_in,trial,success,loss" and len(rows) == 1 + 3 * (1 + 2 + 2 + 1)
+    assert (tmp_path / "pushing_trial_0.png").stat().st_size > 5000
+    kept = json.loads((tmp_path / "jobs" / "pushing_learned_0.json").read_text())
+    tested = study.test(bench, "truth", LinearPolicy.read(bench.task("truth"), kept["policy"]))
+    assert tested == kept["truth"] and kept["own"] != kept["truth"]
+
+    monkeypatch.setattr(study, "_record", lambda *a: pytest.fail("made again"))
+    monkeypatch.setattr(study, "films", lambda *a: [])
+    assert study.table(bench, ["learned", "isotropic", "truth"], [0], tmp_path).read_text() == text
+    other = small_bench(tmp_path, monkeypatch, trials=2)
+    with pytest.raises(DataError, match=r"pushing_none_0.json: expected a job of the same setting, found trials=3 instead of 2"):
+        study.table(other, ["learned"], [0], tmp_path)
+
+
+def test_the_command_takes_its_configuration(tmp_path, monkeypatch):
+    values = OmegaConf.to_container(OmegaConf.load(study.Path(command.__file__).parents[2] / "conf" / "environments.yaml"))
+    values.pop("defaults")
+    setting = command.setting_of(values)
+    assert setting.worlds == command.AT_A_TIME and setting.search == Search() and setting.trials == 100
+    for change, message in (({"task": "juggling"}, "task: expected one of placement"), ({"trials": 0}, "trials: expected a whole"),
+                            ({"policy": "magic"}, "policy: expected one of gradient, cem, sac, ppo"),
+                            ({"options": {"nearr": 1.0}}, "options.nearr: expected one of steps"),
+                            ({"search": {**values["search"], "rat": 1}}, "search.rat: unknown key")):  # fmt: skip
+        with pytest.raises(ConfigError, match=message):
+            command.setting_of({**values, **change})
+
+
+def test_a_picture_shows_the_body_on_its_box():
+    made = arena("placement", 1, steps=1)
+    played = play(made, drawn(made, 1), LinearPolicy(made.task), record=True)
+    pictures = film(made, played.states, 0, 2, size=48)
+    assert len(pictures) == 2 and pictures[0].shape == (48, 48, 3) and pictures[0].dtype == np.uint8
+    x, F, tool = played.states
+    gone = film(made, (x + torch.tensor([0.0, 5.0, 0.0]), F, tool), 0, 1, size=48)[0]
+    assert np.abs(pictures[0].astype(int) - gone).max() > 60  # the white body hides what is behind it
+
+
+def test_without_gymnasium_the_message_says_what_to_install(monkeypatch):
+    import builtins
+    import sys
+
+    real = builtins.__import__
+
+    def missing(name, *args, **kwargs):
+        if name.split(".")[0] in ("gymnasium", "stable_baselines3"):
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.delitem(sys.modules, "mosa.environments.gymnasium_api", raising=False)
+    monkeypatch.setattr(builtins, "__import__", missing)
+    with pytest.raises(ConfigError, match=r"expected Gymnasium, found none; pip install 'mosa\[environments\]'"):
+        by_reinforcement("sac", arena(), 8, 0)
+    with pytest.raises(ConfigError, match="policy: expected one of gradient, cem, sac, ppo"):
+        by_reinforcement("magic", arena(), 8, 0)
