@@ -5,6 +5,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
@@ -90,3 +91,17 @@ def test_fits_of_cues_make_a_table(monkeypatch, tmp_path, capsys):
     rows = capsys.readouterr().out.splitlines()
     assert rows[2] == "| ball | prior=stvk | 1.3 | 1.3 | 1.26 | 1.3 | 1.26 |  | 1.260 | 1.26 | 1.26 | 1 |"
     assert len({row.count("|") for row in rows}) == 1
+
+
+def test_the_errors_of_a_calibration_s_cues_are_smooth_and_as_large_as_asked(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    calibration = importlib.import_module("calibration")
+    rng = np.random.default_rng(0)
+    rest = rng.uniform(0, 0.5, (400, 3))
+    rest[1] = rest[0] + 0.005
+    positions = np.repeat(rest[None], 30, 0)
+    errors = calibration.noisy(positions, rest, 0.002, rng) - positions
+    assert np.abs(errors[0]).max() == 0 and errors[1:].std() == pytest.approx(0.002, rel=0.1)
+    assert np.corrcoef(errors[1:, 0, 0], errors[1:, 1, 0])[0, 1] > 0.8
+    assert abs(np.corrcoef(errors[1:-1, 0, 0], errors[2:, 0, 0])[0, 1]) < 0.5
+    assert calibration.overrides_of("trophy")[0] == "scene=standin"

@@ -12,6 +12,8 @@ from pathlib import Path
 from mosa.commands import configuration
 from mosa.errors import ConfigError, MosaError
 
+RESULTS = Path("docs/results")
+
 
 def arguments(words: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="mosa-experiment", description=__doc__)
@@ -19,6 +21,7 @@ def arguments(words: list[str]) -> argparse.Namespace:
     parser.add_argument("--quick", action="store_true", help="the small variant, minutes on two cores")
     parser.add_argument("--dry-run", action="store_true", help="list the jobs with the estimated time, run nothing")
     parser.add_argument("--collect", action="store_true", help="run nothing, write the results of the jobs that are complete")
+    parser.add_argument("--page", action="store_true", help="write the page of all results, results.md beside their folder")
     parser.add_argument("--runs", type=Path, default=Path("experiments"), help="folder of the jobs' run folders")
     parser.add_argument(
         "--results", type=Path, default=None, help="folder of the tables; default: docs/results, quick: RUNS/results"
@@ -62,6 +65,9 @@ def run(options: argparse.Namespace) -> int:
     from mosa.experiments.specification import estimate, experiment_names, jobs_of, load_experiment, narrowed, pairs, total_minutes
 
     folder = Path(configuration()) / "experiment" / "paper"
+    if options.page and not options.names:
+        print(write_the_page(folder, options))
+        return 0
     if not options.names:
         for name in experiment_names(folder):
             print(f"{name:28s} {load_experiment(folder, name).title}")
@@ -86,14 +92,23 @@ def run(options: argparse.Namespace) -> int:
     failed = {} if options.collect else run_jobs(jobs, devices, options.jobs)
     from mosa.experiments.writing import write_results
 
-    results = options.results or (options.runs / "results" if options.quick else Path("docs/results"))
+    results = options.results or (options.runs / "results" if options.quick else RESULTS)
     command = shown(options)
     for experiment in experiments:
         page = write_results(experiment, planned[experiment.name], results, command)
         print(f"{experiment.name}: {page}, {total_minutes(planned[experiment.name]):.1f} minutes of jobs")
-    for folder, reason in failed.items():
-        print(f"failed: {folder}: {reason}", file=sys.stderr)
+    if options.page:
+        print(write_the_page(folder, options))
+    for where, reason in failed.items():
+        print(f"failed: {where}: {reason}", file=sys.stderr)
     return 1 if failed else 0
+
+
+def write_the_page(folder: Path, options: argparse.Namespace) -> Path:
+    from mosa.experiments.page import write_page
+    from mosa.experiments.specification import experiment_names
+
+    return write_page(folder, experiment_names(folder), options.results or RESULTS)
 
 
 def shown(options: argparse.Namespace) -> str:

@@ -42,9 +42,25 @@ class Figure:
 
 
 @dataclass(frozen=True)
+class Claim:
+    """What the paper or an issue says of a figure (by its label), for the page of results. Either row is ahead of `against`, in a
+    column (None: the mean, or the only one), or every row is at most `most`; there `unless` names the figure with the posterior's
+    standard deviation, which excuses what it covers twice."""
+
+    text: str
+    figure: str
+    row: str | None = None
+    against: tuple[str, ...] = ()
+    column: str | None = None
+    most: float | None = None
+    unless: str | None = None
+
+
+@dataclass(frozen=True)
 class Experiment:
     """rows, columns: axes of the table (every other one but the seed is a table of its own); printed: entry of printed.yaml; note:
-    how the data differ from the paper's; minutes: of a job on cpu and gpu; analysis: a function of `analyses`, or None."""
+    how the data differ from the paper's; minutes: of a job on cpu and gpu; analysis: a function of `analyses`, or None; claims:
+    for the page of results."""
 
     name: str
     title: str
@@ -60,6 +76,7 @@ class Experiment:
     plot: str | None = "bars"
     analysis: str | None = None
     mean: bool = True
+    claims: tuple[Claim, ...] = ()
     quick: bool = False
 
 
@@ -119,8 +136,24 @@ def load_experiment(folder: Path, name: str, quick: bool = False) -> Experiment:
         keys["figures"] = tuple(Figure(**figure) for figure in keys["figures"])
     except TypeError as error:
         raise ConfigError(f"{name}: figures: expected sections of {', '.join(Figure.__dataclass_fields__)} ({error})") from error
+    keys["claims"] = tuple(claim_of(f"{name}: claims[{i}]", each, keys["figures"]) for i, each in enumerate(keys.get("claims", ())))
     keys["seeds"], keys["common"] = tuple(keys.get("seeds", (0,))), tuple(keys.get("common", ()))
     return Experiment(name=name, quick=quick, **keys)
+
+
+def claim_of(where: str, found: Any, figures: Sequence[Figure]) -> Claim:
+    """Errors: ConfigError naming the key."""
+    try:
+        claim = Claim(**{k: tuple(v) if isinstance(v, list) else v for k, v in found.items()})
+    except (TypeError, AttributeError) as error:
+        raise ConfigError(f"{where}: expected fields of {', '.join(Claim.__dataclass_fields__)} ({error})") from error
+    labels = [figure.label for figure in figures]
+    for key in ("figure", "unless"):
+        if (label := getattr(claim, key)) is not None and label not in labels:
+            raise ConfigError(f"{where}.{key}: expected one of {', '.join(labels)}, found {label!r}")
+    if (claim.most is None) == (claim.row is None) or (claim.row is not None and not claim.against):
+        raise ConfigError(f"{where}: expected row with against, or most")
+    return claim
 
 
 def options_of(where: str, found: Any, shared: Mapping[str, Any]) -> tuple[Option, ...]:

@@ -15,6 +15,7 @@ import mosa
 from mosa.analysis.tables import markdown
 from mosa.experiments.collecting import Cell, Record, best_of, records_of, table
 from mosa.experiments.drawing import draw, save
+from mosa.experiments.page import write_json
 from mosa.experiments.specification import Experiment, Figure, Job, minutes_taken
 
 PRINTED = Path(__file__).with_name("printed.yaml")
@@ -38,13 +39,14 @@ def write_results(experiment: Experiment, jobs: Sequence[Job], folder: Path, com
         extra, more = ANALYSES[experiment.analysis](experiment, records, folder / name)
         pictures += more
     page = folder / f"{name}.md"
-    page.write_text(markdown_page(experiment, jobs, records, tables, pictures, extra, command))
+    lines = provenance(experiment, jobs, records, command)
+    page.write_text(markdown_page(experiment, jobs, tables, pictures, extra, lines))
+    write_json(folder / f"{name}.json", tables, extra, lines, pictures)
     return page
 
 
 def markdown_page(
-    experiment: Experiment, jobs: Sequence[Job], records: Sequence[Record], tables: Mapping, pictures: Sequence[Path], extra: str,
-    command: str,
+    experiment: Experiment, jobs: Sequence[Job], tables: Mapping, pictures: Sequence[Path], extra: str, lines: Sequence[str],
 ) -> str:  # fmt: skip
     parts = [f"# {experiment.title}"]
     if experiment.quick:
@@ -56,8 +58,8 @@ def markdown_page(
     for figure in experiment.figures:
         rows = tables[figure.label]
         header = [experiment.rows, *next(iter(rows.values()))]
-        lines = [[row, *(cell_text(rows, row, column, figure, "**{}**") for column in header[1:])] for row in rows]
-        parts.append(f"{figure.label}{arrow(figure)} (`{figure.figure}`)\n\n" + markdown(header, lines))
+        body = [[row, *(cell_text(rows, row, column, figure, "**{}**") for column in header[1:])] for row in rows]
+        parts.append(f"{figure.label}{arrow(figure)} (`{figure.figure}`)\n\n" + markdown(header, body))
     if experiment.mean and any("mean" in row for rows in tables.values() for row in rows.values()):
         parts.append("Mean: over the columns that all rows have.")
     if extra:
@@ -65,7 +67,8 @@ def markdown_page(
     parts += [f"![{experiment.title}]({picture.name})" for picture in pictures]
     if experiment.printed is not None:
         parts.append(printed_table(experiment.printed))
-    parts.append(provenance(experiment, jobs, records, command))
+    missing = [f"missing: {job.folder.name} ({' '.join(job.overrides)})" for job in jobs if not job.finished]
+    parts.append("\n".join(f"- {line}" for line in (*lines, *missing)))
     return "\n\n".join(parts) + "\n"
 
 
@@ -91,23 +94,21 @@ def printed_table(name: str) -> str:
     return f"The paper prints ({entry['title']}; {' / '.join(entry['labels'])}):\n\n" + markdown(["", *entry["columns"]], lines)
 
 
-def provenance(experiment: Experiment, jobs: Sequence[Job], records: Sequence[Record], command: str) -> str:
-    """What the figures come from: commit, seeds, machine, time, and the jobs that are missing."""
+def provenance(experiment: Experiment, jobs: Sequence[Job], records: Sequence[Record], command: str) -> list[str]:
+    """What the figures come from: commit, seeds, machine, time."""
     complete = [job for job in jobs if job.finished]
     devices = sorted(
         {str(record.figures["time/device"]) for record in records if record.figures and "time/device" in record.figures}
     )
     minutes = [minutes_taken(job) or 0.0 for job in complete]
-    lines = [
-        f"- command: `{command}`",
-        f"- version {mosa.__version__}, commit {commit()}",
-        f"- seeds: {', '.join(map(str, experiment.seeds))}; ± is the standard deviation over them, of one seed there is none",
-        f"- machine: {', '.join(devices) or 'none'}; Python {platform.python_version()}",
-        f"- {len(complete)} of {len(jobs)} jobs complete, {sum(minutes):.1f} minutes of jobs, written "
+    return [
+        f"command: `{command}`",
+        f"version {mosa.__version__}, commit {commit()}",
+        f"seeds: {', '.join(map(str, experiment.seeds))}; ± is the standard deviation over them, of one seed there is none",
+        f"machine: {', '.join(devices) or 'none'}; Python {platform.python_version()}",
+        f"{len(complete)} of {len(jobs)} jobs complete, {sum(minutes):.1f} minutes of jobs, written "
         f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
     ]
-    lines += [f"- missing: {job.folder.name} ({' '.join(job.overrides)})" for job in jobs if not job.finished]
-    return "\n".join(lines)
 
 
 def commit() -> str:

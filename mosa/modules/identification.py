@@ -21,13 +21,21 @@ from mosa.modules.body import Body, ContactOffset, Ready, World
 from mosa.modules.criteria import Criterion
 from mosa.modules.gauss_newton import Block, GaussNewton, Posterior, Seat
 from mosa.modules.hyperelastic import HyperelasticAdapter
-from mosa.modules.material import FORMS, NU_MAX
+from mosa.modules.material import FORMS, NU_MAX, STIFFNESS
 from mosa.modules.stages import Stage
 from mosa.modules.stiffness_modes import StiffnessModes
 
 STIFFNESS_STEPS = (0.3, 0.6, 1.0, 1.5, 2.2, 3.2, 4.5, 7.0)
 POISSON_STEPS = (0.2, 0.32, 0.42)
 """Where a calibration looks first: multiples of the stiffness that the configuration starts from, and Poisson numbers."""
+FURTHER, FURTHEST = 1.5, 100.0
+"""Where the best lies at an end of the multiples, these go on by such a factor, up to so much of the configuration's stiffness."""
+STRIDES = {"E": 1.1, "mu": 1.1, "kappa": 1.1, "yield_stress": 1.1, "viscosity": 1.6, "cohesion": 0.5, "nu": 0.8,
+           "friction_angle": 0.8}
+"""First steps of a compass search in unconstrained parameters: a factor of 3 (of 5 in a viscosity), or 0.1 in the middle of nu's
+range and 17 degrees in that of the angle's."""
+FINEST = 0.2
+"""Of the first steps: there a compass search ends, and Gauss-Newton goes on."""
 NOISE_ITERATIONS = 3
 """Iterations in which the noise is found again; later its scale stays, so that costs can be compared."""
 COARSER = 1.25
@@ -128,6 +136,24 @@ def each_law(body: Body, numbers: Tensor) -> Iterator[Tensor]:
 
 def _learned(module) -> bool:
     return module is not None and few_numbers(module)
+
+
+def compass(at: Callable[[dict[str, float]], float], row: dict[str, float], strides: dict[str, float]) -> dict[str, float]:
+    """The place that a compass search of at() ends at, begun at `row`: a step up or down in one number at a time, where it
+    improves, and smaller steps where none does."""
+    best, share = at(row), 1.0
+    while share > FINEST:
+        moved = False
+        for name, stride in strides.items():
+            for sign in (1.0, -1.0):
+                step = row | {name: row[name] + sign * share * stride}
+                found = at(step)
+                if found < best:
+                    best, row, moved = found, step, True
+                    break
+        if not moved:
+            share *= 0.5
+    return row
 
 
 TRIED = 4
@@ -308,33 +334,53 @@ class Identification:
         self.noise = residuals.spread(self._along(found, self.multiple()), least, wrong)
 
     def search(self) -> float:
-        """Start a calibration from the best of a coarse grid: smallest mean distance [m] of free rollouts from the cues, which is
-        returned. Errors: SimulationDiverged where no start of the grid can be simulated."""
-        material = self.body.material
-        starts = material.begins
-        rows = []
-        for multiple in STIFFNESS_STEPS:
-            moved = {n: starts[n] + math.log(multiple) for n in ("E", "mu", "kappa") if n in starts and n in material.modulated}
-            if "nu" in starts:
-                rows += [moved | {"nu": FORMS["nu"].inverse(nu)} for nu in POISSON_STEPS]
-            else:
-                rows.append(moved)
-        learned = {n for n, raw in material.raw.items() if raw.requires_grad}
-        best: tuple[float, dict] = (math.inf, {})
-        for row in rows:
-            row = {n: v for n, v in row.items() if n in learned}
-            self._set(row)
-            try:
-                distance = self.distance()
-            except (SimulationDiverged, ConfigError):
-                continue
-            if distance < best[0]:
-                best = (distance, row)
+        """Start a calibration near the smallest mean distance [m] of free rollouts from the cues, which is returned.
+
+        The best of a coarse grid of stiffness and Poisson number, which goes on where its best is at an end of the stiffness; then,
+        for laws with parameters beside these, a compass search in all of them (Kolda, Lewis, Torczon, SIAM Review 45, 2003).
+        Errors: SimulationDiverged where no start of the grid can be simulated."""
+        starts, learned = self.body.material.begins, self._learned_names()
+        modulated = [n for n in STIFFNESS if n in learned and n in self.body.material.modulated]
+        tried: dict[tuple[float, ...], float] = {}
+
+        def at(row: dict[str, float]) -> float:
+            key = tuple(row.values())
+            if key not in tried:
+                tried[key] = self._distance_at(row)
+            return tried[key]
+
+        def row_of(multiple: float, nu: float | None) -> dict[str, float]:
+            row = {n: starts[n] + math.log(multiple) * (n in modulated) for n in learned}
+            return row if nu is None else row | {"nu": FORMS["nu"].inverse(nu)}
+
+        numbers: tuple[float | None, ...] = POISSON_STEPS if "nu" in learned else (None,)
+        multiples = list(STIFFNESS_STEPS) if modulated else [1.0]
+        best = min(((at(row_of(m, nu)), m, nu) for m in multiples for nu in numbers), key=lambda found: found[0])
+        for end, factor in ((multiples[0], 1 / FURTHER), (multiples[-1], FURTHER)):
+            multiple = end
+            while modulated and best[1] == multiple and math.isfinite(best[0]) and 1 / FURTHEST < multiple * factor < FURTHEST:
+                multiple *= factor
+                found = min(((at(row_of(multiple, nu)), multiple, nu) for nu in numbers), key=lambda found: found[0])
+                best = min(best, found, key=lambda found: found[0])
         if not math.isfinite(best[0]):
             raise SimulationDiverged("fit.prior: none of the starts of the coarse grid can be simulated; set prior.parameters "
                                      "nearer to the body's, or raise simulation.max_substeps")
-        self._set(best[1])
-        return best[0]
+        row = row_of(*best[1:])
+        if set(learned) - {"E", "nu"}:
+            row = compass(at, row, {n: STRIDES.get(n, 1.0) for n in learned})
+        self._set(row)
+        return at(row)
+
+    def _learned_names(self) -> list[str]:
+        return [name for name, raw in self.body.material.raw.items() if raw.requires_grad]
+
+    def _distance_at(self, row: dict[str, float]) -> float:
+        """Of these unconstrained parameters, infinite where they cannot be simulated."""
+        self._set(row)
+        try:
+            return self.distance()
+        except (SimulationDiverged, ConfigError):
+            return math.inf
 
     @torch.no_grad()
     def _set(self, row: dict[str, float]) -> None:
@@ -380,11 +426,27 @@ class Identification:
         if self.knows_grid:
             self.newton.seats[0].tensors[-1].fill_(float(state.get("multiple", 0.0)))
 
+    @torch.no_grad()
     def posterior(self) -> Posterior:
         """Laplace's approximation at what was found, with the root mean square distance of free rollouts from the cues after first
-        contact as the model's error."""
+        contact as the model's error.
+
+        Of a calibration the data count for no more than its residuals say: see `independent`."""
         found = []
         for i, take in enumerate(self.takes):
             away = self.rollout(self.body, i).x - take.cues.positions
             found.append(float(away[take.first_contact :].square().sum(-1).mean()))
-        return replace(self.newton.posterior(), model_error=(sum(found) / len(found)) ** 0.5)
+        share = self.independent() if self.calibrating and self.noise is not None else 1.0
+        return replace(self.newton.posterior(share), model_error=(sum(found) / len(found)) ** 0.5)
+
+    def independent(self) -> float:
+        """Share of the data that a calibration counts which its residuals bear out, in (0, 1].
+
+        What a free rollout leaves beyond the cues' own noise is what grid, contact and the law's form get wrong: a few smooth
+        patterns (`residuals.patterns`), and not `count` independent errors in every frame."""
+        counted = 100 / 30 * self.settings.count
+        cues = 3 * residuals.floors(self.body.settings.dx, 0.0)[0] ** 2
+        wrong = [1 - cues / float(scales[0][min(take.first_contact, len(scales[0])) - 1 :].square().mean())
+                 for take, scales in zip(self.takes, self.noise)]  # fmt: skip
+        each = max(1.0, residuals.patterns(self._fields(self.body)))
+        return 1 / (1 + max(0.0, sum(wrong) / len(wrong)) * max(0.0, counted / each - 1))

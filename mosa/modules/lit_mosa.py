@@ -205,7 +205,8 @@ class LitMosa(Restorable, L.LightningModule):
         self.steps_done += 1
         self.report_newton(found)
         if self.identification.converged or stage.ended(self.losses):
-            if stage.learns_adapter:
+            alone = self.body.adapter is None and self.body.heterogeneity is None  # then the calibration is all there is
+            if stage.learns_adapter or (stage.calibrates and alone):
                 self.posterior = self.identification.posterior()
             self.finish(stage)
 

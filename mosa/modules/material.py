@@ -72,9 +72,10 @@ class Direction:
 
 
 LOG = Form(0.0, math.inf, (), math.log, torch.exp)
+LOG_OR_ZERO = LOG._replace(held=(0.0,))
 SOFTPLUS = Form(0.0, math.inf, (0.0,), lambda v: v + math.log(-math.expm1(-v)), nn.functional.softplus)
 FORMS: dict[str, Form | Direction] = {
-    "E": LOG, "mu": LOG, "kappa": LOG, "yield_stress": LOG, "viscosity": SOFTPLUS, "cohesion": SOFTPLUS,
+    "E": LOG, "mu": LOG, "kappa": LOG, "yield_stress": LOG, "viscosity": LOG_OR_ZERO, "cohesion": SOFTPLUS,
     "nu": _scaled_sigmoid(NU_MAX, (0.0, NU_MAX)), "friction_angle": _scaled_sigmoid(ANGLE_MAX, (0.0, ANGLE_MAX)),
 }  # fmt: skip
 """Every parameter a prior may name, SI units; friction_angle in degrees, cohesion a strain."""
@@ -122,6 +123,15 @@ class Material(nn.Module):
         self.directions = tuple(name for name in parameters if isinstance(FORMS[name], Direction))
         for name, value in parameters.items():
             self._add(name, value, name not in frozen)
+        if "viscosity" in self.raw:
+            self.register_buffer("viscosity_is_a_logarithm", torch.tensor(True))
+
+    def _load_from_state_dict(self, state_dict, prefix: str, *rest) -> None:
+        """Of checkpoints without the mark, the viscosity is the inverse of a softplus."""
+        name, mark = f"{prefix}raw.viscosity", f"{prefix}viscosity_is_a_logarithm"
+        if "viscosity" in self.raw and name in state_dict and mark not in state_dict:
+            state_dict[name], state_dict[mark] = SOFTPLUS.physical(state_dict[name]).log(), torch.tensor(True)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def _check_names(self, law: str, parameters, frozen, modulated) -> None:
         known = law_named(law)

@@ -63,6 +63,18 @@ def floors(dx: float, cells: float) -> tuple[float, float, float]:
                  for i, (cue, model) in enumerate(zip(CUE_ERRORS, MODEL_ERRORS)))
 
 
+def patterns(found: list[Fields]) -> float:
+    """How many independent patterns the positions' residuals consist of: (sum l)^2 / sum l^2 over the eigenvalues l of their
+    covariance, at most the number of frames; of several rollouts the mean."""
+    counts = []
+    for each in found:
+        field = each.position.flatten(1).double()
+        field = field / field.norm(dim=1, keepdim=True).clamp(min=1e-12)  # as the noise weighs the frames
+        gram = field @ field.T
+        counts.append(float(gram.trace() ** 2 / gram.square().sum()))
+    return sum(counts) / len(counts)
+
+
 def difference(one: list[Fields], other: list[Fields]) -> list[Fields]:
     """Field by field."""
     return [Fields(*(x - y for x, y in zip(a, b))) for a, b in zip(one, other)]

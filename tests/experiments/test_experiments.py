@@ -17,10 +17,13 @@ from mosa.errors import ConfigError, DataError
 from mosa.experiments import running
 from mosa.experiments.analyses import ANALYSES
 from mosa.experiments.collecting import Cell, best_of, records_of, table
+from mosa.experiments.page import verdict
 from mosa.experiments.specification import (
+    Claim,
     Experiment,
     Figure,
     Option,
+    claim_of,
     estimate,
     experiment_names,
     folder_name,
@@ -330,3 +333,70 @@ def test_a_quick_variant_runs_to_its_table_and_is_not_run_again(tmp_path, capsys
     true = [float(row[5]) for row in rows]
     assert true[0] / true[18] == pytest.approx(1.6, rel=0.01)  # along the rabbit's fibres and across
     assert float(rows[0][4]) > 0 and float(rows[0][3]) >= 0
+
+
+# ------------------------------------------------------------------------------------------------ the page of results
+def cells(**rows) -> dict:
+    return {row: {"mean": None if value is None else Cell(*value)} for row, value in rows.items()}
+
+
+def test_a_claim_holds_only_by_more_than_the_spread_of_the_seeds():
+    found = experiment()
+    claim = Claim("ours is ahead", "rms [mm]", row="ours", against=("prior", "box"))
+    for rows, begins in (
+        (cells(ours=(10.0, 0.5, 3), prior=(20.0, 0.5, 3), box=(12.0, 0.5, 3)), "holds, 10.0 ± 0.5 against 20.0 ± 0.5 (prior)"),
+        (cells(ours=(10.0, 2.0, 3), prior=(20.0, 0.5, 3), box=(11.0, 2.0, 3)), "within the spread, "),
+        (cells(ours=(10.0, 0.1, 3), prior=(20.0, 0.5, 3), box=(9.0, 0.1, 3)), "does not hold, "),
+        (cells(ours=None, prior=(20.0, 0.5, 3), box=(9.0, 0.1, 3)), "not run"),
+    ):
+        assert verdict(found, claim, {"rms [mm]": rows}).startswith(begins)
+    one = verdict(found, claim, {"rms [mm]": cells(ours=(10.0, None, 1), prior=(20.0, None, 1), box=None)})
+    assert one == "holds, 10.0 against 20.0 (prior); not run: box; one seed"
+    best = Claim("more is better", "PSNR", row="ours", against=("prior",))
+    assert verdict(found, best, {"PSNR": cells(ours=(30.0, None, 1), prior=(31.0, None, 1))}).startswith("does not hold")
+
+
+def test_a_bound_excuses_what_the_posterior_says_is_not_determined():
+    claim = Claim("within 5 %", "PSNR", most=5.0, unless="rms [mm]")
+    rows = cells(a=(3.0, None, 1), b=(40.0, None, 1), c=(9.0, None, 1))
+    said = verdict(experiment(), claim, {"PSNR": rows, "rms [mm]": cells(a=(1.0, None, 1), b=(25.0, None, 1), c=(1.0, None, 1))})
+    assert said == ("does not hold, 1 of 3 within 5; not determined, and the posterior says so: b (40.0); beyond it: c (9.0)")
+    alone = {"PSNR": cells(b=(40.0, None, 1)), "rms [mm]": cells(b=(25.0, None, 1))}
+    assert verdict(experiment(), claim, alone).startswith("holds where it is determined, 0 of 1")
+    assert verdict(experiment(), claim, {}) == "not run"
+
+
+def test_the_page_has_what_was_run_and_says_what_was_not(tmp_path):
+    found = narrowed(load_experiment(PAPER, "table_generalisation"), {"scene": ["rabbit", "peanut"]}, (0,))
+    jobs = [job for job in jobs_of(found, tmp_path / "runs")
+            if any(place["method"].name in ("ours", "NeuMA") for place in job.places)]  # fmt: skip
+    for job in jobs:
+        write_metrics(job, rms=0.010 if "adapter=operator" in job.overrides else 0.030)
+    write_results(found, jobs, tmp_path / "docs" / "results", "the command")
+    assert run(arguments(["--page", "--results", str(tmp_path / "docs" / "results")])) == 0
+    text = (tmp_path / "docs" / "results.md").read_text()
+    for name in NAMES:
+        assert f"## {load_experiment(PAPER, name).title}" in text
+    assert "31.35 / 92.3" in text and "`the command`" in text and "](results/table_generalisation.png)" in text
+    row = next(line for line in text.splitlines() if line.startswith("| NCLaw"))
+    assert row.count("not run") >= 2
+    assert "our default has the smallest error of all: **holds, 10.0 against 20.0 (prior only), 30.0 (NeuMA); not run:" in text
+    assert "Ours: not run. `mosa-experiment table_ablation`" in text
+    with pytest.raises(ConfigError, match="--results: expected a folder"):
+        run(arguments(["--page", "--results", str(tmp_path / "nothing")]))
+    (tmp_path / "docs" / "results" / "table_generalisation.json").write_text("{}")
+    with pytest.raises(DataError, match=r"table_generalisation\.json"):
+        run(arguments(["--page", "--results", str(tmp_path / "docs" / "results")]))
+
+
+def test_a_claim_of_a_figure_or_row_that_is_not_there_is_a_mistake_of_the_file():
+    figures = (Figure("a", "x"),)
+    for found, message in (({"text": "t", "figure": "b", "most": 1}, "expected one of a, found 'b'"),
+                           ({"text": "t", "figure": "a"}, "row with against, or most"),
+                           ({"text": "t", "figure": "a", "rwo": "x"}, "expected fields of")):  # fmt: skip
+        with pytest.raises(ConfigError, match=message):
+            claim_of("f: claims[0]", found, figures)
+    for name in NAMES:  # rows that the claims name are rows
+        made = load_experiment(PAPER, name)
+        rows = {option.name for option in made.axes[made.rows]}
+        assert {row for claim in made.claims if claim.row for row in (claim.row, *claim.against)} <= rows, name

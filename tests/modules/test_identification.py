@@ -14,7 +14,7 @@ from mosa.modules import identification as identification_module
 from mosa.modules.criteria import Criterion
 from mosa.modules.gauss_newton import Seat
 from mosa.modules.hyperelastic import anisotropic_basis
-from mosa.modules.identification import COARSER, Identification, IdentificationSettings, write_numbers
+from mosa.modules.identification import COARSER, Identification, IdentificationSettings, compass, write_numbers
 from mosa.modules.stages import Stage
 
 FRAMES = 12
@@ -296,3 +296,37 @@ def test_a_stopped_stage_goes_on_with_what_it_knew_of_the_grid():
     again.iterate()
     assert again.multiple() == whole.multiple() != 0.0
     assert torch.equal(again.newton.seats[0].read(), whole.newton.seats[0].read())
+
+
+def test_a_compass_search_goes_down_a_valley_in_every_number():
+    def at(row):
+        return (row["a"] - 2.3) ** 2 + 4 * (row["b"] + 1.1 + 0.3 * row["a"]) ** 2
+
+    found = compass(at, {"a": 0.0, "b": 0.0}, {"a": 1.0, "b": 0.5})
+    assert abs(found["a"] - 2.3) < 0.3 and at(found) < 0.05
+
+
+def test_the_grid_of_starts_goes_on_where_its_best_is_at_an_end():
+    """The body is 30 times as stiff as the configuration says; the grid's own last multiple is 7."""
+    truth = small_body(adapter=False)
+    body = small_body(adapter=False, E=E / 30)
+    found = identification(body, [take_and_turn(truth, 0.5)], "prior")
+    found.search()
+    assert values(body)["E"] == pytest.approx(E, rel=0.35)
+
+
+def test_a_calibration_whose_residuals_are_a_few_patterns_is_less_sure():
+    """The same residuals' size, once one smooth error of the cues and once none: only the first is more than the cues' noise."""
+    truth = small_body(adapter=False)
+    take = take_and_turn(truth, 0.5)
+    bent = copy.deepcopy(take)
+    late = torch.linspace(0, 1, FRAMES, dtype=torch.float64)[:, None]
+    bent.cues.positions[..., 0] += 0.02 * late * truth.rest[:, 1] / truth.rest[:, 1].abs().max()
+    sure = []
+    for each in (take, bent):
+        body = small_body(adapter=False)
+        found = identification(body, [each], "prior")
+        found.iterate()
+        sure.append((found.independent(), found.posterior().covariance[0, 0], found.newton.posterior().covariance[0, 0]))
+    assert sure[0][0] == 1.0 and sure[0][1] == sure[0][2]
+    assert sure[1][0] < 0.1 and sure[1][1] > 5 * sure[1][2]

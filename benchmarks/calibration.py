@@ -1,0 +1,194 @@
+"""The calibration of every law by itself: the stand-ins of PAC-NeRF's scenes without images.
+
+    python benchmarks/calibration.py make --out motions torus cream trophy          # the true motions, a minute each on a CPU
+    python benchmarks/calibration.py fit motions/*.npz --particles 1500 --results fits.jsonl [--set identification.count=60 ...]
+    python benchmarks/calibration.py table fits.jsonl
+
+`make` simulates a scene's truth on its own fine grid. `fit` fills the shape with other and fewer particles, carries them along the
+true motion, adds an error to every frame (`noisy`), and calibrates the scene's law on that. What is left out is the
+reconstruction; what is in are the grid, the time step, the starts of the search, Gauss-Newton and its posterior.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+import yaml
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from mosa.config import build_body, build_criterion, build_identification, build_stages, build_world
+from mosa.data.builtin import BOX
+from mosa.data.builtin.drop import GRAVITY, simulate
+from mosa.data.builtin.objects import object_named
+from mosa.data.builtin.shapes import SHAPES
+from mosa.data.builtin.surface import bind, extract_surface, fill
+from mosa.errors import MosaError
+from mosa.metrics import identification_errors
+from mosa.modules.body import Start
+from mosa.modules.identification import Identification
+from mosa.prediction import determined
+from mosa.reconstruction.resolution import grid_spacing
+from mosa.types import MotionCues
+
+CONF = Path(__file__).parents[1] / "conf"
+NOISE = 0.004
+"""Error of the cues over the body's height: 1.0 mm on the rabbit's 0.25 m is what its reconstruction has (docs/cues.md)."""
+WAVES = 24
+
+
+def overrides_of(name: str) -> list[str]:
+    """Of a stand-in, as the table of system identification has them."""
+    found = yaml.safe_load((CONF / "experiment" / "paper" / "_shared.yaml").read_text())["stand-ins"]
+    return [str(each) for each in found[name]]
+
+
+def configuration(name: str, more: list[str]) -> dict:
+    with initialize_config_dir(str(CONF.resolve()), version_base=None):
+        cfg = compose("train", overrides=[*overrides_of(name), "adapter=none", "heterogeneity.enabled=false", *more])
+    return OmegaConf.to_container(cfg, resolve=True)
+
+
+def make(name: str, folder: Path, seed: int) -> Path:
+    """The true motion of a scene: rest (N, 3), positions (T, N, 3) [m]."""
+    began, body = time.perf_counter(), object_named(name)
+    surface = extract_surface(SHAPES[body.shape], body.pitch, np.random.default_rng([seed, 1]))
+    particles = fill(SHAPES[body.shape], body.spacing, np.random.default_rng([seed, 2]))
+    fall = simulate(body, body.material, particles, surface.vertices, body.drops["train"], body.drops["train"])
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{name}.npz"
+    np.savez(path, rest=fall.rest, positions=fall.positions.astype(np.float32), velocity=fall.velocity, shape=particles,
+             lowest=surface.vertices[:, 1].min())
+    print(f"{path}: {len(particles)} particles, {fall.substeps} substeps a frame, {time.perf_counter() - began:.0f} s", flush=True)
+    return path
+
+
+def noisy(positions: np.ndarray, rest: np.ndarray, sd: float, rng: np.random.Generator) -> np.ndarray:
+    """positions (T, N, 3) with errors of `sd` [m] a component, anew in every frame, alike a tenth of the body around."""
+    size = np.ptp(rest, 0).max()
+    waves = rng.normal(size=(WAVES, 3)) * 2 * np.pi / (0.5 * size)
+    found = positions.copy()
+    for frame in found[1:]:
+        phases, weights = rng.uniform(0, 2 * np.pi, WAVES), rng.normal(size=(WAVES, 3)) * math.sqrt(2 / WAVES)
+        frame += sd * np.cos(rest @ waves.T + phases) @ weights
+    return found
+
+
+def case_of(path: Path, particles: int, more: list[str], seed: int, noise: float, device: str) -> SimpleNamespace:
+    """A body of about so many particles with the law of the scene, what it learns from, and where its particles truly go."""
+    name, stored = path.stem, np.load(path)
+    body, cfg, rng = object_named(name), configuration(name, more), np.random.default_rng([seed, 12])
+    spacing = (len(stored["shape"]) * body.spacing**3 / particles) ** (1 / 3)
+    points = fill(SHAPES[body.shape], spacing, rng)
+    rest = points + (stored["rest"] - stored["shape"])[0]
+    skin = bind(rest, stored["rest"], body.spacing)
+    truth = np.stack([skin.follow(x.astype(np.float64)) for x in stored["positions"]])
+    seen = noisy(truth, rest, noise * np.ptp(stored["rest"][:, 1]), rng)
+    tensor = lambda a: torch.as_tensor(a, dtype=torch.float32, device=device)  # noqa: E731
+    n, frames = len(rest), len(truth)
+    reach = body.reach or BOX[1][0]
+    world = {"ground": {"height": 0.0, "mode": "sticky"}, "gravity": list(GRAVITY), "up": [0.0, 1.0, 0.0],
+             "box": [[-reach, BOX[0][1], -reach], [reach, BOX[1][1], reach]]}  # fmt: skip
+    config = {"cfg": cfg, "world": world, "density": body.material.density, "frame_dt": 1 / body.footage.fps,
+              "dx": grid_spacing(spacing, cfg["simulation"]["particles_per_cell"])}  # fmt: skip
+    made = build_body(config, {"rest": tensor(rest), "volume": tensor(np.full(n, spacing**3)), "colors": torch.zeros(n, 3),
+                               "opacities": torch.ones(n), "covariances": torch.eye(3).expand(n, 3, 3)}).to(device)  # fmt: skip
+    start = Start(torch.eye(3, device=device), made.center, tensor(stored["velocity"]), torch.zeros(3, device=device))
+    cues = MotionCues(tensor(seen), torch.eye(3, device=device).expand(frames, n, 3, 3), tensor(np.ones((frames, n, 3))),
+                      tensor(np.ones((frames, n))), tensor(np.zeros((1,))))  # fmt: skip
+    height = rest[:, 1].min() - 0.5 * spacing
+    falls = truth[:, :, 1].min(1) - 0.5 * spacing
+    contact = int(np.argmax(falls < 0.02 * height))
+    take = SimpleNamespace(start=start, frame_dt=config["frame_dt"], first_contact=contact, cues=cues)
+    return SimpleNamespace(name=name, object=body, body=made, world=build_world(world), take=take, cfg=cfg, truth=tensor(truth),
+                           dx=config["dx"])  # fmt: skip
+
+
+def fit(
+    path: Path, particles: int, more: list[str], seed: int, noise: float, device: str, stages: str = "prior"
+) -> dict:  # fmt: skip
+    """The calibration of one scene: what it finds, what is true, and what its posterior says."""
+    began = time.perf_counter()
+    case = case_of(path, particles, more, seed, noise, device)
+    body, contact = case.body, case.take.first_contact
+    stage = replace(build_stages(case.cfg["fit"], None, None)[0], name=stages)
+    calibration = Identification(body, [case.take], case.world, stage, build_criterion(case.cfg), build_identification(case.cfg),
+                                 (True, False, False))
+    calibration.search()
+    searched = {name: float(value.detach()) for name, value in body.material.physical().items()}
+    for taken in range(1, stage.iterations + 1):
+        report = calibration.iterate()
+        now = " ".join(f"{name} {float(value.detach()):.4g}" for name, value in body.material.physical().items())
+        print(f"  {case.name} {taken}: {now} cost {report['after']:.1f} length {report['length']:.2f}", flush=True)
+        if calibration.converged:
+            break
+    alone, known = determined(body, calibration.newton.posterior()), case.object.material.known
+    said = determined(body, calibration.posterior())
+    found = {name: float(value.detach()) for name, value in body.material.physical().items()}
+    away = calibration.rollout(body, 0).x[contact:] - case.truth[contact:]
+    return {
+        "scene": case.name, "law": body.material.law, "set": more, "particles": len(body.rest), "dx": case.dx, "seed": seed,
+        "noise": noise, "parameters": {
+            name: {"true": true, "start": searched[name], "found": found[name],
+                   "error": identification_errors(name, found[name], true)[f"{name}_relative_error"],
+                   "sd": said.get(f"posterior/{name}_relative_sd", said.get(f"posterior/{name}_sd")),
+                   "sd_of_noise": alone.get(f"posterior/{name}_relative_sd", alone.get(f"posterior/{name}_sd"))}
+            for name, true in known.items()},
+        "stage": stages, "contact_cells": float(body.contact.cells.detach()),
+        "rms_mm": 1e3 * float(away.square().sum(-1).mean().sqrt()),
+        "iterations": taken, "seconds": time.perf_counter() - began,
+    }  # fmt: skip
+
+
+def table(records: list[dict]) -> str:
+    heads = ("scene", "set", "particles", "parameter", "true", "from the search", "found", "error %", "sd of the noise",
+             "posterior sd", "rms mm", "s")  # fmt: skip
+    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    for r in records:
+        for name, p in r["parameters"].items():
+            numbers = f"{p['true']:.4g} | {p['start']:.4g} | {p['found']:.4g} | {100 * p['error']:.1f} | {p['sd_of_noise']:.3g}"
+            lines.append(f"| {r['scene']} | {' '.join(r['set'])} | {r['particles']} | {name} | {numbers} | {p['sd']:.3g} | "
+                         f"{r['rms_mm']:.1f} | {r['seconds']:.0f} |")  # fmt: skip
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("make", "fit", "table"))
+    parser.add_argument("inputs", nargs="+", help="make: names of stand-ins; fit: true motions; table: results")
+    parser.add_argument("--out", type=Path, default=Path("motions"), help="make: folder of the true motions")
+    parser.add_argument("--results", type=Path, default=Path("fits.jsonl"), help="fit: a line is added for each")
+    parser.add_argument("--particles", type=int, default=1500, help="fit: of the learner, about")
+    parser.add_argument("--noise", type=float, default=NOISE, help="fit: error of the cues over the body's height")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--stage", default="prior", help="fit: prior; prior_eta: under the criterion, with the second grid")
+    parser.add_argument("--set", nargs="*", default=[], help="fit: overrides of the law and its identification")
+    options = parser.parse_args()
+    if options.what == "table":
+        print(table([json.loads(line) for name in options.inputs for line in Path(name).read_text().splitlines()]))
+        return
+    for each in options.inputs:
+        if options.what == "make":
+            make(each, options.out, options.seed)
+            continue
+        try:
+            record = fit(Path(each), options.particles, options.set, options.seed, options.noise, options.device, options.stage)
+        except MosaError as error:
+            print(f"{each}: {error}", flush=True)
+            continue
+        with options.results.open("a") as file:
+            file.write(json.dumps(record) + "\n")
+        print(table([record]), flush=True)
+
+
+if __name__ == "__main__":
+    main()
