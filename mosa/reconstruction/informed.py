@@ -31,7 +31,7 @@ class InformedSettings:
     iterations: int = knob(80, whole(0))
     views: int = knob(1, COUNT)
     lr: float = knob(0.02, POSITIVE)
-    elastic: float = knob(1.0, WEIGHT)
+    elastic: float = knob(0.3, WEIGHT)
     bending: float = knob(1.0, WEIGHT)
 
     def __post_init__(self) -> None:
