@@ -4,9 +4,10 @@
     python benchmarks/identification.py fit problems/*.pt --device cuda --results fits.jsonl [--set identification.count=60 ...]
     python benchmarks/identification.py table fits.jsonl
 
-`make` films, reconstructs, finds the starts and the cues about the calibrated backbone's motion, as a run does, and keeps what a fit
-reads in one file of a few MB, with the truth for the figures. `fit` calibrates the prior and runs the joint stage on it: a few seconds each on a GPU, minutes on a CPU. Figures
-are held-out errors after first contact, in mm, at 2000 particles. docs/identification.md has tables that were made so.
+`make` films, reconstructs, finds the starts and the cues about the calibrated backbone's motion, as a run does, and keeps what a
+fit reads in one file of a few MB, with the truth for the figures. `fit` calibrates the prior and runs the joint stage on it: a few
+seconds each on a GPU, minutes on a CPU. Figures are held-out errors after first contact, in mm, at 2000 particles.
+docs/identification.md has tables that were made so.
 """
 
 from __future__ import annotations

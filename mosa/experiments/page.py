@@ -13,6 +13,7 @@ from typing import Any
 from mosa.analysis.tables import markdown
 from mosa.errors import ConfigError, DataError
 from mosa.experiments.collecting import Cell
+from mosa.experiments.printed import printed_table
 from mosa.experiments.specification import Claim, Experiment, Figure, load_experiment
 
 Tables = Mapping[str, Mapping[str, Mapping[str, Cell | None]]]
@@ -50,8 +51,6 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
     """results.md beside the folder of results. folder: of the experiments' files. Errors: ConfigError, DataError."""
     if not results.is_dir():
         raise ConfigError(f"--results: expected a folder with results, found none at {results}")
-    from mosa.experiments.writing import printed_table
-
     parts = [INTRODUCTION]
     for name in sorted(names, key=lambda name: not name.startswith("table_")):
         experiment = load_experiment(folder, name)

@@ -9,16 +9,13 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
-import yaml
-
 import mosa
 from mosa.analysis.tables import markdown
 from mosa.experiments.collecting import Cell, Record, best_of, records_of, table
 from mosa.experiments.drawing import draw, save
 from mosa.experiments.page import write_json
+from mosa.experiments.printed import printed_table
 from mosa.experiments.specification import Experiment, Figure, Job, minutes_taken
-
-PRINTED = Path(__file__).with_name("printed.yaml")
 
 
 def write_results(experiment: Experiment, jobs: Sequence[Job], folder: Path, command: str) -> Path:
@@ -84,14 +81,6 @@ def cell_text(
         return ""
     text = found.text(figure.decimals, plus)
     return bold.format(text) if best_of(rows, column, figure.best) == row else text
-
-
-def printed_table(name: str) -> str:
-    """The paper's own figures as Markdown. Errors: KeyError for an entry that is not there."""
-    entry = yaml.safe_load(PRINTED.read_text())[name]
-    lines = [[row, *(" / ".join("" if v is None else str(v) for v in values) for values in cells)]
-             for row, cells in entry["rows"].items()]  # fmt: skip
-    return f"The paper prints ({entry['title']}; {' / '.join(entry['labels'])}):\n\n" + markdown(["", *entry["columns"]], lines)
 
 
 def provenance(experiment: Experiment, jobs: Sequence[Job], records: Sequence[Record], command: str) -> list[str]:

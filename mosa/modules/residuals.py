@@ -17,7 +17,7 @@ from mosa.physics.constitutive.singular_values import singular_value_decompositi
 from mosa.types import MotionCues, Rollout
 
 CUE_ERRORS = (0.5e-3, 0.01, 0.015)
-"""Per component: positions [m], rotations [rad], singular values. Cues that a simulation informed are 0.5 to 0.7 mm off in all after
+"""Per component: positions [m], rotations [rad], singular values. Cues that a simulation informed are 0.5 to 0.7 mm off after
 contact, 0.3 to 0.4 in a component (rabbit, chick1, mandarin, peanut); what they get wrong beyond is measured from the residuals."""
 MODEL_ERRORS = (1.0, 0.3, 0.15)
 """Rotations and singular values that a grid gets wrong where it gets positions wrong by a cell."""

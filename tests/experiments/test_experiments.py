@@ -18,6 +18,7 @@ from mosa.experiments import running
 from mosa.experiments.analyses import ANALYSES
 from mosa.experiments.collecting import Cell, best_of, records_of, table
 from mosa.experiments.page import verdict
+from mosa.experiments.printed import printed_table
 from mosa.experiments.specification import (
     Claim,
     Experiment,
@@ -32,7 +33,7 @@ from mosa.experiments.specification import (
     narrowed,
     pairs,
 )
-from mosa.experiments.writing import printed_table, write_results
+from mosa.experiments.writing import write_results
 from mosa.keys import EVALUATION, TRAINING
 from mosa.schema import check
 
