@@ -61,7 +61,8 @@ def cell(values: Sequence[float]) -> Cell | None:
 
 
 def table(experiment: Experiment, records: Sequence[Record], figure: Figure) -> dict[str, dict[str, Cell | None]]:
-    """{row: {column: cell}} with a column `mean` over the columns that every row has (spread: over seeds, of these means).
+    """{row: {column: cell}} with a column `mean` (spread: over seeds, of these means), over the columns that every row has of which
+    at least half as many are complete as of the fullest; rows that lack one of them have no mean.
 
     None where no run has the figure."""
     values: dict[str, dict[str, dict[int, float]]] = {}
@@ -75,7 +76,8 @@ def table(experiment: Experiment, records: Sequence[Record], figure: Figure) -> 
     rows = {option.name: values.get(option.name, {}) for option in experiment.axes[experiment.rows]}
     result = {row: {column: cell(list(found.get(column, {}).values())) for column in columns} for row, found in rows.items()}
     if experiment.mean and len(columns) > 1 and experiment.rows != experiment.columns:
-        filled = [found for found in rows.values() if any(found.values())]
+        complete = {row: sum(map(bool, found.values())) for row, found in rows.items()}
+        filled = [found for row, found in rows.items() if 0 < complete[row] >= 0.5 * max(complete.values())]
         shared = [column for column in columns if filled and all(found.get(column) for found in filled)]
         for row, found in rows.items():
             seeds = sorted(set.intersection(*(set(found.get(column, {})) for column in shared))) if shared else []

@@ -58,7 +58,7 @@ def markdown_page(
         body = [[row, *(cell_text(rows, row, column, figure, "**{}**") for column in header[1:])] for row in rows]
         parts.append(f"{figure.label}{arrow(figure)} (`{figure.figure}`)\n\n" + markdown(header, body))
     if experiment.mean and any("mean" in row for rows in tables.values() for row in rows.values()):
-        parts.append("Mean: over the columns that all rows have.")
+        parts.append("Mean: over the columns that all rows have, but for those rows that are less than half complete.")
     if extra:
         parts.append(extra)
     parts += [f"![{experiment.title}]({picture.name})" for picture in pictures]
