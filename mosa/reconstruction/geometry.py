@@ -113,9 +113,11 @@ def holds_matter(distance: Volume) -> bool:
 
 def nothing_left(scene: Scene, hull: Geometry) -> Geometry:
     """The hull's geometry, where the images left nothing of it, with a warning that says so."""
-    warnings.warn(f"scene {scene.name}: carving and refinement left nothing of a visual hull of {int(hull.body.values.sum())} "
-                  f"voxels of {1e3 * hull.body.pitch:.3g} mm; the hull is the body, as with reconstruction.geometry.source=hull. More "
-                  "voxels (reconstruction.resolution) or pixels (scene.scale) may tell more", stacklevel=3)
+    warnings.warn(
+        f"scene {scene.name}: carving and refinement left nothing of a visual hull of {int(hull.body.values.sum())} voxels of "
+        f"{1e3 * hull.body.pitch:.3g} mm; the hull is the body, as with reconstruction.geometry.source=hull. More voxels "
+        "(reconstruction.resolution) or pixels (scene.scale) may tell more", stacklevel=3,
+    )  # fmt: skip
     return hull
 
 
