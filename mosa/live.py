@@ -27,7 +27,7 @@ from mosa.twin_worlds import TwinWorlds
 from mosa.viewing import horizontal
 
 COLORS = ("appearance", "stretch", "heterogeneity", "uncertainty")
-FASTEST = 8.0
+FASTEST = 4.0
 """Of the ball, in sizes of the body per second: a mouse jumps, a solid that jumps passes through what it should push."""
 COURANT = 0.45
 """Cells per substep that the ball moves at most, below the half that a step allows."""
@@ -191,8 +191,8 @@ class Live:
         """Stop and say why; False."""
         self.running = False
         if isinstance(error, SimulationDiverged):
-            self.message = (f"The simulation diverged at {self.time:.3f} s: {error} What is shown is the last state before; drop "
-                            "the body again, from lower or slower, or push more gently.")
+            self.message = (f"The simulation diverged at {self.time:.3f} s; what is shown is the last state before. Drop the body "
+                            f"again, from lower or slower, or push more gently. ({error})")
         else:
             self.message = f"{type(error).__name__}: {error}"
         return False

@@ -27,8 +27,8 @@ class LiveViewer:
         self.live, self.ended, self.busy = live, threading.Event(), threading.RLock()
         self.server = open_server(host, port)
         gui, first, body = self.server.gui, live.drop_as, live.twin.body
-        self.message = gui.add_markdown("")
         self.buttons = {name: gui.add_button(name) for name in ("drop", "pause", "step", "reset")}
+        self.message = gui.add_markdown("")
         with gui.add_folder("the next drop"):
             high = max(live.highest, first.height, 0.01)
             fastest = 2 * float(np.sqrt(2 * 9.8 * live.size))

@@ -210,8 +210,8 @@ class Twin:
         formats: Sequence[str] = ("ply",), colliders: Sequence[Collider] = (),
     ) -> Path:  # fmt: skip
         """Write into `folder`: `body.npz`, which the viewer shows the motion with; `rollout.npz` (with the poses of `colliders`,
-        those of the rollout, where they are given); one PLY a frame (x y z red green blue); `simulation.mp4`; and the Gaussians that
-        its images show in `formats` (`data.splat_files.FORMATS`: 3DGS PLY, splat, spz, usd) below `splats/`."""
+        those of the rollout, where they are given); one PLY a frame (x y z red green blue); `simulation.mp4`; and the Gaussians
+        that its images show in `formats` (`data.splat_files.FORMATS`: 3DGS PLY, splat, spz, usd) below `splats/`."""
         folder = Path(folder)
         (folder / "ply").mkdir(parents=True, exist_ok=True)
         save_body(folder / BODY_FILE, self.body, self.world)

@@ -87,7 +87,7 @@ def test_the_ball_goes_to_its_target_no_faster_than_a_step_allows_and_pushes_the
     assert speed == pytest.approx(min(most, FASTEST * live.size)) and speed < 0.6 / DT
     live.target = live.hand_position + np.array([0.25, 0, 0])
     forces = []
-    for _ in range(60):
+    for _ in range(120):
         assert live.step()
         forces.append(live.force[0])
     assert np.allclose(live.hand_position, live.target, atol=1e-9)
@@ -113,7 +113,7 @@ def test_a_motion_that_diverges_stops_with_a_message_and_the_next_drop_goes_on()
         shown = live.positions.numpy()
         reached += live.step()
     assert 3 < reached < 60 and not live.running
-    assert live.message.startswith("The simulation diverged at 0.") and "drop the body again" in live.message
+    assert live.message.startswith("The simulation diverged at 0.") and "Drop the body again" in live.message
     assert np.array_equal(live.positions.numpy(), shown) and np.isfinite(shown).all()
     assert not live.step() and "diverged" in live.message
     live.change(speed=0.0)
@@ -211,10 +211,10 @@ def test_the_page_drops_steps_pushes_and_outlives_a_divergence():
         shown.pushed((0.1, 0.2, 0.3))
         assert live.target == pytest.approx([0.1, 0.2, 0.3])
         here = live.hand_position.copy()
-        shown.dragged(SimpleNamespace(start_position=(0.0, 0.0, 0.0), end_position=(0.005, 0.0, 0.0)))
-        assert live.target == pytest.approx(here + np.array([0.005, 0, 0])) and np.allclose(shown.gizmo.position, live.target)
+        shown.dragged(SimpleNamespace(start_position=(0.0, 0.0, 0.0), end_position=(0.003, 0.0, 0.0)))
+        assert live.target == pytest.approx(here + np.array([0.003, 0, 0])) and np.allclose(shown.gizmo.position, live.target)
         shown.step()
-        assert np.allclose(shown.ball.position, here + np.array([0.005, 0, 0])) and "on the ball" in shown.caption.content
+        assert np.allclose(shown.ball.position, here + np.array([0.003, 0, 0])) and "on the ball" in shown.caption.content
         shown.reset()
         assert live.time == 0 and np.allclose(shown.gizmo.position, live.home(live.drop_as))
         shown.sliders["speed"].value = shown.sliders["speed"].max
