@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,12 +16,14 @@ from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
 from mosa.errors import ConfigError, DataError
-from mosa.modules.body import Body, World
+from mosa.modules.body import World
 from mosa.modules.carried_splats import seen
 from mosa.modules.observer import deformed_covariances
 from mosa.npz import read_npz
 from mosa.reconstruction.cues import neighbourhood
+from mosa.shown_body import FILE, ShownBody
 from mosa.twin import Twin
+from mosa.viewing import cell, horizontal
 
 BODIES = ("observed", "truth", "prior", "learned")
 """What a clip can have, from left to right: the motion learned from, or where none was the true one, and the two models'."""
@@ -138,9 +139,7 @@ class Clip:
     @property
     def across(self) -> np.ndarray:
         """(3,) horizontal unit vector, from each body to the next."""
-        across = np.eye(3)[np.abs(self.up).argmin()]
-        across = across - (across @ self.up) * self.up
-        return across / np.linalg.norm(across)
+        return horizontal(self.up)
 
     @property
     def moved(self) -> np.ndarray:
@@ -221,24 +220,19 @@ class Clip:
         return said
 
 
-def cell(size: float) -> float:
-    """Width [m] of a ground cell for a body of that size: the power of ten below it."""
-    return 10.0 ** math.floor(math.log10(size))
-
-
 @torch.no_grad()
-def read_run(folder: str | Path) -> list[Clip]:
-    """The sequences of a run, the training one first. prior.npz, observed.npz and truth.npz may be missing: older runs left fewer
-    files, captures have no truth. Errors: DataError naming the file that is missing or of another run."""
+def read_run(folder: str | Path, checkpoint: str | Path | None = None) -> list[Clip]:
+    """The sequences of a run, the training one first, or the motion of a folder that `Twin.export` or eval.py wrote. prior.npz,
+    observed.npz and truth.npz may be missing: older runs left fewer files, captures have no truth. checkpoint: of the run, None for
+    the folder's own, or else its body.npz. Errors: DataError naming the file that is missing or of another run."""
     folder = Path(folder)
     if not folder.is_dir():
-        raise DataError(f"run: expected the folder of a finished run (run=outputs/train/<date>/<time>), found no folder {folder}")
+        raise DataError(f"run: expected the folder of a finished run (run=outputs/train/<date>/<time>), or of an exported motion, "
+                        f"found no folder {folder}")
     rollouts = arrays(folder / "rollout.npz")  # first: it is what a run that has not ended lacks
-    twin = Twin.load(folder / "checkpoints" / "last.ckpt")
-    body = twin.body
+    body = shown_body(folder, checkpoint)
     paths = {kind: folder / f"{'rollout' if kind == 'learned' else kind}.npz" for kind in BODIES}
     files = {kind: arrays(path) for kind, path in paths.items() if kind != "learned" and path.is_file()} | {"learned": rollouts}
-    factor = body.factor(body.heterogeneity)
     spreads = arrays(folder / "uncertainty.npz") if (folder / "uncertainty.npz").is_file() else {}
     clips = []
     for name in (key.removesuffix("/x") for key in rollouts if key.endswith("/x")):
@@ -260,14 +254,26 @@ def read_run(folder: str | Path) -> list[Clip]:
             x = stored[f"{name}/x"]
             bodies[kind] = Motion(x, covariances(stored, name, body), carried_by(body, x))
         clips.append(Clip(name, rollouts[f"{name}/times"], bodies, body.colors.clamp(0, 1).numpy(), body.opacities.numpy(),
-                          factor.numpy(), twin.world, spread_of(spreads, name, shape, folder / "uncertainty.npz"),
+                          body.factor.numpy(), body.world, spread_of(spreads, name, shape, folder / "uncertainty.npz"),
                           **splat_keys(body)))  # fmt: skip
     if not clips:
         raise DataError(f"{folder / 'rollout.npz'}: expected the rollouts of a run, found none")
     return clips
 
 
-def carried_by(body: Body, x: np.ndarray) -> Carried | None:
+def shown_body(folder: Path, checkpoint: str | Path | None) -> ShownBody:
+    """The body whose motions a folder has. Errors: DataError where nothing says what it looks like."""
+    path = Path(checkpoint) if checkpoint is not None else folder / "checkpoints" / "last.ckpt"
+    if checkpoint is None and not path.is_file() and (folder / FILE).is_file():
+        return ShownBody.read(folder / FILE)
+    if checkpoint is None and not folder.joinpath("checkpoints").is_dir():
+        raise DataError(f"{folder}: expected checkpoints/last.ckpt of a run, or body.npz of an exported motion, found neither; "
+                        "checkpoint=<run folder>/checkpoints/last.ckpt names the run's")
+    twin = Twin.load(path)
+    return ShownBody.of(twin.body, twin.world)
+
+
+def carried_by(body: ShownBody, x: np.ndarray) -> Carried | None:
     """The body's splats with its particles at (T, N, 3) [m]; None where it has none."""
     if body.splats is None:
         return None
@@ -275,7 +281,7 @@ def carried_by(body: Body, x: np.ndarray) -> Carried | None:
     return Carried(*(value.numpy() for value in (shown.means, shown.covariances, shown.colors())))
 
 
-def splat_keys(body: Body) -> dict[str, np.ndarray]:
+def splat_keys(body: ShownBody) -> dict[str, np.ndarray]:
     """What clips say of the splats that the body carries."""
     if body.splats is None:
         return {}
@@ -305,7 +311,7 @@ def check_motion(stored: dict[str, np.ndarray], name: str, path: Path, keys: tup
             raise DataError(f"{path}: {name}/{key}: expected finite numbers")
 
 
-def covariances(stored: dict[str, np.ndarray], name: str, body: Body) -> np.ndarray:
+def covariances(stored: dict[str, np.ndarray], name: str, body: ShownBody) -> np.ndarray:
     """(T, N, 3, 3) [m^2] of a motion's splats: the stored ones; else those at rest, deformed by the stored F_tot, or where there
     are positions alone by a local fit to them."""
     if f"{name}/covariances" in stored:

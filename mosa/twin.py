@@ -32,6 +32,8 @@ from mosa.prediction import total_spread
 from mosa.progress import tqdm
 from mosa.rendering.cameras import look_at
 from mosa.rollout_file import save_rollout
+from mosa.shown_body import FILE as BODY_FILE
+from mosa.shown_body import save_body
 from mosa.twin_start import check_frames, check_variant, checked_dt, checked_substeps, start_in
 from mosa.twin_worlds import TwinWorlds
 from mosa.types import Cameras, Rollout
@@ -207,11 +209,12 @@ class Twin:
         self, rollout: Rollout, folder: str | Path, *, video: bool = True, title: str = "learned twin",
         formats: Sequence[str] = ("ply",), colliders: Sequence[Collider] = (),
     ) -> Path:  # fmt: skip
-        """Write `rollout.npz` (with the poses of `colliders`, those of the rollout, where they are given), one PLY a frame (x y z
-        red green blue), `simulation.mp4` and the Gaussians that its images show in `formats` (`data.splat_files.FORMATS`: 3DGS
-        PLY, splat, spz, usd) below `splats/` into `folder`."""
+        """Write into `folder`: `body.npz`, which the viewer shows the motion with; `rollout.npz` (with the poses of `colliders`,
+        those of the rollout, where they are given); one PLY a frame (x y z red green blue); `simulation.mp4`; and the Gaussians
+        that its images show in `formats` (`data.splat_files.FORMATS`: 3DGS PLY, splat, spz, usd) below `splats/`."""
         folder = Path(folder)
         (folder / "ply").mkdir(parents=True, exist_ok=True)
+        save_body(folder / BODY_FILE, self.body, self.world)
         save_rollout(folder / "rollout.npz", {"simulation": rollout}, colliders)
         for t, x in enumerate(rollout.x.cpu().numpy()):
             write_ply(folder / "ply" / f"{t:03d}.ply", x, self.body.colors.cpu().numpy())

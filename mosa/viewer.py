@@ -1,44 +1,35 @@
 """What a run saw, calibrated and learned, side by side in a browser:  python -m mosa.viewer run=outputs/train/<date>/<time>
 
+With --live its twin, to be dropped and pushed (`mosa.live_viewer`).
+
 The observed motion (the reconstruction's, of the sequences learned from) or, of other sequences, the true one where it is
 known; beside it the calibrated prior's and the learned body's. Needs viser: the extra `viewer`.
 """
 
 from __future__ import annotations
 
-import math
-import socket
 import sys
 import threading
-from collections.abc import Sequence
-from itertools import product
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from mosa.clips import BODIES, COLORS, FAINT, GRAY, Clip, cell, read_run
-from mosa.errors import ConfigError, MosaError
+from mosa.clips import BODIES, COLORS, FAINT, GRAY, Clip, read_run
+from mosa.errors import ConfigError, DataError, MosaError
+from mosa.live import Live
+from mosa.live_viewer import LiveViewer
+from mosa.run import named_device
+from mosa.twin import Twin
+from mosa.viewing import add_ground, aim, open_server, view_of
 
 GEOMETRY = ("splats", "particles")
-FIELD_OF_VIEW = math.radians(40)
-"""Vertical, of the first view: less distorted at the rim than viser's 75 degrees."""
 
 
 def first_view(clip: Clip) -> tuple[np.ndarray, np.ndarray]:
     """((3,) camera, (3,) point looked at) [m]: a clip's motions side by side, seen from the front and a little above."""
-    across, up = clip.across, clip.up
-    axes = np.stack([across, up, np.cross(across, up)])  # right, up, to the camera
-    seen = np.concatenate([clip.moved, clip.moved + (len(clip.bodies) - 1) * clip.side]) @ axes.T
-    low, high = seen.min(0), seen.max(0)
-    if clip.world.ground is not None:
-        low[1] = min(low[1], clip.world.ground.height)
-    corners = 0.5 * (high - low) * np.array(list(product((-1, 1), repeat=3)))
-    toward = np.array([0, 0.25, 1]) / math.hypot(0.25, 1)
-    rim = np.abs(np.stack([corners[:, 0], corners @ np.cross(toward, [1, 0, 0])])).max(0)  # to the right, and up
-    distance = (corners @ toward + 1.15 * rim / math.tan(FIELD_OF_VIEW / 2)).max()  # all in a square window, and a margin
-    target = 0.5 * (low + high) @ axes
-    return target + distance * toward @ axes, target
+    seen = np.concatenate([clip.moved, clip.moved + (len(clip.bodies) - 1) * clip.side])
+    return view_of(seen, clip.up, clip.across, None if clip.world.ground is None else clip.world.ground.height)
 
 
 def layouts(clip: Clip) -> tuple[str, ...]:
@@ -51,18 +42,8 @@ class Viewer:
     Errors: ConfigError without viser, or for a host that is no address of this machine."""
 
     def __init__(self, clips: Sequence[Clip], *, host: str = "127.0.0.1", port: int = 8080) -> None:
-        try:
-            import viser
-        except ImportError as error:
-            raise ConfigError("viewer: expected the package viser, found none: pip install -e '.[viewer]' in a clone, "
-                              "pip install viser elsewhere") from error
-        try:  # viser's own server would try port after port and then wait for ever
-            with socket.create_server((host, 0)):
-                pass
-        except OSError as error:
-            raise ConfigError(f"host: expected 127.0.0.1, 0.0.0.0 or this machine's address, found {host!r} ({error})") from error
         self.clips, self.ended, self.drawing = {clip.name: clip for clip in clips}, threading.Event(), threading.RLock()
-        self.server = viser.ViserServer(host=host, port=port, label="MoSA", verbose=False)
+        self.server = open_server(host, port)
         first = clips[0]
         gui = self.server.gui
         self.sequence = gui.add_dropdown("sequence", list(self.clips), initial_value=first.name)
@@ -90,13 +71,8 @@ class Viewer:
         target = first_view(clip)[1]
         self.look(self.server.initial_camera)
         if clip.world.ground is not None:
-            axes = np.stack([clip.across, np.cross(clip.up, clip.across), clip.up], axis=1)  # the grid's x, y and normal
-            at, width = target + (clip.world.ground.height - target @ clip.up) * clip.up, cell(clip.size)
-            at = axes @ np.array([*(width * np.round(axes.T[:2] @ at / width)), at @ clip.up])  # lines at multiples of the width
-            farthest = max(float(np.linalg.norm(first_view(each)[0] - target)) for each in clips)
-            extent = 2 * width * math.ceil(farthest / width)
-            scene.add_grid("/ground", extent, extent, plane="xy", cell_size=width, section_size=10 * width, position=at,
-                           wxyz=np.roll(Rotation.from_matrix(axes).as_quat(), 1))
+            far = max(float(np.linalg.norm(first_view(each)[0] - target)) for each in clips)
+            add_ground(scene, clip.up, clip.across, clip.world.ground.height, clip.size, target, far)
         # viser keeps covariances as float16, whose steps are 6e-8 below 6e-5: in m^2 a splat of 0.5 mm would lose its shape
         self.unit = float(np.sqrt(np.linalg.eigvalsh(clip.splats("learned", 0, "appearance")[1]).max()))
         self.nodes = {}
@@ -112,11 +88,7 @@ class Viewer:
 
     def look(self, *cameras) -> None:
         """The current sequence's first view, for what viser calls cameras."""
-        eye, target = first_view(self.clip)
-        for camera in cameras:
-            camera.position = eye  # first: it takes a connected client's look_at along
-            camera.look_at, camera.fov = target, FIELD_OF_VIEW
-            camera.near = 1e-3 * float(np.linalg.norm(eye - target))
+        aim(*first_view(self.clip), *cameras)
 
     @property
     def clip(self) -> Clip:
@@ -188,32 +160,65 @@ class Viewer:
         self.server.stop()
 
 
-USAGE = """usage: mosa-view <run folder> [host=127.0.0.1] [port=8080]     (or python -m mosa.viewer run=<run folder> ...)
+USAGE = """usage: mosa-view <folder> [--live] [checkpoint=<file>] [host=127.0.0.1] [port=8080] [device=cpu]
+       (or python -m mosa.viewer run=<folder> ...)
 
-What a run saw, calibrated and learned, side by side in a browser.
+What a run saw, calibrated and learned, side by side in a browser; or with --live its twin, to be dropped and pushed.
 
-  <run folder>  of a finished run, as outputs/train/<date>/<time>; also as run=<run folder>
-  host          127.0.0.1: to be seen from this machine alone; 0.0.0.0: from everywhere
-  port          the next free one where it is taken
+  <folder>    of a finished run, as outputs/train/<date>/<time>, or one that Twin.export or eval.py wrote; also as run=<folder>;
+              with --live a checkpoint will do
+  --live      the learned twin in motion: drop, pause, step, reset, and a ball that the mouse pushes it with
+  checkpoint  of the run, where the folder has none: what a motion alone does not say is read from it
+  host        127.0.0.1: to be seen from this machine alone; 0.0.0.0: from everywhere
+  port        the next free one where it is taken
+  device      cpu | cuda: where the twin is simulated (--live)
 
 Needs the package viser: pip install viser."""
 
 
-def options(arguments: Sequence[str]) -> dict[str, str]:
-    """run= (or the folder alone), host=, port= of the command line. Errors: ConfigError naming what is wrong."""
-    known = {"run": None, "host": "127.0.0.1", "port": "8080"}
+def options(arguments: Sequence[str]) -> dict[str, str | None]:
+    """run= (or the path alone), live=, checkpoint=, host=, port=, device= of the command line. Errors: ConfigError naming what is
+    wrong."""
+    known = {"run": None, "checkpoint": None, "live": "false", "host": "127.0.0.1", "port": "8080", "device": "cpu"}
     for argument in arguments:
+        argument = "live=true" if argument == "--live" else argument
         key, mark, value = argument.partition("=")
-        if key not in known and known["run"] is None and Path(argument).is_dir():
+        if key not in known and known["run"] is None and Path(argument).exists():
             key, mark, value = "run", "=", argument
         if not mark or key not in known:
-            raise ConfigError(f"viewer: expected run=<run folder>, host=<address>, port=<number>, found {argument!r}")
+            raise ConfigError("viewer: expected run=<folder>, --live, checkpoint=<file>, host=<address>, port=<number>, "
+                              f"device=<name>, found {argument!r}")
         known[key] = value
     if known["run"] is None:
-        raise ConfigError("run: expected the folder of a finished run, found none; python -m mosa.viewer run=<run folder>")
+        if known["live"] != "true" or known["checkpoint"] is None:
+            raise ConfigError("run: expected the folder of a finished run, found none; python -m mosa.viewer run=<run folder>")
+        known["run"] = known["checkpoint"]
     if not known["port"].isdigit() or not 0 < int(known["port"]) < 65536:
         raise ConfigError(f"port: expected a number from 1 to 65535, found {known['port']!r}")
+    if known["live"] not in ("true", "false"):
+        raise ConfigError(f"live: expected true or false, found {known['live']!r}")
+    if known["live"] == "false" and Path(known["run"]).is_file():
+        raise ConfigError(f"run: expected a folder, found the file {known['run']!r}; --live shows the twin of a checkpoint")
     return known
+
+
+def checkpoint_of(run: str, checkpoint: str | None) -> Path:
+    """Of the twin that --live shows. Errors: DataError where there is none."""
+    path = Path(checkpoint or run)
+    path = path / "checkpoints" / "last.ckpt" if path.is_dir() else path
+    if not path.is_file():
+        raise DataError(f"run: expected the folder of a run with checkpoints/last.ckpt, or a checkpoint, found no file {path}; of "
+                        "a folder that was exported the checkpoint is given by checkpoint=")
+    return path
+
+
+def opened(chosen: Mapping[str, str | None]) -> Viewer | LiveViewer:
+    """The page that `options` ask for, served. Errors: ConfigError, DataError."""
+    place = {"host": chosen["host"], "port": int(chosen["port"])}
+    if chosen["live"] == "true":
+        twin = Twin.load(checkpoint_of(chosen["run"], chosen["checkpoint"]), named_device(chosen["device"]))
+        return LiveViewer(Live(twin), **place)
+    return Viewer(read_run(chosen["run"], chosen["checkpoint"]), **place)
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -222,14 +227,15 @@ def main(arguments: Sequence[str]) -> None:
         return
     try:
         chosen = options(arguments)
-        viewer = Viewer(read_run(chosen["run"]), host=chosen["host"], port=int(chosen["port"]))
+        viewer = opened(chosen)
     except MosaError as error:
         print(f"\n{type(error).__name__}: {error}", file=sys.stderr)
         sys.exit(2)
     port = viewer.server.get_port()
     if port != int(chosen["port"]):
         print(f"port {chosen['port']} is taken; serving on {port}")
-    print(f"http://{chosen['host']}:{port} shows {', '.join(viewer.clips)}; Ctrl-C ends it")
+    shown = ", ".join(viewer.clips) if isinstance(viewer, Viewer) else "the twin, live"
+    print(f"http://{chosen['host']}:{port} shows {shown}; Ctrl-C ends it")
     try:
         viewer.ended.wait()
     except KeyboardInterrupt:

@@ -96,7 +96,8 @@ def test_the_viewer_explains_itself(capsys, flag):
 
 
 def test_a_folder_alone_is_the_run(tmp_path):
-    assert viewer.options([str(tmp_path), "port=9000"]) == {"run": str(tmp_path), "host": "127.0.0.1", "port": "9000"}
+    assert viewer.options([str(tmp_path), "port=9000"]) == {
+        "run": str(tmp_path), "checkpoint": None, "live": "false", "host": "127.0.0.1", "port": "9000", "device": "cpu"}
 
 
 def test_a_warning_and_what_ended_a_run_are_in_the_log(tmp_path, capsys, monkeypatch):

@@ -23,6 +23,7 @@ from mosa.physics.contact.colliders import domain_walls
 from mosa.rollout_file import save_observed, save_rollout
 from mosa.twin import Twin
 from mosa.types import Appearance, MotionCues, Rollout, Splats
+from mosa.viewing import FIELD_OF_VIEW
 
 N, T, SEEN = 27, 5, 3
 GROUND = -0.2
@@ -53,6 +54,7 @@ def run(tmp_path, monkeypatch):
             p.copy_(torch.randn(p.shape, generator=torch.Generator().manual_seed(0)) if p.dim() == 2 else torch.zeros_like(p))
     twin = Twin(body, build_world(world), 0.02, {}, Start(torch.eye(3), torch.zeros(3), torch.zeros(3), torch.zeros(3)))
     monkeypatch.setattr(Twin, "load", lambda path: twin)
+    (tmp_path / "checkpoints").mkdir()
     save_rollout(tmp_path / "rollout.npz", {"train": rollout(0), "test/test_60": rollout(0.2)})
     save_rollout(tmp_path / "prior.npz", {"train": rollout(-0.03), "test/test_60": rollout(0.2)})
     seen = rollout(0.01)
@@ -129,6 +131,59 @@ def test_splats_that_the_particles_carry_are_shown(run):
     assert read_run(run)[0].splats("learned", 0, "appearance")[0].shape == (N, 3)
 
 
+@pytest.mark.parametrize("carrying", [False, True])
+def test_an_exported_motion_is_shown_without_its_run(run, tmp_path, carrying, monkeypatch):
+    twin = Twin.load("")
+    if carrying:
+        upright = torch.tensor([1.0, 0, 0, 0]).repeat(2, 1)
+        splats = Splats(twin.body.rest[[0, 13]], torch.full((2, 3), 0.02), upright, torch.full((2,), 0.7), torch.full((2, 3), 0.5))
+        monkeypatch.setattr(twin.body, "splats", CarriedSplats(Appearance(splats, torch.zeros(2, 1, 3)), twin.body.rest))
+    wanted = read_run(run)[0]
+    folder = twin.export(rollout(0), tmp_path / "falling", video=False)
+    monkeypatch.setattr(Twin, "load", lambda path: (_ for _ in ()).throw(AssertionError(f"{path} was read")))
+    (clip,) = read_run(folder)
+    assert clip.name == "simulation" and list(clip.bodies) == ["learned"] and clip.world.ground.height == pytest.approx(GROUND)
+    assert clip.up.tolist() == [0, 1, 0] and np.array_equal(clip.factor, wanted.factor)
+    for one, other in zip(clip.splats("learned", 3, "appearance"), wanted.splats("learned", 3, "appearance")):
+        assert len(one) == (2 if carrying else N) and np.allclose(one, other, atol=1e-6)
+    assert (viewer.first_view(clip)[0] != viewer.first_view(wanted)[0]).any() and "**simulation**" in clip.caption(0)
+    stored = dict(np.load(folder / "body.npz"))
+    for part, broken in (("up", np.zeros(3, np.float32)), ("factor", stored["factor"][:3]), ("rest", np.full((N, 3), np.nan))):
+        np.savez(folder / "body.npz", **stored | {part: broken})
+        with pytest.raises(DataError, match=rf"^[^:]*body\.npz: .*{part}"):
+            read_run(folder)
+    (folder / "body.npz").unlink()
+    with pytest.raises(DataError, match=r"falling: expected checkpoints/last\.ckpt of a run, or body\.npz .* checkpoint="):
+        read_run(folder)
+    monkeypatch.setattr(Twin, "load", lambda path: twin)
+    assert np.array_equal(read_run(folder, "last.ckpt")[0].factor, wanted.factor)
+
+
+def test_what_is_to_be_shown_is_asked_for_on_the_command_line(run, monkeypatch):
+    live = viewer.options([str(run), "--live", "device=cpu"])
+    assert live["live"] == "true" and live["run"] == str(run)
+    with pytest.raises(DataError, match=r"run: expected .* a checkpoint, found no file .*last\.ckpt; .*checkpoint="):
+        viewer.checkpoint_of(live["run"], None)
+    file = run / "checkpoints" / "last.ckpt"
+    file.write_bytes(b"")
+    assert viewer.checkpoint_of(str(run), None) == viewer.checkpoint_of(str(file), None) == file
+    assert viewer.options([str(file), "live=true"])["run"] == str(file)
+    assert viewer.options([f"checkpoint={file}", "--live"])["run"] == str(file)
+    with pytest.raises(ConfigError, match=r"run: expected a folder, found the file .*--live"):
+        viewer.options([str(file)])
+    with pytest.raises(ConfigError, match="live: expected true or false, found 'yes'"):
+        viewer.options([str(run), "live=yes"])
+    pytest.importorskip("viser")
+    twin = Twin.load("")
+    monkeypatch.setattr(Twin, "load", lambda path, device="cpu": twin)
+    monkeypatch.setattr(twin, "training_start", replace(twin.training_start, center=torch.tensor([0.0, 0.2, 0.0])))
+    shown = viewer.opened(live | {"port": "0"})
+    try:
+        assert "drop" in shown.buttons and shown.live.twin is twin
+    finally:
+        shown.stop()
+
+
 def test_flat_bodies_keep_the_truth_s_splats(run):
     """Where neighbours lie in a plane no deformation can be fitted: the fit says 0, and a splat of that is not seen."""
     clouds = rollout(0).x[0] * torch.tensor([1.0, 1.0, 0.0])
@@ -162,7 +217,7 @@ def test_the_first_view_holds_all_bodies_and_the_ground(run, up):
     points = np.concatenate([clip.moved + place * clip.side for place in range(3)])
     points = np.concatenate([points, points + np.outer(GROUND - points @ clip.up, clip.up)]) - eye
     tangent = np.abs(points @ np.stack([right / np.linalg.norm(right), upward], axis=1)) / (points @ forward)[:, None]
-    inside = tangent / np.tan(viewer.FIELD_OF_VIEW / 2)  # 1 at the rim of a square window
+    inside = tangent / np.tan(FIELD_OF_VIEW / 2)  # 1 at the rim of a square window
     assert 0.5 < inside.max() < 1 and forward @ clip.up < 0
 
 

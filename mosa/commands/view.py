@@ -1,4 +1,4 @@
-"""What a run saw, calibrated and learned, side by side in a browser:  mosa-view outputs/train/<date>/<time>"""
+"""What a run saw, calibrated and learned, side by side in a browser, or its twin live:  mosa-view outputs/train/<date>/<time>"""
 
 import os
 import sys

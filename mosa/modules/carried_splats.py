@@ -19,6 +19,7 @@ from mosa.types import Appearance, Cameras, Splats
 
 if TYPE_CHECKING:
     from mosa.modules.body import Body
+    from mosa.shown_body import ShownBody
 
 APPEARANCES = ("splats", "particles")
 
@@ -111,7 +112,7 @@ class Seen:
         return (constant * shades[..., None]).clamp(0, 1)
 
 
-def seen(body: Body, positions: Tensor, F_tot: Tensor | None) -> Seen:
+def seen(body: Body | ShownBody, positions: Tensor, F_tot: Tensor | None) -> Seen:
     """The body's splats where its particles are at positions (T, N, 3) [m]; where it has none the particles, deformed by F_tot
     (T, N, 3, 3), which splats do not need."""
     splats = body.splats

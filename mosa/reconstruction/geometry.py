@@ -6,12 +6,14 @@ that is. """
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field, replace
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from mosa.errors import DataError
 from mosa.reconstruction.carving import CarvingSettings, carve, keep_silhouettes
 from mosa.reconstruction.flight import free_motions
 from mosa.reconstruction.hull import Volume, shave_ridges
@@ -104,33 +106,61 @@ def free_frames_at_most(scene: Scene, count: int) -> list[int]:
     return frames
 
 
+def holds_matter(distance: Volume) -> bool:
+    """Whether any point of the grid lies inside of the surface."""
+    return bool((distance.values < 0).any())
+
+
+def nothing_left(scene: Scene, hull: Geometry) -> Geometry:
+    """The hull's geometry, where the images left nothing of it, with a warning that says so."""
+    warnings.warn(
+        f"scene {scene.name}: carving and refinement left nothing of a visual hull of {int(hull.body.values.sum())} voxels of "
+        f"{1e3 * hull.body.pitch:.3g} mm; the hull is the body, as with reconstruction.geometry.source=hull. More voxels "
+        "(reconstruction.resolution) or pixels (scene.scale) may tell more", stacklevel=3,
+    )  # fmt: skip
+    return hull
+
+
 def find_geometry(scene: Scene, hull: Volume, settings: GeometrySettings, *, ridge_passes: int, sigma: float, margin: int,
                   device: torch.device | str) -> Geometry:
-    """The body of `scene` inside its visual hull (occupancy of frame 0, training cameras only), read from training frames alone.
+    """The body of `scene` inside its visual hull (occupancy of frame 0, training cameras only), read from training frames alone;
+    the hull's where they leave nothing of it. Errors: DataError where the hull has no inside.
 
     ridge_passes, sigma: of `shave_ridges`, which gives the body where source is hull, and else a start; margin: px around the
     mattes. """
-    solid = replace(hull, values=(hull.values > 0.5).float())
-    volume = solid.occupied_volume()
-    if settings.source == "hull":
-        cameras = scene.cameras.select(scene.training_cameras)
-        body = shave_ridges(solid, cameras, passes=ridge_passes, sigma=sigma) if ridge_passes else solid
+    whole = replace(hull, values=(hull.values > 0.5).float())
+    volume = whole.occupied_volume()
+    cameras = scene.cameras.select(scene.training_cameras)
+
+    def of_hull() -> Geometry:
+        body = shave_ridges(whole, cameras, passes=ridge_passes, sigma=sigma) if ridge_passes else whole
         return Geometry(body, volume, torch.empty(0), 1)
+
+    if not holds_matter(signed_distance(whole)):
+        raise DataError(f"scene {scene.name}: expected a visual hull with an inside, found {int(whole.values.sum())} voxels of "
+                        f"{1e3 * hull.pitch:.3g} mm: take more voxels (reconstruction.resolution) or more pixels (scene.scale), "
+                        "and look at the mattes of frame 0 and at scene.box")
+    if settings.source == "hull":
+        return of_hull()
     frames = free_frames_at_most(scene, max(1, settings.frames))
     windows = object_windows(scene, scene.training_cameras, frames, margin=margin).to(device)
     seen = [windows.of_frame(t) for t in frames]
-    solid = Volume(solid.values.to(device), solid.origin.to(device), solid.pitch)
+    solid = Volume(whole.values.to(device), whole.origin.to(device), whole.pitch)
     bound = signed_distance(solid)
     start = carve(solid, seen[0], settings.carving)
     if ridge_passes:
         # of the whole hull: rounding would widen what was carved by mistake
-        rounded = shave_ridges(solid, scene.cameras.select(scene.training_cameras), passes=ridge_passes, sigma=sigma)
+        rounded = shave_ridges(solid, cameras, passes=ridge_passes, sigma=sigma)
         start = replace(start, values=torch.minimum(start.values, rounded.values))
     distance = signed_distance(start)
     distance = refine(distance, bound, seen[:1], settings.refinement, settings.first)
+    if not holds_matter(distance):
+        return nothing_left(scene, of_hull())
     motions = free_motions(scene, distance, seen)
     moved = [seen[0], *(motion.windows(views) for motion, views in zip(motions, seen[1:]))]
     distance = refine(distance, bound, moved, settings.refinement, settings.then)
+    if not holds_matter(distance):
+        return nothing_left(scene, of_hull())
     information = surface_information(distance, moved, settings.refinement, settings.then[-1][1])
     inner = slice(BORDER, -BORDER)
     kept = keep_silhouettes(voxels(distance, solid).values > 0.5, solid, seen[0])

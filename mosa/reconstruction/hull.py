@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -79,6 +79,17 @@ def _grow(mattes: Tensor, radius: int) -> Tensor:
     return torch.as_tensor(np.stack([cv2.dilate(m, kernel) for m in mattes.cpu().numpy()]), device=mattes.device)
 
 
+def _grown_views(mattes: Tensor, cameras: Cameras, radius: int) -> tuple[Tensor, Cameras]:
+    """Mattes grown by `radius` [px], in images that are wider by more than that: a matte that growing alone brings to the border
+    would read as one that runs over it, and its view would hide nothing any more."""
+    border = radius + 1
+    wide = F.pad(mattes[:, None], (border,) * 4, mode="replicate")[:, 0]
+    K = cameras.K.clone()
+    K[:, :2, 2] += border
+    views = replace(cameras, K=K, width=cameras.width + 2 * border, height=cameras.height + 2 * border)
+    return _grow(wide, radius), views
+
+
 def hull_bounds(mattes: Tensor, cameras: Cameras, box: Tensor, *, resolution: int = 48) -> Tensor:
     """Bounds of the object, (2, 3) [m], found in two passes of a coarse grid over `box` with mattes grown by half a cell.
 
@@ -93,8 +104,8 @@ def hull_bounds(mattes: Tensor, cameras: Cameras, box: Tensor, *, resolution: in
         points = grid.points()
         depth = (points.reshape(-1, 3).mean(0) @ cameras.w2c[:, :3, :3].transpose(1, 2) + cameras.w2c[:, :3, 3])[:, 2]
         radius = float((0.9 * pitch * cameras.K[:, 0, 0] / depth.clamp(min=1e-3)).max())
-        grown = _grow(mattes, max(1, min(int(radius + 1), min(cameras.width, cameras.height) // 4)))
-        inside = points[occupancy(points, grown, cameras) > 0.5]
+        radius = max(1, min(int(radius + 1), min(cameras.width, cameras.height) // 4))
+        inside = points[occupancy(points, *_grown_views(mattes, cameras, radius)) > 0.5]
         if len(inside) == 0:
             raise DataError(
                 f"visual hull: no point of the box {bounds.tolist()} lies inside all {len(cameras)} mattes; check "

@@ -14,7 +14,7 @@ from mosa.data.builtin.parts import Shape, coat, ellipsoid
 from mosa.data.builtin.renderer import render_surface, ring_of_cameras
 from mosa.data.builtin.surface import extract_surface
 from mosa.data.builtin.takes import pictures_to_footage
-from mosa.errors import ConfigError
+from mosa.errors import ConfigError, DataError
 from mosa.reconstruction.carving import CarvingSettings, carve, keep_silhouettes
 from mosa.reconstruction.field import first_crossing, sample, scatter, smooth
 from mosa.reconstruction.flight import Motion, free_motions
@@ -147,6 +147,18 @@ def test_the_surface_moves_to_where_colours_and_outlines_put_it(squashed):
     assert errors[1].mean().abs() < errors[0].mean().abs()
     known = sample(information[None], (surface - distance.origin) / distance.pitch)[:, 0]
     assert (known > 0).float().mean() > 0.8
+
+
+def test_a_body_of_which_images_leave_nothing_is_its_hull_and_an_empty_hull_is_named(bowl, monkeypatch):
+    monkeypatch.setattr("mosa.reconstruction.geometry.carve", lambda body, *_: replace(body, values=torch.zeros_like(body.values)))
+    with pytest.warns(UserWarning, match=r"scene bowl: carving and refinement left nothing of a visual hull of \d+ voxels of 6 mm"):
+        hull, geometry = found(bowl, first=(), then=())
+    assert torch.equal(geometry.body.values, found(bowl, source="hull")[1].body.values) and geometry.free_frames == 1
+    assert geometry.body.occupied_volume() > 0.8 * geometry.hull_volume
+    flat = replace(hull, values=torch.zeros_like(hull.values))
+    flat.values[5, 5, 5] = 1.0
+    with pytest.raises(DataError, match=r"scene bowl: expected a visual hull with an inside, found 1 voxels of 6 mm: .*resolution"):
+        find_geometry(bowl, flat, GeometrySettings(), ridge_passes=0, sigma=1.2, margin=6, device="cpu")
 
 
 def test_free_flight_is_followed_and_ends_where_the_body_deforms(squashed):

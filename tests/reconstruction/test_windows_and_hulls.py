@@ -6,6 +6,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from mosa.data.builtin.renderer import ring_of_cameras
 from mosa.reconstruction import hull
 from mosa.reconstruction.observed import object_windows
 
@@ -40,3 +41,22 @@ def test_grown_mattes_are_maxima_over_squares(squashed):
     for radius in (0, 1, 7):
         wanted = F.max_pool2d(mattes[:, None], 2 * radius + 1, stride=1, padding=radius)[:, 0]
         assert torch.equal(hull._grow(mattes, radius), wanted)
+
+
+def test_a_small_body_in_a_wide_box_is_found():
+    """A ball of 5 cm in a box of 3.2 m, large in every picture: mattes grown by half a cell of the box reach the pictures' borders.
+    """
+    rig = ring_of_cameras(6, 100, target=(0, 0, 0), distance=0.3, elevations=(0.1, 0.8), field=0.035, turn=0.1)
+    axis = torch.linspace(-0.025, 0.025, 41)
+    ball = torch.cartesian_prod(axis, axis, axis)
+    ball = ball[ball.norm(dim=1) <= 0.025]
+    mattes = torch.zeros(6, 100, 100)
+    for matte, K, w2c in zip(mattes, rig.K, rig.w2c):
+        pixel = (ball @ w2c[:3, :3].T + w2c[:3, 3]) @ K.T
+        column, row = (pixel[:, :2] / pixel[:, 2:]).long().unbind(1)
+        matte[row, column] = 1
+    mattes = F.max_pool2d(mattes[:, None], 3, 1, 1)[:, 0]
+    assert mattes[:, 0].sum() == 0 and mattes.mean() > 0.2
+    bounds = hull.hull_bounds(mattes, rig, torch.tensor([[-1.6, -0.1, -1.6], [1.6, 1.0, 1.6]]))
+    assert (bounds[0] <= -0.025).all() and (bounds[1] >= 0.025).all()
+    assert (bounds[1] - bounds[0]).max() < 0.07

@@ -1,0 +1,104 @@
+"""What both pages of the viewer share: the server, the ground, rigid solids, and the view that holds what is to be seen."""
+
+from __future__ import annotations
+
+import math
+import socket
+from itertools import product
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mosa.errors import ConfigError
+from mosa.physics.contact.colliders import Box, Capsule, Cylinder, Shape, Sphere
+
+FIELD_OF_VIEW = math.radians(40)
+"""Vertical, of the first view: less distorted at the rim than viser's 75 degrees."""
+SOLID = (150, 160, 175)
+"""8-bit colour of rigid solids."""
+
+
+def open_server(host: str, port: int) -> Any:
+    """A viser server. port: the next free one where it is taken. Errors: ConfigError without viser, or for a host that is no
+    address of this machine."""
+    try:
+        import viser
+    except ImportError as error:
+        raise ConfigError("viewer: expected the package viser, found none: pip install -e '.[viewer]' in a clone, "
+                          "pip install viser elsewhere") from error
+    try:  # viser's own server would try port after port and then wait for ever
+        with socket.create_server((host, 0)):
+            pass
+    except OSError as error:
+        raise ConfigError(f"host: expected 127.0.0.1, 0.0.0.0 or this machine's address, found {host!r} ({error})") from error
+    return viser.ViserServer(host=host, port=port, label="MoSA", verbose=False)
+
+
+def horizontal(up: np.ndarray) -> np.ndarray:
+    """(3,) unit vector across `up` (3,): to the right in the first view."""
+    across = np.eye(3)[np.abs(up).argmin()]
+    across = across - (across @ up) * up
+    return across / np.linalg.norm(across)
+
+
+def view_of(points: np.ndarray, up: np.ndarray, across: np.ndarray, ground: float | None) -> tuple[np.ndarray, np.ndarray]:
+    """((3,) camera, (3,) point looked at) [m] that hold points (M, 3) and the ground below them, from the front and a little above.
+    ground: its height along `up` [m], None where there is none."""
+    axes = np.stack([across, up, np.cross(across, up)])  # right, up, to the camera
+    seen = points @ axes.T
+    low, high = seen.min(0), seen.max(0)
+    if ground is not None:
+        low[1] = min(low[1], ground)
+    corners = 0.5 * (high - low) * np.array(list(product((-1, 1), repeat=3)))
+    toward = np.array([0, 0.25, 1]) / math.hypot(0.25, 1)
+    rim = np.abs(np.stack([corners[:, 0], corners @ np.cross(toward, [1, 0, 0])])).max(0)  # to the right, and up
+    distance = (corners @ toward + 1.15 * rim / math.tan(FIELD_OF_VIEW / 2)).max()  # all in a square window, and a margin
+    target = 0.5 * (low + high) @ axes
+    return target + distance * toward @ axes, target
+
+
+def aim(eye: np.ndarray, target: np.ndarray, *cameras: Any) -> None:
+    """The first view, for what viser calls cameras."""
+    for camera in cameras:
+        camera.position = eye  # first: it takes a connected client's look_at along
+        camera.look_at, camera.fov = target, FIELD_OF_VIEW
+        camera.near = 1e-3 * float(np.linalg.norm(eye - target))
+
+
+def cell(size: float) -> float:
+    """Width [m] of a ground cell for a body of that size [m]: the power of ten below it."""
+    return 10.0 ** math.floor(math.log10(size))
+
+
+def add_ground(scene: Any, up: np.ndarray, across: np.ndarray, height: float, size: float, target: np.ndarray, far: float) -> None:
+    """A grid at `height` along `up` [m] in cells for a body of `size` [m], about `target` (3,), `far` [m] to each side."""
+    axes = np.stack([across, np.cross(up, across), up], axis=1)  # the grid's x, y and normal
+    at, width = target + (height - target @ up) * up, cell(size)
+    at = axes @ np.array([*(width * np.round(axes.T[:2] @ at / width)), at @ up])  # lines at multiples of the width
+    extent = 2 * width * math.ceil(far / width)
+    scene.add_grid("/ground", extent, extent, plane="xy", cell_size=width, section_size=10 * width, position=at, wxyz=turn(axes))
+
+
+def turn(rotation: np.ndarray) -> np.ndarray:
+    """(4,) quaternion as viser has it, real part first, of a (3, 3) rotation."""
+    return np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
+
+
+def add_solid(scene: Any, name: str, shape: Shape, color: tuple[int, int, int] = SOLID, **options) -> Any | None:
+    """A node for a collider's shape; None for half spaces and meshes, which are not drawn."""
+    import trimesh  # viser brings it
+
+    if isinstance(shape, Sphere):
+        mesh = trimesh.creation.icosphere(subdivisions=3, radius=shape.radius)
+    elif isinstance(shape, Box):
+        mesh = trimesh.creation.box(extents=shape.size)
+    elif isinstance(shape, Cylinder):
+        mesh = trimesh.creation.cylinder(radius=shape.radius, height=shape.length)
+    elif isinstance(shape, Capsule):
+        mesh = trimesh.creation.capsule(radius=shape.radius, height=shape.length)
+        mesh.apply_translation(-mesh.bounds.mean(0))
+    else:
+        return None
+    return scene.add_mesh_simple(name, np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32), color=color,
+                                 flat_shading=isinstance(shape, Box), **options)  # fmt: skip
