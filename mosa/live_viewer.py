@@ -61,8 +61,9 @@ class LiveViewer:
         self.gizmo = scene.add_transform_controls("/push", 2.5 * live.radius, disable_rotations=True, depth_test=False,
                                                   position=ball)  # fmt: skip
         self.gizmo.on_update(lambda _: self.pushed(self.gizmo.position))
-        if hasattr(self.ball, "on_drag_update"):  # of newer viser: the ball itself follows the mouse, in the plane of the screen
-            self.ball.on_drag_update("left")(self.dragged)
+        self.draggable = hasattr(self.ball, "on_drag")  # newer viser: the ball itself follows the mouse, in the screen's plane
+        if self.draggable:
+            self.ball.on_drag("left")(self.dragged)
         self.buttons["drop"].on_click(lambda _: self.drop())
         self.buttons["pause"].on_click(lambda _: self.pause())
         self.buttons["step"].on_click(lambda _: self.step())

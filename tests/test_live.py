@@ -210,6 +210,7 @@ def test_the_page_drops_steps_pushes_and_outlives_a_divergence():
         assert live.time == at and not live.running
         shown.pushed((0.1, 0.2, 0.3))
         assert live.target == pytest.approx([0.1, 0.2, 0.3])
+        assert shown.draggable  # by the viser that the tests ask for
         here = live.hand_position.copy()
         shown.dragged(SimpleNamespace(start_position=(0.0, 0.0, 0.0), end_position=(0.003, 0.0, 0.0)))
         assert live.target == pytest.approx(here + np.array([0.003, 0, 0])) and np.allclose(shown.gizmo.position, live.target)
