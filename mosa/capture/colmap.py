@@ -43,7 +43,7 @@ def read_model(folder: Path) -> dict[str, Camera]:
                 raise DataError(f"{cameras}: file not found; a COLMAP model has it beside {images.name}")
             try:
                 return assembled(cameras_of(cameras), images_of(images), images)
-            except (struct.error, UnicodeDecodeError) as error:
+            except (struct.error, UnicodeDecodeError, OverflowError) as error:
                 raise DataError(f"{folder}: expected a COLMAP model, found a damaged file ({error}); export it again") from error
     raise DataError(f"{folder}: expected images.bin or images.txt of a COLMAP model, found neither")
 
@@ -96,9 +96,20 @@ def numbers(words: list[str], where: str) -> list[float]:
         raise DataError(f"{where}: expected numbers, found {' '.join(words)[:80]!r}") from error
 
 
+def whole(words: list[str], where: str) -> list[int]:
+    found = numbers(words, where)
+    if not all(value.is_integer() and abs(value) < 2**63 for value in found):
+        raise DataError(f"{where}: expected whole numbers, found {' '.join(words)[:80]!r}")
+    return [int(value) for value in found]
+
+
 def lines_of(file: Path) -> list[tuple[int, str]]:
-    """Numbered lines that are no comments, empty ones included."""
-    return [(i, line.strip()) for i, line in enumerate(file.read_text().splitlines(), 1) if not line.startswith("#")]
+    """Numbered lines that are no comments, empty ones included. Errors: DataError."""
+    try:
+        lines = file.read_text().splitlines()
+    except UnicodeDecodeError as error:
+        raise DataError(f"{file}: expected the text of a COLMAP model, found a damaged file ({error}); export it again") from error
+    return [(i, line.strip()) for i, line in enumerate(lines, 1) if not line.startswith("#")]
 
 
 def text_cameras(file: Path) -> dict[int, Intrinsics]:
@@ -109,7 +120,7 @@ def text_cameras(file: Path) -> dict[int, Intrinsics]:
             continue
         if len(words) < 5:
             raise DataError(f"{where}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {line[:80]!r}")
-        number, width, height = (int(v) for v in numbers([words[0], *words[2:4]], where))
+        number, width, height = whole([words[0], *words[2:4]], where)
         found[number] = intrinsics(words[1], width, height, numbers(words[4:], where), where)
     return found
 
@@ -123,8 +134,8 @@ def text_images(file: Path) -> list[tuple[str, int, np.ndarray, np.ndarray]]:
         words, where = line.split(maxsplit=9), f"{file}, line {i}"
         if len(words) < 10:
             raise DataError(f"{where}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, found {line[:80]!r}")
-        values = numbers(words[:9], where)
-        found.append((words[9], int(values[8]), np.array(values[1:5]), np.array(values[5:8])))
+        (_, number), values = whole([words[0], words[8]], where), numbers(words[1:8], where)
+        found.append((words[9], number, np.array(values[:4]), np.array(values[4:])))
     return found
 
 
@@ -167,16 +178,22 @@ def read_points(folder: Path) -> np.ndarray:
             for _ in range(counted(data, binary, 100 * MOST)):
                 found.append(struct.unpack_from("<3d", data, at + 8))
                 at += 51 + 8 * struct.unpack_from("<Q", data, at + 43)[0]
-        except struct.error as error:
+        except (struct.error, OverflowError) as error:
             raise DataError(
                 f"{binary}: expected points of a COLMAP model, found a damaged file ({error}); export it again"
             ) from error
     elif text.is_file():
-        found = [numbers(line.split()[1:4], f"{text}, line {i}") for i, line in lines_of(text) if line]
+        found = [point(line.split(maxsplit=4), f"{text}, line {i}") for i, line in lines_of(text) if line]
     else:
         return np.zeros((0, 3))
     points = np.array(found, float).reshape(-1, 3)
     return points[np.isfinite(points).all(1)]
+
+
+def point(words: list[str], where: str) -> list[float]:
+    if len(words) < 4:
+        raise DataError(f"{where}: expected POINT3D_ID X Y Z, found {' '.join(words)[:80]!r}")
+    return numbers(words[1:4], where)
 
 
 def counted(data: bytes, file: Path, most: int = MOST) -> int:

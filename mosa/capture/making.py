@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -49,6 +50,8 @@ APART = 0.12
 """Radii of the object from where the others see it, from which on a phone is suspected."""
 CORRECTIONS = 2
 """Times that the fall is fitted again, with the outlines that its hull has."""
+FAR_OFF = 1.5
+"""Factor between a scale that is given and that of the fall from which on one of them is a mistake."""
 COARSE = 320
 """Pixels of images in which the ground is looked for."""
 
@@ -65,7 +68,7 @@ def make(cfg: DictConfig) -> dict[str, Any]:
 
 def capture(values: Mapping[str, Any]) -> dict[str, Any]:
     """From the keys of conf/capture.yaml. Errors: ConfigError, DataError."""
-    folder = Path(values["output"])
+    folder = output_folder(values)
     clips = [open_clip(file, of_phone(values, file.stem, "fps")) for file in find_videos(values["videos"])]
     refuse_unknown_phones(values, [clip.path.stem for clip in clips])
     phones = read_phones(values["videos"], values["poses"], {clip.path.name: clip.size for clip in clips})
@@ -83,6 +86,7 @@ def capture(values: Mapping[str, Any]) -> dict[str, Any]:
     times = common_times(exposures, fall.window, before=values["before"], after=values["after"], rate=values["rate"])
     ground = None if values["ground"] is None else np.array(values["ground"], float)
     own = world is None
+    free = check_known_world(fall, knowledge, phones, tracks, flight, ground if own else None)
     world = world_of(fall, phones, ground) if own else world
     gains = gains_of(values, phones, clips, plates, world, tracks, fall)
     for v, phone in enumerate(tqdm(phones, desc="frames at common times", unit="phone")):
@@ -105,7 +109,7 @@ def capture(values: Mapping[str, Any]) -> dict[str, Any]:
         world = world.lowered(height)
         centres = centres - [0, height, 0]
         write_transforms(folder, phones, times, world)
-    found = figures(values, phones, clips, tracks, fall, knowledge, world, times, centres, radius, floor, gains)
+    found = figures(values, phones, clips, tracks, fall, free, knowledge, world, times, centres, radius, floor, gains)
     (folder / FILE).write_text(json.dumps(found, indent=1))
     write_report(folder, found, phones, fall, exposures, world, times)
     for line in found["warnings"]:
@@ -119,6 +123,44 @@ def capture(values: Mapping[str, Any]) -> dict[str, Any]:
         found["command"],
     )
     return found
+
+
+def output_folder(values: Mapping[str, Any]) -> Path:
+    """Made, and tried, before minutes are spent. Errors: DataError where it cannot be written, or is what is read."""
+    folder = Path(values["output"])
+    for key in ("videos", "poses", "plates", "masks", "like"):
+        if values[key] is not None and folder.resolve() == Path(values[key]).resolve():
+            raise ConfigError(f"output: expected a folder of its own, found that of {key}={values[key]}")
+    try:
+        (folder / "images").mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise DataError(f"output: {folder}: expected a folder that can be written, found none ({error.strerror})") from error
+    return folder
+
+
+def check_known_world(
+    fall: Fall, knowledge: Knowledge, phones: list[Phone], tracks: list[Track], flight: tuple[float, float] | None,
+    ground: np.ndarray | None,
+) -> Fall:
+    """What the keys say of scale, up and ground is possible. Returns the fall as it is where nobody knows scale and up: a known
+    scale pulls the acceleration to gravity's, so that of it a mistake cannot be told. Errors: ConfigError."""
+    given = knowledge.scale is not None or knowledge.up is not None
+    free = fit_fall(phones, tracks, fall.offsets, replace(knowledge, scale=None, up=None), flight) if given else fall
+    if knowledge.scale is not None and not 1 / FAR_OFF < knowledge.scale / free.scale < FAR_OFF:
+        raise ConfigError(f"scale: expected about {free.scale:.3g} m per unit of the poses, as the object then falls at "
+                          f"{knowledge.gravity:g} m/s^2, found {knowledge.scale:g}; check like, fps and gravity too")  # fmt: skip
+    if knowledge.up is not None and free.acceleration @ knowledge.up >= 0:
+        raise ConfigError(f"up: expected a direction against the fall, found {list(map(float, knowledge.up))}, along which the "
+                          "object falls upwards")  # fmt: skip
+    if ground is not None:
+        below = float((fall.at(np.array(fall.window[1])) - ground) @ fall.up)
+        extent = float(np.ptp([phone.camera.centre for phone in phones], axis=0).max())
+        if not 0 < below < extent:
+            raise ConfigError(f"ground: expected a point of the floor less than {extent:.3g} (units of the poses, the distance "
+                              f"between phones) below where the free fall ends, found one {below:.3g} below it")  # fmt: skip
+    return free
 
 
 def found_fall(
@@ -194,12 +236,13 @@ def centres_of(exposures, phones: list[Phone], times: np.ndarray) -> np.ndarray:
 
 
 def figures(
-    values, phones, clips, tracks, fall: Fall, knowledge: Knowledge, world: World, times, centres, radius, floor, gains
+    values, phones, clips, tracks, fall: Fall, free: Fall, knowledge: Knowledge, world: World, times, centres, radius, floor, gains
 ) -> dict[str, Any]:
-    """All that capture.json says."""
+    """All that capture.json says. free: the fall without what was known of scale and up, which it so checks."""
     box = box_of(centres, radius)
     folder = Path(values["output"])
-    acceleration = float(np.linalg.norm(fall.acceleration)) * world.scale
+    acceleration = float(np.linalg.norm(free.acceleration)) * world.scale
+    turned = float(np.degrees(np.arccos(np.clip(-free.acceleration @ fall.up / np.linalg.norm(free.acceleration), -1, 1))))
     per_phone = []
     for v, (phone, clip, track) in enumerate(zip(phones, clips, tracks)):
         per_phone.append({
@@ -216,7 +259,7 @@ def figures(
     free = int((times <= fall.window[1]).sum())
     found = {
         "phones": per_phone, "fall": {"window": list(fall.window), "centres": fall.frames, "noise_px": fall.noise,
-                                      "acceleration": acceleration},
+                                      "acceleration": acceleration, "turned_degrees": turned},
         "scale": world.scale, "scale_sd": None if knowledge.scale is not None else fall.scale_sd,
         "up": fall.up.tolist(), "up_sd_degrees": None if knowledge.up is not None else fall.up_sd, "ground": floor,
         "radius": radius, "frames": len(times), "free_frames": free, "rate": float(1 / np.diff(times).mean()), "box": box,
@@ -239,6 +282,8 @@ def warnings_of(found: dict[str, Any], values: Mapping[str, Any], knowledge: Kno
             f"with the scale {knowledge.scale:.6g} the object falls with {found['fall']['acceleration']:.3g} m/s^2 in place of "
             f"{g:.3g}: check scale, fps and gravity"
         )
+    if knowledge.up is not None and found["fall"]["turned_degrees"] > 3:
+        said.append(f"the object falls {found['fall']['turned_degrees']:.1f} degrees beside the given up: check up, or like")
     for phone, record in zip(phones, found["phones"]):
         if record["jitter"] > 0.5:
             said.append(

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from mosa.capture.colmap import is_model, read_model, read_points
-from mosa.capture.phones import Camera, Phone
+from mosa.capture.phones import Camera, Phone, plausible
 from mosa.data.footage import matrix, number, read_json, world_to_camera
 from mosa.data.lens import COEFFICIENTS, is_fisheye
 from mosa.errors import DataError
@@ -40,7 +40,7 @@ def read_phones(videos: str | Path, poses: str | Path, sizes: dict[str, tuple[in
                 f"{poses}: no pose for {video}: expected an image named {video.stem}.<ending>, {video.stem}_<number>, or "
                 f"in a folder {video.stem}, found {', '.join(list(cameras)[:8])}"
             )
-        one = still(mine, extent, video.stem)
+        one = plausible(still(mine, extent, video.stem))
         phones.append(Phone(video.stem, resized(one, size, video), video))
     if len(phones) < FEWEST:
         raise DataError(f"{folder}: expected at least {FEWEST} videos, one of each phone, found {len(phones)}")
@@ -88,9 +88,11 @@ def read_transforms_poses(file: Path) -> dict[str, Camera]:
         known = {key: number(both[key], f"{where}, {key}") for key in keys if both.get(key) is not None}
         if not {"w", "h"} <= set(known):
             raise DataError(f"{where}: expected the images' size in pixels, w and h, found {sorted(known)}")
+        if min(known["w"], known["h"]) < 1:
+            raise DataError(f"{where}: expected an image size w, h of at least 1 px, found {known['w']:g}x{known['h']:g}")
         if "fl_x" not in known and not 0 < known.get("camera_angle_x", 0) < math.pi:
             raise DataError(f"{where}: expected fl_x (and fl_y) in pixels or camera_angle_x in radians, found neither")
-        focal = known.get("fl_x") or 0.5 * known["w"] / math.tan(0.5 * known["camera_angle_x"])
+        focal = known["fl_x"] if "fl_x" in known else 0.5 * known["w"] / math.tan(0.5 * known["camera_angle_x"])
         K = np.array(
             [[focal, 0, known.get("cx", known["w"] / 2)], [0, known.get("fl_y", focal), known.get("cy", known["h"] / 2)], [0, 0, 1]]
         )

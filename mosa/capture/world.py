@@ -81,9 +81,12 @@ def read_world(folder: str | Path) -> World:
             "mosa-capture wrote"
         )
     origin = matrix([found["origin"]], (1, 3), f"{file}, world.origin")[0]
-    return World(
-        number(found["scale"], f"{file}, world.scale"), matrix(found["rotation"], (3, 3), f"{file}, world.rotation"), origin
-    )
+    scale, R = number(found["scale"], f"{file}, world.scale"), matrix(found["rotation"], (3, 3), f"{file}, world.rotation")
+    if not scale > 0:
+        raise DataError(f"{file}, world.scale: expected metres per unit of the poses, above 0, found {scale:g}")
+    if not (np.abs(R @ R.T - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0):
+        raise DataError(f"{file}, world.rotation: expected a rotation matrix, found {R.tolist()}")
+    return World(scale, R, origin)
 
 
 def write_images(folder: Path, phone: Phone, pictures: np.ndarray) -> None:

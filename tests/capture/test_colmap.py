@@ -71,6 +71,9 @@ def test_rays_undo_the_projection_through_a_lens():
     ("cameras.txt", lambda text: text.replace("OPENCV", "FOV"), r"cameras\.txt, line 3.*undistort"),
     ("cameras.txt", lambda text: text.replace("0.05 ", ""), r"cameras\.txt, line 3.*8 parameters"),
     ("cameras.txt", lambda text: text.replace("160", "wide"), r"cameras\.txt, line 3.*numbers"),
+    ("cameras.txt", lambda text: text.replace("160", "inf"), r"cameras\.txt, line 3.*whole numbers"),
+    ("cameras.txt", lambda text: "10.5" + text.partition("10")[2], r"cameras\.txt, line 1.*CAMERA_ID MODEL|whole numbers"),
+    ("images.txt", lambda text: text.replace(" 11 shots", " nan shots"), r"images\.txt.*whole numbers"),
 ])  # fmt: skip
 def test_a_damaged_text_model_is_named(tmp_path, name, damage, said):
     model(tmp_path, binary=False)
@@ -94,6 +97,39 @@ def test_a_cut_binary_model_is_named(tmp_path):
     (tmp_path / "cameras.bin").unlink()
     with pytest.raises(DataError, match=r"cameras\.bin: file not found"):
         read_model(tmp_path)
+
+
+@pytest.mark.parametrize("content, said", [
+    (b"1 0.5 0.5\n", r"points3D\.txt, line 1: expected POINT3D_ID X Y Z"), (b"\xff\xfe", r"points3D\.txt: .* damaged file"),
+])  # fmt: skip
+def test_damaged_points_are_named(tmp_path, content, said):
+    (tmp_path / "points3D.txt").write_bytes(content)
+    with pytest.raises(DataError, match=said):
+        read_points(tmp_path)
+
+
+def test_a_model_that_claims_more_than_any_memory_is_damaged(tmp_path):
+    (tmp_path / "points3D.bin").write_bytes(struct.pack("<Q", 2) + bytes(43) + struct.pack("<Q", 2**62) + bytes(100))
+    with pytest.raises(DataError, match=r"points3D\.bin: expected points of a COLMAP model, found a damaged file"):
+        read_points(tmp_path)
+
+
+@pytest.mark.parametrize("changed, said", [
+    ({"w": 0}, "image size w, h of at least 1 px"), ({"fl_x": 0}, "focal length fl_x"), ({"fl_y": -200.0}, "focal length fl_y"),
+    ({"cx": 1e9}, "principal point"), ({"k1": 1e3}, r"k1|lens|distort"),
+])  # fmt: skip
+def test_a_lens_that_cannot_be_is_refused_before_any_video_is_read(tmp_path, changed, said):
+    frames = []
+    for i, camera in enumerate(cameras()[:3]):
+        pose = np.linalg.inv(camera.w2c) @ OPENGL_TO_OPENCV
+        frames.append({"file_path": f"phone{i}.jpg", "transform_matrix": pose.tolist(), "fl_x": 200.0, "w": 160, "h": 120})
+    sizes = {f"phone{i}.mp4": (160, 120) for i in range(3)}
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    assert len(read_phones(tmp_path, tmp_path, sizes)) == 3
+    frames[1] |= changed
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    with pytest.raises(DataError, match=said):
+        read_phones(tmp_path, tmp_path, sizes)
 
 
 def test_transforms_and_colmap_say_the_same(tmp_path):

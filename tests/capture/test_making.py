@@ -86,6 +86,26 @@ def test_mistakes_are_named(filmed_folder, tmp_path):
     with pytest.raises(DataError, match="expected the record of a capture"):
         (tmp_path / "capture.json").write_text("{}")
         read_world(tmp_path)
+    world = {"scale": 0.3, "rotation": np.eye(3).tolist(), "origin": [0, 0, 0]}
+    for wrong, said in (({"scale": 0}, r"world\.scale"), ({"rotation": np.diag([1, 1, -1]).tolist()}, r"world\.rotation")):
+        (tmp_path / "capture.json").write_text(json.dumps({"world": world | wrong}))
+        with pytest.raises(DataError, match=said):
+            read_world(tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match=r"output: .*expected a folder that can be written"):
+        capture(keys(folder, output=str(tmp_path / "file")))
+    with pytest.raises(ConfigError, match=r"output: expected a folder of its own, found that of videos"):
+        capture(keys(folder, output=str(folder / "videos")))
+
+
+@pytest.mark.parametrize("wrong, said", [
+    (dict(scale=1000.0), r"scale: expected about 0\.3"), (dict(up=(-WORLD[1][:, 1]).tolist()), "up: .* falls upwards"),
+    (dict(ground=[1e3, 1e3, 1e3]), r"ground: expected a point of the floor"),
+])  # fmt: skip
+def test_a_world_that_contradicts_the_fall_is_refused(filmed_folder, tmp_path, wrong, said):
+    """A known scale pulls the fall to gravity's, so that nothing in the result would show the mistake."""
+    with pytest.raises(ConfigError, match=said):
+        capture(keys(filmed_folder[0], output=str(tmp_path / "scene"), **wrong))
 
 
 def test_keys_are_checked_before_anything_is_read(filmed_folder):
@@ -94,7 +114,10 @@ def test_keys_are_checked_before_anything_is_read(filmed_folder):
         make(OmegaConf.create(keys(folder, poses="???")))
     for wrong, said in ((dict(phones={"phone1": {"scan": "sideways"}}), r"phones\.phone1\.scan: expected auto or down"),
                         (dict(plate_seconds=[2, 1]), r"plate_seconds: expected two numbers \[from, to\]"),
-                        (dict(fps=0), r"fps: expected a number above 0")):  # fmt: skip
+                        (dict(fps=0), r"fps: expected a number of at least 1"),
+                        (dict(up=[0, 0, 0]), r"up: expected a direction"), (dict(max_offset=1e9), r"max_offset: .* at most 60"),
+                        (dict(output=""), r"output: expected the path of a folder"),
+                        (dict(before=1e9), r"before: .* at most 60")):  # fmt: skip
         with pytest.raises(ConfigError, match=said):
             make(OmegaConf.create(keys(folder, **wrong)))
 
