@@ -19,6 +19,7 @@ from torch import Tensor
 from mosa.errors import ConfigError, DataError
 from mosa.keys import BODY
 from mosa.limits import machine_memory
+from mosa.physics.constitutive.laws import law_named
 from mosa.rendering.lighting import LIGHT
 from mosa.rendering.spherical_harmonics import DEGREES
 from mosa.schema import POSITIVE, THREE, WEIGHT, Kind, check, is_number, one_of, or_null, whole
@@ -37,6 +38,12 @@ NAMED = {"collections OrderedDict", "torch Size", "torch._utils _rebuild_tensor_
          *(f"torch {kind}Storage" for kind in ("Float", "Double", "Half", "BFloat16", "Long", "Int", "Short", "Char", "Byte",
                                                "Bool"))}  # fmt: skip
 """Functions and classes that a checkpoint of this program refers to; torch knows some more, of which a few make large objects."""
+GOING_ON: dict[str, Kind] = {
+    "stage": whole(0), "steps_done": whole(0), "particles": whole(1), "misfit": POSITIVE,
+    "losses": Kind("numbers", lambda v: isinstance(v, list) and all(is_number(x) for x in v)),
+    "compared": or_null(Kind("distances by law", lambda v: isinstance(v, Mapping) and all(map(is_number, v.values())))),
+}  # fmt: skip
+"""Of `mosa`, what a fit goes on from."""
 NODES, DEPTH = 2_000_000, 40
 """Entries and levels of a checkpoint's containers: losses of a fit of 10,000 steps are 10,000."""
 
@@ -257,20 +264,64 @@ def check_same(checkpoint: Mapping[str, Any], module: torch.nn.Module, path: str
         raise DataError(f"ckpt_path: {path}: expected a body of {count} particles, found {checkpoint['mosa']['particles']}: the "
                         "checkpoint belongs to another scene, reconstruction or simulation.particles")
     for name in sorted(set(here) | set(there)):
-        found = [tuple(state[name].shape) if isinstance(state.get(name), Tensor) else None for state in (here, there)]
+        found = [f"{tuple(state[name].shape)}{'' if state[name].is_floating_point() else ' of whole numbers or flags'}"
+                 if isinstance(state.get(name), Tensor) else None for state in (here, there)]
         if found[0] != found[1]:
             raise DataError(f"ckpt_path: {path}: {name}: expected {found[0] or 'nothing of that name'}, found {found[1]}: "
                             "the checkpoint belongs to another configuration (adapter, prior, heterogeneity)")
+    check_tensors({k.removeprefix("body."): v for k, v in there.items() if k.startswith("body.")}, path)
+    stage, most = checkpoint["mosa"]["stage"], len(module.stages)
+    if stage > most:
+        raise DataError(f"ckpt_path: {path}: mosa.stage: expected at most {most}, the stages of this fit, found {stage}: the "
+                        "checkpoint belongs to another configuration (fit)")
+
+
+def check_cues(found: Any) -> None:
+    """Positions that a fit found once more, of each sequence; None where it did not. Errors: ConfigError."""
+    shaped = isinstance(found, list) and all(isinstance(t, Tensor) and t.ndim == 3 and t.shape[2] == 3 for t in found)
+    if found is not None and not (shaped and all(t.is_floating_point() and bool(torch.isfinite(t).all()) for t in found)):
+        described = [tuple(t.shape) if isinstance(t, Tensor) else type(t).__name__ for t in found] if isinstance(
+            found, list) else type(found).__name__
+        raise ConfigError(f"mosa.cues: expected null, or for each sequence finite positions of shape (T, N, 3), found "
+                          f"{str(described)[:200]}")  # fmt: skip
+
+
+def check_identification(found: Any) -> None:
+    """The state of a running stage of Gauss-Newton; None outside of one. Errors: ConfigError."""
+    if found is None:
+        return
+    parts(found, ("iteration", "factors", "noise"), "mosa.identification")
+    check({"mosa": {"identification": {name: found.get(name, 0) for name in ("iteration", "factors", "multiple")}}},
+          {"mosa.identification.iteration": whole(0), "mosa.identification.multiple": Kind("a number", is_number),
+           "mosa.identification.factors": Kind("numbers above 0", lambda v: isinstance(v, list) and all(
+               is_number(x) and x > 0 for x in v))})  # fmt: skip
+    for name in ("noise", "grid"):
+        groups = found.get(name)
+        if groups is not None and not (isinstance(groups, list) and all(
+            isinstance(each, (list, tuple)) and len(each) == 3 and all(
+                isinstance(t, Tensor) and t.is_floating_point() and bool(torch.isfinite(t).all()) for t in each)
+            for each in groups)):  # fmt: skip
+            raise ConfigError(f"mosa.identification.{name}: expected null, or for each rollout three tensors of finite numbers")
 
 
 def check_resumed(checkpoint: Mapping[str, Any], path: str | Path) -> None:
     """What a fit goes on from is there. Errors: DataError naming what is missing."""
     try:
         parts(checkpoint, (*RESUMED, "state_dict"), "checkpoint")
-        parts(checkpoint["mosa"], ("stage", "losses", "steps_done", "particles"), "mosa")
-        counts = or_null(whole(0))
-        check(checkpoint["mosa"], {name: counts for name in ("stage", "steps_done", "particles")})
-        check({"losses": checkpoint["mosa"]["losses"]}, {"losses": Kind("numbers", lambda v: isinstance(v, list) and all(
-            isinstance(x, (int, float)) for x in v))})
+        check(checkpoint, {"state_dict": Kind("tensors by name", lambda v: isinstance(v, Mapping) and all(
+            isinstance(name, str) for name in v))})  # fmt: skip
+        saved = checkpoint["mosa"]
+        parts(saved, ("stage", "losses", "steps_done", "particles"), "mosa")
+        check({"mosa": {name: saved[name] for name in GOING_ON if name in saved}},
+              {f"mosa.{name}": kind for name, kind in GOING_ON.items()})
+        check_cues(saved.get("cues"))
+        check_identification(saved.get("identification"))
+        if saved.get("compared"):
+            law = saved["config"]["cfg"]["prior"]["law"] if "config" in saved else None
+            if not isinstance(law, str):
+                raise ConfigError(f"mosa.config.cfg.prior.law: expected the law that was chosen, found {str(law)[:80]!r}")
+            law_named(law)
+    except (KeyError, TypeError) as error:
+        raise DataError(f"ckpt_path: {path}: mosa.config: expected the run's configuration, found none ({error})") from error
     except ConfigError as error:
         raise DataError(f"ckpt_path: {path}: {error}; a fit goes on from a checkpoint that train.py wrote") from error

@@ -7,16 +7,19 @@ from dataclasses import replace
 from pathlib import Path
 
 import lightning as L
+import torch
+from lightning.pytorch.callbacks import LambdaCallback
 from lightning.pytorch.plugins.environments import LightningEnvironment
 
 from mosa import parallel
 from mosa.callbacks import AtomicCheckpointIO, FitProgress, ImageStrips, KeepLast, Pace, StageNotes
-from mosa.checkpoints import check_same, read_checkpoint
+from mosa.checkpoints import check_same, checked_posterior, read_checkpoint
 from mosa.config import plain
 from mosa.costs import Costs, duration, seconds_of_fit, speed_of_rollouts
 from mosa.data.datamodule import MultiViewDataModule
-from mosa.errors import MosaError
+from mosa.errors import DataError, MosaError, SimulationDiverged
 from mosa.loggers import build_loggers
+from mosa.modules.identification import read_numbers
 from mosa.modules.lit_mosa import LitMosa
 from mosa.run import device_names
 
@@ -37,7 +40,9 @@ def fit_estimate(module: LitMosa, costs: Costs, processes: int = 1) -> str:
 def fit(cfg, module: LitMosa, data: MultiViewDataModule, folder: Path, device: str) -> None:
     """The staged optimisation under Lightning; resumes from cfg.ckpt_path. Errors: DataError for a checkpoint of another run."""
     if cfg.ckpt_path is not None:
-        check_same(read_checkpoint(cfg.ckpt_path), module, cfg.ckpt_path)
+        stored = read_checkpoint(cfg.ckpt_path)
+        check_same(stored, module, cfg.ckpt_path)
+        checked_posterior(stored, len(read_numbers(module.body)), cfg.ckpt_path)
     settings = plain(cfg.logger)
     logger = build_loggers(settings, folder)
     callbacks = [KeepLast(folder / "checkpoints"), FitProgress(), StageNotes(), *([Pace()] if logger else [])]
@@ -48,6 +53,8 @@ def fit(cfg, module: LitMosa, data: MultiViewDataModule, folder: Path, device: s
                         logger=logger or False, callbacks=callbacks, plugins=[AtomicCheckpointIO(), LightningEnvironment()],
                         enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False, log_every_n_steps=1,
                         reload_dataloaders_every_n_epochs=1, default_root_dir=folder, use_distributed_sampler=False, **shared)
+    begun: list[bool] = []
+    trainer.callbacks.append(LambdaCallback(on_train_start=lambda *_: begun.append(True)))
     try:
         trainer.fit(module, datamodule=data, ckpt_path=cfg.ckpt_path, weights_only=True)
     except MosaError as error:
@@ -58,6 +65,14 @@ def fit(cfg, module: LitMosa, data: MultiViewDataModule, folder: Path, device: s
         raise
     except SystemExit:  # Lightning's answer to Ctrl-C
         raise KeyboardInterrupt from None
+    except torch.linalg.LinAlgError as error:
+        raise SimulationDiverged(f"the fit came to numbers that cannot be solved with ({' '.join(str(error).split())[:200]}); "
+                                 "check the checkpoint that it goes on from, or lower simulation.courant") from error
+    except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        if begun or cfg.ckpt_path is None:
+            raise
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:300]  # Lightning takes its own entries as they are
+        raise DataError(f"ckpt_path: {cfg.ckpt_path}: the fit cannot go on from it ({reason})") from error
     finally:
         parallel.disconnect()
     if module.stage is not None:

@@ -13,7 +13,7 @@ from mosa.data.agreement import lines_of_sight, misses
 from mosa.data.splat_files import check_formats
 from mosa.errors import ConfigError, DataError
 from mosa.extensions import registered_keys
-from mosa.keys import CAPTURE, EVALUATION, SIMULATION, SPLATS, TRAINING
+from mosa.keys import CAPTURE, ENVIRONMENTS, EVALUATION, SIMULATION, SPLATS, TRAINING
 from mosa.known import check_known, conf_folder
 from mosa.limits import machine_memory
 from mosa.modules.body import Body, Start, World
@@ -60,6 +60,13 @@ def check_capture(values: Mapping[str, Any]) -> None:
     if (conf := conf_folder()) is not None:
         check_known(values, conf, "capture", CAPTURE)
     check(values, CAPTURE)
+
+
+def check_environments(values: Mapping[str, Any]) -> None:
+    """All that the configuration of `python -m mosa.environments` says by itself. Errors: ConfigError naming the key."""
+    if (conf := conf_folder()) is not None:
+        check_known(values, conf, "environments", ENVIRONMENTS)
+    check(values, ENVIRONMENTS)
 
 
 def check_particles(key: str, count: float) -> None:

@@ -18,6 +18,27 @@ def test_a_package_that_cannot_be_imported_is_named(names):
         load_extensions(names)
 
 
+@pytest.mark.parametrize("text", ["raise ValueError('x')", "import sys; sys.exit(3)", "def (", "import no_such_package"])
+def test_a_package_that_fails_while_it_is_imported_is_named(tmp_path, monkeypatch, text):
+    (tmp_path / "fails_at_once.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ConfigError, match=r"extensions: expected a module that can be imported .*found 'fails_at_once'"):
+        load_extensions(["fails_at_once"])
+
+
+@pytest.mark.parametrize("name", ["", ".", ".a", "../a", "a b", "a/b", "a.py.", "a;b"])
+def test_what_is_no_name_of_a_module_is_not_imported(name):
+    with pytest.raises(ConfigError, match=r"extensions: expected the name of a module"):
+        load_extensions([name])
+
+
+def test_an_adapter_that_was_registered_and_is_not_there_is_named(monkeypatch):
+    monkeypatch.setattr(adapters, "ADAPTERS", adapters.ADAPTERS | {"gone": "no_such_package:Adapter", "empty": "math:Adapter"})
+    for name in ("gone", "empty"):
+        with pytest.raises(ConfigError, match=rf"adapter\.name: '{name}' is registered as .*cannot be imported"):
+            adapters.adapter_class({"name": name})
+
+
 def test_no_extensions_are_none():
     load_extensions(None)
     load_extensions([])

@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from strangers import checkpoint, saved
 from test_known import composed
 
-from mosa.checkpoints import check_same, read_checkpoint
+from mosa.checkpoints import check_resumed, check_same, read_checkpoint
 from mosa.config import rehearse
 from mosa.data.images import check_amount, read_image
 from mosa.data.particles import read_ply
@@ -39,7 +39,50 @@ def test_a_fit_goes_on_from_its_own_checkpoint_alone(tmp_path):
     check_begin(OmegaConf.create({"ckpt_path": None, "resume": None}))
 
 
+def going_on(**changes):
+    """A checkpoint's content that a fit can go on from, with parts of `mosa` in the place of its own."""
+    stored = {"epoch": 0, "global_step": 0, "pytorch-lightning_version": "2", "loops": {}, "callbacks": {}, "optimizer_states": [],
+              "lr_schedulers": [], "state_dict": {}}  # fmt: skip
+    return stored | {"mosa": {"stage": 2, "losses": [1.0], "steps_done": 3, "particles": 7, "misfit": 0.01} | changes}
+
+
+RUNNING = {"iteration": 1, "factors": [1.0], "multiple": 0.0, "noise": [[torch.ones(4)] * 3], "grid": None}
+CUES = torch.zeros(5, 7, 3)
+
+
+def test_what_a_fit_goes_on_from_is_checked_whole():
+    check_resumed(going_on(), "a.ckpt")
+    check_resumed(going_on(cues=[CUES], identification=RUNNING, compared=None), "a.ckpt")
+
+
+@pytest.mark.parametrize("changes, message", [
+    *((dict(cues=value), r"mosa\.cues: expected null, or for each sequence finite positions of shape \(T, N, 3\)") for value in (
+        5, "a", {"train": CUES}, [5], ["a"], [CUES[0]], [CUES.long()], [CUES * math.nan], [CUES[..., :2]])),
+    (dict(identification=5), r"mosa\.identification: expected a section"),
+    (dict(identification={}), r"mosa\.identification: expected the parts"),
+    (dict(identification=RUNNING | {"iteration": "a"}), r"mosa\.identification\.iteration: expected a whole number"),
+    (dict(identification=RUNNING | {"factors": [math.nan]}), r"mosa\.identification\.factors: expected numbers above 0"),
+    (dict(identification=RUNNING | {"multiple": math.inf}), r"mosa\.identification\.multiple: expected a number"),
+    (dict(identification=RUNNING | {"noise": [[5]]}), r"mosa\.identification\.noise: expected null, or for each rollout"),
+    (dict(identification=RUNNING | {"grid": [[CUES * math.nan] * 3]}), r"mosa\.identification\.grid: expected null, or"),
+    (dict(misfit="a"), r"mosa\.misfit: expected a number"), (dict(losses=[math.nan]), r"mosa\.losses: expected numbers"),
+    (dict(stage=None), r"mosa\.stage: expected a whole number"), (dict(compared=5), r"mosa\.compared: expected distances"),
+    (dict(compared={"corotated": 1.0}), r"mosa\.config\.cfg\.prior\.law: expected the law"),
+])  # fmt: skip
+def test_a_damaged_state_of_a_fit_is_named(changes, message):
+    with pytest.raises(DataError, match=message):
+        check_resumed(going_on(**changes), "a.ckpt")
+
+
+def test_tensors_by_no_name_are_no_state():
+    for wrong in (5, [1], {5: 1}):
+        with pytest.raises(DataError, match="state_dict: expected tensors by name"):
+            check_resumed(going_on() | {"state_dict": wrong}, "a.ckpt")
+
+
 class Model:
+    stages = (None,) * 3
+
     def __init__(self, *overrides):
         self.stored = saved(*overrides)["state_dict"]
 
@@ -54,6 +97,12 @@ def test_a_checkpoint_of_another_model_is_named(tmp_path):
         check_same(stored, Model("adapter=direct"), "a.ckpt")
     with pytest.raises(DataError, match="expected a body of 27 particles, found 28"):
         check_same({**stored, "mosa": stored["mosa"] | {"particles": 28}}, Model(), "a.ckpt")
+    with pytest.raises(DataError, match=r"mosa\.stage: expected at most 3, the stages of this fit, found 4"):
+        check_same({**stored, "mosa": stored["mosa"] | {"stage": 4}}, Model(), "a.ckpt")
+    rest = stored["state_dict"]["body.rest"]
+    for wrong, message in ((rest.long(), "of whole numbers"), (rest * math.nan, "finite")):
+        with pytest.raises(DataError, match=rf"body\.rest: .*{message}"):
+            check_same({**stored, "state_dict": stored["state_dict"] | {"body.rest": wrong}}, Model(), "a.ckpt")
 
 
 @pytest.mark.parametrize("text", ["", '{"a":', "[1]", '{"a": [1]}', "null", "[" * 100_000])

@@ -17,9 +17,8 @@ from mosa.environments.policies import METHODS, Search
 from mosa.environments.study import Bench, Setting, one, table
 from mosa.environments.tasks import TASKS
 from mosa.errors import ConfigError
-from mosa.keys import ENVIRONMENTS
+from mosa.guards import check_environments
 from mosa.run import named_device
-from mosa.schema import check
 
 log = logging.getLogger(__name__)
 
@@ -29,7 +28,7 @@ AT_A_TIME = 8
 
 def setting_of(values: dict) -> Setting:
     """Errors: ConfigError naming the key."""
-    check(values, ENVIRONMENTS)
+    check_environments(values)
     device, worlds = named_device(values["device"]), values["worlds"]
     if worlds == "auto":
         worlds = AT_A_TIME if device == "cpu" else values["trials"]

@@ -47,4 +47,8 @@ def adapter_class(config: Mapping[str, Any]) -> type[nn.Module] | None:
     if not isinstance(name, str) or name not in ADAPTERS:
         raise ConfigError(f"adapter.name: expected {', '.join(ADAPTERS)} or null, found {name!r}")
     module, _, found = ADAPTERS[name].partition(":")
-    return getattr(importlib.import_module(module), found)
+    try:
+        return getattr(importlib.import_module(module), found)
+    except (ImportError, AttributeError) as error:  # of another package's registration
+        raise ConfigError(f"adapter.name: {name!r} is registered as {ADAPTERS[name]}, which cannot be imported "
+                          f"({error})") from error

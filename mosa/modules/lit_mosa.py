@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import lightning as L
 import torch
@@ -14,7 +15,7 @@ from mosa import losses, parallel
 from mosa.checkpoints import VERSION
 from mosa.config import build_criterion, build_identification, build_stages, build_world
 from mosa.data.datamodule import Observations
-from mosa.errors import ConfigError, MosaError, SimulationDiverged
+from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
 from mosa.modules.adapter_base import pool
 from mosa.modules.body import Body, Start, World
 from mosa.modules.criteria import Criterion
@@ -22,6 +23,7 @@ from mosa.modules.gauss_newton import Posterior
 from mosa.modules.identification import Identification, IdentificationSettings, choose_law
 from mosa.modules.material import material_states
 from mosa.modules.observer import deformed_covariances, observe
+from mosa.modules.residuals import SAMPLES
 from mosa.modules.restorable import Restorable
 from mosa.modules.stages import Stage
 from mosa.modules.terms import MISFIT, Step, check_terms, evaluate_terms
@@ -122,13 +124,19 @@ class LitMosa(Restorable, L.LightningModule):
         self.misfit = saved.get("misfit", MISFIT)
         self.saved_identification = saved.get("identification")
         self.compared = dict(saved.get("compared") or {})
-        if self.compared:
+        if self.compared and (candidates := self.body.material.candidates):
+            if (law := saved["config"]["cfg"]["prior"]["law"]) not in candidates:
+                raise ConfigError(f"ckpt_path: expected a law among prior.candidates, {', '.join(candidates)}, found {law!r} in "
+                                  "the checkpoint: it belongs to another configuration")
             for material in (self.body.material, *(variant["material"] for variant in self.body.frozen.values())):
-                material.choose(saved["config"]["cfg"]["prior"]["law"])
+                material.choose(law)
             self.settle_law()
         self.posterior = Posterior.read(saved["posterior"]) if saved.get("posterior") else None
         if saved.get("cues") is not None and self.takes:
             self.restore_cues(saved["cues"])
+        elif self.losses and self.stage is not None and not self.stage.calibrates and any(take.again for take in self.takes):
+            raise ConfigError("ckpt_path: expected the motion that reconstruction.informed finds, as this stage began after it, "
+                              "found none in the checkpoint: set reconstruction.informed.iterations=0, as the run had it")
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
         return [torch.optim.Adam(self.groups(stage), betas=(0.9, 0.95)) for stage in self.stages]
@@ -193,7 +201,7 @@ class LitMosa(Restorable, L.LightningModule):
                     self.settle_law()
                 self.identification = self.identifying(stage)
                 if iteration > 0 and self.saved_identification is not None:
-                    self.identification.restore(self.saved_identification)
+                    self.go_on(self.identification, self.saved_identification)
                 elif stage.calibrates and not searched:
                     self.identification.search()
             found = self.identification.iterate()
@@ -214,6 +222,20 @@ class LitMosa(Restorable, L.LightningModule):
         """A stage's identification on the takes, from where the body stands."""
         kinds = tuple(self.weights.get(name, 0.0) != 0 for name in ("position", "rotation", "stretch"))
         return Identification(self.body, self.takes, self.world, stage, self.criterion, self.settings, kinds)
+
+    def go_on(self, identification: Identification, saved: Mapping[str, Any]) -> None:
+        """The identification as a checkpoint has it, whose containers were checked. Errors: DataError where it is another fit's."""
+        expected = [len(self.takes[i].cues.positions) - 1 for i, _ in identification.pairs]
+        samples = min(len(self.body.rest), SAMPLES)
+        for name, size in (("noise", ()), ("grid", (samples, 3))):
+            found = saved.get(name)
+            if found is not None and [[tuple(t.shape) for t in each] for each in found] != [[(T, *size)] * 3 for T in expected]:
+                raise DataError(f"ckpt_path: mosa.identification.{name}: expected tensors of {expected} frames after the "
+                                "first, found others: the checkpoint belongs to another configuration")
+        if len(saved["factors"]) != (count := len(identification.newton.blocks)):
+            raise DataError(f"ckpt_path: mosa.identification.factors: expected {count} numbers, found {len(saved['factors'])}: "
+                            "the checkpoint belongs to another configuration")
+        identification.restore(dict(saved))
 
     def settle_law(self) -> None:
         """What is written from now on is a run of the law that was chosen."""
