@@ -20,6 +20,9 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from mosa.capture.poses import read_phones, scene_points
+from mosa.capture.world import read_world
+from mosa.checkpoints import RESUMED, check_resumed
 from mosa.config import build_body, build_world, rehearse
 from mosa.data.export import export_transforms
 from mosa.data.scene import load_scene
@@ -484,5 +487,67 @@ def runs(folder: Path) -> Iterator[Attack]:
     yield "a sweep of failures", lambda: train("-m", f"hydra.sweep.dir={folder}/sweep", "seed=-1,-2", code=1)
 
 
+def poses(folder: Path) -> Iterator[Attack]:
+    """Poses of a capture, in COLMAP's text and as transforms.json, and the record of an earlier one."""
+    sizes = {f"p{i}.mp4": (160, 120) for i in range(3)}
+    lines = {"cameras": ["1 PINHOLE 160 120 228.5 228.5 80.0 60.0"],
+             "images": [line for i in range(3) for line in (f"{i} 1 0 0 0 {i}.5 0 4.5 1 p{i}.jpg", "")],
+             "points3D": ["1 0.5 0.5 0.5 9 9 9 1"]}  # fmt: skip
+
+    def model(name: str, column: int, value: str):
+        words = lines[name][0].split()
+        words[column] = value
+        for each, rows in lines.items():
+            changed = [" ".join(words), *rows[1:]] if each == name else rows
+            (folder / f"{each}.txt").write_text("\n".join(changed))
+        read_phones(folder, folder, sizes)
+        scene_points(folder)
+
+    for name, columns in (("cameras", range(8)), ("images", (1, 5, 8)), ("points3D", (1,))):
+        for column in columns:
+            for value in ("nan", "inf", "1e400", "abc") if name != "points3D" else ("abc",):
+                yield f"{name} {column}={value}", lambda n=name, c=column, v=value: model(n, c, v)
+    entry = {"transform_matrix": np.eye(4).tolist(), "fl_x": 200.0, "fl_y": 200.0, "cx": 80.0, "cy": 60.0, "w": 160, "h": 120}
+
+    def listing(key: str, value):
+        (folder / "t").mkdir(exist_ok=True)
+        frames = [entry | {"file_path": f"p{i}.jpg"} | ({key: value} if i == 1 else {}) for i in range(3)]
+        (folder / "t" / "transforms.json").write_text(json.dumps({"frames": frames}))
+        read_phones(folder, folder / "t", sizes)
+
+    for key in ("fl_x", "fl_y", "w", "h", "cx", "transform_matrix"):
+        for value in (-1e9, 1e30, math.nan, "a", True, [1]):
+            yield f"{key}={value}", lambda k=key, v=value: listing(k, v)
+    for key in ("w", "h", "fl_x", "fl_y"):
+        yield f"{key}=0", lambda k=key: listing(k, 0)
+    good = {"scale": 0.4, "rotation": np.eye(3).tolist(), "origin": [0, 0, 0]}
+
+    def record(key: str, value):
+        (folder / "capture.json").write_text(json.dumps({"world": good | {key: value}}))
+        read_world(folder)
+
+    for key in good:
+        for value in (0, -1, math.nan, "a", None, [1], np.diag([1, 1, -1]).tolist(), np.diag([2, 1, 1]).tolist()):
+            yield f"like: {key}={value}", lambda k=key, v=value: record(k, v)
+
+
+def resumed(_: Path) -> Iterator[Attack]:
+    """Parts of a checkpoint that a fit goes on from."""
+    whole = {name: {} for name in RESUMED} | {"state_dict": {}}
+    own = {"stage": 2, "losses": [1.0], "steps_done": 3, "particles": 7}
+    state = {"iteration": 1, "factors": [1.0], "multiple": 0.0, "noise": None}
+    nan = torch.full((5, 7, 3), math.nan)
+    wrong = {"cues": (5, "a", {}, {"a": 1}, [5], ["a"], [nan], [nan[0]], [nan.long()]), "misfit": ("a", 0, -1, math.nan, None),
+             "stage": (-1, "a", None, True), "losses": (5, ["a"], [None], [math.nan], {}), "particles": (0, "a", None),
+             "steps_done": (-1, "a"), "compared": (5, ["a"], {"corotated": "a"}, {"corotated": 1.0}),
+             "identification": (5, {}, {"iteration": 1}, *(state | change for change in (
+                 {"iteration": "a"}, {"factors": ["a"]}, {"factors": [0.0]}, {"multiple": math.nan}, {"noise": 5}, {"noise": [5]},
+                 {"noise": [[5] * 3]}, {"grid": [[nan] * 3]})))}  # fmt: skip
+    for key, values in wrong.items():
+        for value in values:
+            yield f"{key}={value}", lambda k=key, v=value: check_resumed(whole | {"mosa": own | {k: v}}, "a.ckpt")
+
+
 GROUPS = {"checkpoints": checkpoints, "npz": npz, "overrides": overrides, "colliders": colliders, "calls": calls, "data": data,
-          "meshes": meshes, "caches": caches, "runs": runs}
+          "meshes": meshes, "caches": caches,
+          "poses": poses, "resumed": resumed, "runs": runs}

@@ -141,7 +141,11 @@ def output_folder(values: Mapping[str, Any]) -> Path:
 
 
 def check_known_world(
-    fall: Fall, knowledge: Knowledge, phones: list[Phone], tracks: list[Track], flight: tuple[float, float] | None,
+    fall: Fall,
+    knowledge: Knowledge,
+    phones: list[Phone],
+    tracks: list[Track],
+    flight: tuple[float, float] | None,
     ground: np.ndarray | None,
 ) -> Fall:
     """What the keys say of scale, up and ground is possible. Returns the fall as it is where nobody knows scale and up: a known

@@ -93,7 +93,12 @@ def write_images(folder: Path, phone: Phone, pictures: np.ndarray) -> None:
     """(T, H, W, 4) uint8 as images/<phone>_<frame>.png."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
     for k, picture in enumerate(pictures):
-        cv2.imwrite(str(folder / "images" / f"{phone.name}_{k:03d}.png"), cv2.cvtColor(picture, cv2.COLOR_RGBA2BGRA))
+        _, content = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGBA2BGRA))
+        file = folder / "images" / f"{phone.name}_{k:03d}.png"
+        try:
+            file.write_bytes(content)  # OpenCV's own writing says nothing of a full disk
+        except OSError as error:
+            raise DataError(f"output: {file} cannot be written ({error.strerror})") from error
 
 
 def write_transforms(folder: Path, phones: list[Phone], times: np.ndarray, world: World) -> Path:

@@ -58,6 +58,7 @@ def train_and_test(cfg: DictConfig) -> None:
     # a body that rolls off the box may fold over itself for a moment; the trial is lost either way
     warnings.filterwarnings("ignore", message=".*det F <= 0.*")
     folder = Path(values["out"] or HydraConfig.get().runtime.output_dir)
+    folder.mkdir(parents=True, exist_ok=True)  # what cannot be written is said before hours are spent
     bench = Bench(setting)
     if isinstance(values["simulator"], list):
         page = table(bench, names, values["seeds"], folder)
