@@ -68,7 +68,7 @@ def test_noise_is_not_below_that_of_the_cues_and_the_grid():
     """Of a field that is nothing, sqrt(3) times the floor of one component: cue and model errors add as squares."""
     none = residuals.Fields(*(torch.zeros(2, 4, 3).double() for _ in range(3)))
     for dx, cells in ((0.02, 0.0), (0.02, 0.1), (0.05, 0.5)):
-        expected = [math.hypot(1e-3, cells * dx), math.hypot(0.02, 0.3 * cells), math.hypot(0.03, 0.15 * cells)]
+        expected = [math.hypot(0.5e-3, cells * dx), math.hypot(0.01, 0.3 * cells), math.hypot(0.015, 0.15 * cells)]
         for scale, floor in zip(residuals.spread([none], residuals.floors(dx, cells))[0], expected, strict=True):
             assert torch.allclose(scale, torch.full((2,), 3**0.5 * floor, dtype=torch.float64), rtol=1e-12)
 
