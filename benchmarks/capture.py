@@ -1,8 +1,8 @@
 """Own capture against the truth: six simulated phones with their faults, mosa-capture on what they film, and what it found.
 
-    python benchmarks/capture.py film --folder /tmp/capture --name rabbit   # videos, plates, poses as COLMAP writes them
-    python benchmarks/capture.py compare --folder /tmp/capture              # mosa-capture, and its errors
-    python benchmarks/capture.py footage --folder /tmp/capture              # perfect footage and held-out drops, train commands
+    python benchmarks/capture.py film --folder outputs/capture --name rabbit   # videos, plates, poses as COLMAP writes them
+    python benchmarks/capture.py compare --folder outputs/capture              # mosa-capture, and its errors
+    python benchmarks/capture.py footage --folder outputs/capture              # perfect footage and held-out drops, train commands
 
 `compare` prints errors of clocks, readouts, scale, up and ground, and how well the frames at common times are those of perfect
 cameras there, interpolated in three ways. `footage` writes what the fits need that `docs/capture.md` compares. Synthetic scenes.
