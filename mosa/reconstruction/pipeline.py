@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -35,6 +36,8 @@ from mosa.rendering.rasterizer import rasterize
 from mosa.rendering.spherical_harmonics import constant_coefficients
 from mosa.threads import threaded
 from mosa.types import Appearance, MotionCues, Reconstruction, Scene, Splats
+
+log = logging.getLogger(__name__)
 
 CACHE_VERSION = 3
 """Raised when a stage computes something else from the same settings."""
@@ -380,6 +383,10 @@ class SecondLook:
         with tqdm(total=settings.informed.iterations, desc=title, disable=not self.progress, leave=False) as steps:
             motion = informed_motion(scaffold, carried, windows, centres, background, predicted.to(seen), seen, settings.informed,
                                      settings.dynamic, reach=reach, seed=self.seed, progress=steps.update)
+        if motion is None:
+            log.warning("reconstruction.informed: what the calibrated law predicts of %s is no guide to its images, and the first "
+                        "motion stays", scene.sequence)
+            return self.cues(seen)
         with torch.no_grad():
             frames = torch.arange(len(centres), device=centres.device)
             return self.cues(motion(frames, splats, scaffold.modes, scaffold.around).positions)

@@ -92,6 +92,18 @@ def test_images_correct_a_wrong_prediction_wherever_it_is(bent):
     assert near < 0.65 * before and abs(far - near) < 0.02
 
 
+@pytest.mark.parametrize("share", [0.1, -0.3])
+def test_a_prediction_that_is_no_body_is_not_followed(bent, share):
+    """Flattened, and turned inside out: the first motion stays. The true shapes are followed."""
+    windows, body, true = bent
+    wrong = true.clone()
+    wrong[2, :, 1] = wrong[2, :, 1].mean() + share * (wrong[2, :, 1] - wrong[2, :, 1].mean())
+    for predicted, followed in ((wrong, False), (true, True)):
+        motion = informed_motion(body, body, windows, OFFSETS, torch.ones(3), predicted, true, InformedSettings(iterations=30),
+                                 DynamicSettings(carriers="particles"), reach=0.1, seed=0)
+        assert (motion is not None) == followed
+
+
 def test_the_number_of_iterations_is_checked():
     with pytest.raises(ConfigError, match=r"reconstruction\.informed\.iterations.*found -1"):
         InformedSettings(iterations=-1)
