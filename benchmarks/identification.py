@@ -5,8 +5,9 @@
     python benchmarks/identification.py table fits.jsonl
 
 `make` films, reconstructs, finds the starts and the cues about the calibrated backbone's motion, as a run does, and keeps what a
-fit reads in one file of a few MB, with the truth for the figures. `fit` calibrates the prior and runs the joint stage on it: a few
-seconds each on a GPU, minutes on a CPU. Figures are held-out errors after first contact, in mm, at 2000 particles.
+fit reads in one file of a few MB, with the truth for the figures; of several drops with scene.also_train. `fit` calibrates the
+prior and runs the joint stage on it: a few seconds each on a GPU, minutes on a CPU. Figures are held-out errors after first
+contact, in mm, at 2000 particles; of all drops where none is held out.
 docs/identification.md has tables that were made so.
 """
 
@@ -30,9 +31,11 @@ from mosa.data.builtin.floor import floor_rollout, hidden_of
 from mosa.errors import MosaError
 from mosa.evaluation import true_motion
 from mosa.modules.body import Start
-from mosa.modules.identification import Identification
+from mosa.modules.gauss_newton import Posterior
+from mosa.modules.identification import Identification, each_law
 from mosa.modules.lit_mosa import LitMosa, Take
 from mosa.modules.residuals import sampled
+from mosa.prediction import DRAWS, LEAST_DRAWS, determined, total_spread
 from mosa.types import MotionCues
 
 CONF = Path(__file__).parents[1] / "conf"
@@ -50,38 +53,44 @@ def rms_mm(away: Tensor) -> float:
 
 
 def make(overrides: list[str], folder: Path, device: str) -> Path:
-    """The problem of one scene."""
+    """The problem of one scene, with cues of every sequence that it is learned from (scene.also_train)."""
     cfg = configuration(overrides)
     made = assemble(cfg, device)
     scene, body = made.scene, made.body
-    chosen, sequences = sampled(len(body.rest), torch.device("cpu")), {}
-    for each in made.sequences:
-        s = each.scene
-        sequences[each.prefix] = {
-            "start": each.start.written(), "contact": each.contact, "frames": s.frames,
-            "frame_dt": float(s.times[1] - s.times[0]), "truth": true_motion(body, s)[:, chosen].cpu(),
-            "floor": floor_rollout(body, s, made.world)[:, chosen].cpu(),
-        }  # fmt: skip
     # as a run does before its joint stage: the cues once more, about the calibrated backbone's motion
     module = made.module
     calibration = module.identifying(module.stages[0])
     calibration.search()
     run(calibration, module.stages[0].iterations)
     module.inform()
-    cues, T, hidden = module.takes[0].cues, len(scene.training_frames), hidden_of(scene)
-    kept = {name: getattr(cues, name)[:T].cpu() for name in ("positions", "rotation", "stretch", "weight")}
+    chosen, sequences, hidden = sampled(len(body.rest), torch.device("cpu")), {}, hidden_of(scene)
+    takes = iter(module.takes)  # the sequences that are learned from come first, in their order
+    for each in made.sequences:
+        s = each.scene
+        sequences[each.prefix] = {
+            "start": each.start.written(), "contact": each.contact, "frames": s.frames,
+            "frame_dt": float(s.times[1] - s.times[0]), "truth": true_motion(body, s)[:, chosen].cpu(),
+            "floor": floor_rollout(body, s, made.world)[:, chosen].cpu(), "cues": None,
+        }  # fmt: skip
+        if each.prefix.startswith("train"):
+            cues, T = next(takes).cues, len(s.training_frames)
+            sequences[each.prefix]["cues"] = {
+                name: getattr(cues, name)[:T].cpu() for name in ("positions", "rotation", "stretch", "weight")}
     problem = {
-        "config": made.config, "rest": body.rest.cpu(), "volume": body.volume.cpu(), "sequences": sequences, "cues": kept,
+        "config": made.config, "rest": body.rest.cpu(), "volume": body.volume.cpu(), "sequences": sequences,
         "fibre": getattr(hidden, "fibre", None) if getattr(hidden, "ratio", 1) > 1 else None,
         "factor": hidden.factor(body.rest.cpu().float()),
     }  # fmt: skip
-    twin = "_twin" if cfg.scene.get("material") == "isotropic" else ""
-    path = folder / f"{scene.name}{twin}_{len(body.rest)}.pt"
+    name = scene.name + ("_twin" if cfg.scene.get("material") == "isotropic" else "")
+    name += f"_{len(module.takes)}drops" * (len(module.takes) > 1) + f"_seed{cfg.seed}" * (cfg.seed != 0)
+    path = folder / f"{name}_{len(body.rest)}.pt"
     folder.mkdir(parents=True, exist_ok=True)
     torch.save(problem, path)
-    seen, true = kept["positions"][:, chosen], sequences["train"]["truth"][:T]
-    contact = sequences["train"]["contact"]
-    print(f"{path}: {len(body.rest)} particles, cues off by {rms_mm((seen - true)[contact:]):.2f} mm after contact", flush=True)
+    for prefix, s in sequences.items():
+        if s["cues"] is not None:
+            seen, contact = s["cues"]["positions"][:, chosen], s["contact"]
+            off = rms_mm((seen - s["truth"][: len(seen)])[contact:])
+            print(f"{path}: {len(body.rest)} particles, cues of {prefix} off by {off:.2f} mm after contact", flush=True)
     return path
 
 
@@ -94,55 +103,97 @@ def read(path: Path, overrides: list[str], device: str) -> SimpleNamespace:
     tensors = {"rest": problem["rest"], "volume": problem["volume"], "colors": torch.zeros(n, 3), "opacities": torch.ones(n),
                "covariances": torch.eye(3).expand(n, 3, 3).clone()}  # fmt: skip
     body = build_body(config, tensors).to(device)
+    takes = []
     for own in problem["sequences"].values():
         own["start"] = Start.read(own["start"], body.rest)
-    train, cues = problem["sequences"]["train"], {k: v.float().to(device) for k, v in problem["cues"].items()}
-    take = Take(train["start"], None, MotionCues(**cues, covariances=torch.zeros(1, device=device)), train["frame_dt"],
-                train["contact"])  # without images  # fmt: skip
-    module = LitMosa.from_config(config, body, takes=[take], background=torch.ones(3, device=device))
+        if own["cues"] is not None:  # without images
+            cues = {k: v.float().to(device) for k, v in own["cues"].items()}
+            takes.append(Take(own["start"], None, MotionCues(**cues, covariances=torch.zeros(1, device=device)), own["frame_dt"],
+                              own["contact"]))  # fmt: skip
+    module = LitMosa.from_config(config, body, takes=takes, background=torch.ones(3, device=device))
     return SimpleNamespace(problem=problem, module=module, body=body)
 
 
 @torch.no_grad()
-def errors(case: SimpleNamespace, **switches: bool) -> dict[str, float]:
+def motions(case: SimpleNamespace, **switches: bool) -> dict[str, Tensor]:
+    """(T, M, 3) [m] of the particles that are compared, by sequence."""
+    chosen, model = sampled(len(case.body.rest), torch.device("cpu")), case.body.model().only(**switches)
+    return {
+        prefix: case.body.simulate(s["start"], case.module.world, s["frames"], s["frame_dt"], model=model).x[:, chosen].cpu()
+        for prefix, s in case.problem["sequences"].items()
+    }
+
+
+def errors(case: SimpleNamespace, found: dict[str, Tensor]) -> dict[str, float]:
     """By sequence, [mm]."""
-    chosen, found, model = sampled(len(case.body.rest), torch.device("cpu")), {}, case.body.model().only(**switches)
-    for prefix, s in case.problem["sequences"].items():
-        x = case.body.simulate(s["start"], case.module.world, s["frames"], s["frame_dt"], model=model).x[:, chosen].cpu()
-        found[prefix] = rms_mm((x - s["truth"])[s["contact"] :])
-    return found
+    sequences = case.problem["sequences"]
+    return {prefix: rms_mm((x - sequences[prefix]["truth"])[sequences[prefix]["contact"] :]) for prefix, x in found.items()}
 
 
 def held_out(by_sequence: dict[str, float]) -> float:
-    tests = [value for prefix, value in by_sequence.items() if prefix.startswith("test")]
+    """Mean over the sequences that were not learned from; over all where none is left."""
+    tests = [value for prefix, value in by_sequence.items() if prefix.startswith("test")] or list(by_sequence.values())
     return sum(tests) / len(tests)
+
+
+def coverage(case: SimpleNamespace, found: dict[str, Tensor], posterior: Posterior) -> float | None:
+    """Share of held-out particle errors after contact within two predicted standard deviations, as `predicted_spread` has them;
+    None without held-out sequences or draws that can be simulated."""
+    drawn: dict[str, list[Tensor]] = {prefix: [] for prefix in found if prefix.startswith("test")}
+    for _ in each_law(case.body, posterior.draws(DRAWS, torch.Generator().manual_seed(0))):
+        try:
+            moved = motions(case)
+        except MosaError:
+            continue
+        for prefix in drawn:
+            drawn[prefix].append(moved[prefix])
+    within = []
+    for prefix, each in drawn.items():
+        if len(each) >= LEAST_DRAWS:
+            s = case.problem["sequences"][prefix]
+            sd = total_spread(torch.stack(each), posterior.model_error)
+            within.append(((found[prefix] - s["truth"]).norm(dim=-1) <= 2 * sd)[s["contact"] :].double().mean())
+    return float(sum(within) / len(within)) if within else None
+
+
+def identified(path: Path, overrides: list[str], device: str) -> SimpleNamespace:
+    """A problem after its calibration and its joint stage; what the calibrated prior predicts, and the iterations taken."""
+    case = read(path, overrides, device)
+    module, body = case.module, case.body
+    calibration = module.identifying(module.stages[0])
+    calibration.search()
+    run(calibration, module.stages[0].iterations)
+    case.prior = motions(case, heterogeneity=False, adapter=False)
+    body.adapter.switch_on(body.material.reference_modulus(), body.material.poisson())
+    case.joint = module.identifying(module.stages[-1])
+    case.iterations = run(case.joint, module.stages[-1].iterations)
+    return case
 
 
 def fit(path: Path, overrides: list[str], device: str) -> dict:
     """Calibration and joint stage; the figures of both."""
-    began, case = time.perf_counter(), read(path, overrides, device)
-    module, body = case.module, case.body
-    stages = module.stages
-    calibration = module.identifying(stages[0])
-    calibration.search()
-    run(calibration, stages[0].iterations)
-    prior = errors(case, heterogeneity=False, adapter=False)
-    body.adapter.switch_on(body.material.reference_modulus(), body.material.poisson())
-    joint = module.identifying(stages[-1])
-    taken = run(joint, stages[-1].iterations)
-    learned = errors(case)
-    floor = {k: rms_mm((s["floor"] - s["truth"])[s["contact"] :]) for k, s in case.problem["sequences"].items()}
+    began = time.perf_counter()
+    return figures(identified(path, overrides, device)) | {
+        "problem": path.stem, "set": overrides, "seconds": time.perf_counter() - began}
+
+
+def figures(case: SimpleNamespace) -> dict:
+    """Of an identified problem."""
+    body, posterior, found = case.body, case.joint.posterior(), motions(case)
+    prior, learned = errors(case, case.prior), errors(case, found)
+    floor = errors(case, {prefix: s["floor"] for prefix, s in case.problem["sequences"].items()})
     body.adapter.follow(body.material.poisson())
     axis, ratio = stiffest(body.adapter.stiffness().detach().cpu())
     fibre, factor, true = case.problem["fibre"], body.factor(body.heterogeneity).detach().cpu(), case.problem["factor"]
     varies = float(true.std()) > 1e-6 and float(factor.std()) > 1e-6
     return {
-        "problem": path.stem, "set": overrides, "prior_mm": held_out(prior), "learned_mm": held_out(learned),
+        "prior_mm": held_out(prior), "learned_mm": held_out(learned),
         "ratio": held_out(learned) / held_out(prior), "each_mm": learned, "prior_each_mm": prior, "floor_mm": held_out(floor),
-        "stiffness_ratio": float(ratio), "mean_abs_C": float(body.adapter.statistics().mean_abs_C),
+        "stiffness_ratio": float(ratio), "mean_abs_C": float(body.adapter.statistics().mean_abs_C.detach()),
         "fibre_deg": None if fibre is None else float(angle_between(axis, torch.tensor(fibre))),
+        "cone_deg": determined(body, posterior)["posterior/stiffest_cone_deg"], "coverage": coverage(case, found, posterior),
         "eta": float(torch.corrcoef(torch.stack([factor.float(), true]))[0, 1]) if varies else None,
-        "grid": joint.multiple(), "iterations": taken, "seconds": time.perf_counter() - began,
+        "grid": case.joint.multiple(), "iterations": case.iterations,
     } | {name: float(value.detach()) for name, value in body.material.physical().items()}  # fmt: skip
 
 
@@ -155,8 +206,8 @@ def run(identification: Identification, most: int) -> int:
 
 
 def table(records: list[dict]) -> str:
-    heads = ("problem", "set", "prior mm", "learned mm", "ratio", "floor mm", "stiffness ratio", "fibre deg", "mean abs C", "eta",
-             "grid", "s")  # fmt: skip
+    heads = ("problem", "set", "prior mm", "learned mm", "ratio", "floor mm", "stiffness ratio", "fibre deg", "cone deg",
+             "coverage", "mean abs C", "eta", "grid", "s")  # fmt: skip
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for r in sorted(records, key=lambda r: (r["set"], r["problem"])):
         def shown(name: str, digits: int, r=r) -> str:
@@ -165,7 +216,7 @@ def table(records: list[dict]) -> str:
         lines.append(f"| {r['problem']} | {' '.join(r['set'])} | " + " | ".join(
             shown(name, digits) for name, digits in (
                 ("prior_mm", 1), ("learned_mm", 1), ("ratio", 2), ("floor_mm", 1), ("stiffness_ratio", 2), ("fibre_deg", 0),
-                ("mean_abs_C", 3), ("eta", 2), ("grid", 2), ("seconds", 0))) + " |")  # fmt: skip
+                ("cone_deg", 0), ("coverage", 2), ("mean_abs_C", 3), ("eta", 2), ("grid", 2), ("seconds", 0))) + " |")  # fmt: skip
     return "\n".join(lines)
 
 

@@ -83,13 +83,14 @@ def test_fits_of_cues_make_a_table(monkeypatch, tmp_path, capsys):
     """One row for each line that fits have written, what a scene has no truth for left empty."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     identification = importlib.import_module("identification")
-    names = ("prior_mm", "learned_mm", "ratio", "floor_mm", "stiffness_ratio", "fibre_deg", "mean_abs_C", "eta", "grid", "seconds")
+    names = ("prior_mm", "learned_mm", "ratio", "floor_mm", "stiffness_ratio", "fibre_deg", "cone_deg", "coverage", "mean_abs_C",
+             "eta", "grid", "seconds")  # fmt: skip
     record = dict.fromkeys(names, 1.26) | {"problem": "ball", "set": ["prior=stvk"], "fibre_deg": None}
     (tmp_path / "fits.jsonl").write_text(json.dumps(record) + "\n")
     monkeypatch.setattr("sys.argv", ["identification.py", "table", str(tmp_path / "fits.jsonl")])
     identification.main()
     rows = capsys.readouterr().out.splitlines()
-    assert rows[2] == "| ball | prior=stvk | 1.3 | 1.3 | 1.26 | 1.3 | 1.26 |  | 1.260 | 1.26 | 1.26 | 1 |"
+    assert rows[2] == "| ball | prior=stvk | 1.3 | 1.3 | 1.26 | 1.3 | 1.26 |  | 1 | 1.26 | 1.260 | 1.26 | 1.26 | 1 |"
     assert len({row.count("|") for row in rows}) == 1
 
 
