@@ -35,7 +35,7 @@ from mosa.modules.gauss_newton import Posterior
 from mosa.modules.identification import Identification, each_law
 from mosa.modules.lit_mosa import LitMosa, Take
 from mosa.modules.residuals import sampled
-from mosa.prediction import DRAWS, LEAST_DRAWS, determined, total_spread
+from mosa.prediction import DRAWS, LEAST_DRAWS, among_forms, determined, rival_motions, total_spread
 from mosa.types import MotionCues
 
 CONF = Path(__file__).parents[1] / "conf"
@@ -56,21 +56,23 @@ def make(overrides: list[str], folder: Path, device: str) -> Path:
     """The problem of one scene, with cues of every sequence that it is learned from (scene.also_train)."""
     cfg = configuration(overrides)
     made = assemble(cfg, device)
-    scene, body = made.scene, made.body
+    scene, body, chosen = made.scene, made.body, sampled(len(made.body.rest), torch.device("cpu"))
+    # of the contact height that a run starts from, which a calibration under the wrong law may leave
+    floors = {each.prefix: floor_rollout(body, each.scene, made.world)[:, chosen].cpu() for each in made.sequences}
     # as a run does before its joint stage: the cues once more, about the calibrated backbone's motion
     module = made.module
     calibration = module.identifying(module.stages[0])
     calibration.search()
     run(calibration, module.stages[0].iterations)
     module.inform()
-    chosen, sequences, hidden = sampled(len(body.rest), torch.device("cpu")), {}, hidden_of(scene)
+    sequences, hidden = {}, hidden_of(scene)
     takes = iter(module.takes)  # the sequences that are learned from come first, in their order
     for each in made.sequences:
         s = each.scene
         sequences[each.prefix] = {
             "start": each.start.written(), "contact": each.contact, "frames": s.frames,
             "frame_dt": float(s.times[1] - s.times[0]), "truth": true_motion(body, s)[:, chosen].cpu(),
-            "floor": floor_rollout(body, s, made.world)[:, chosen].cpu(), "cues": None,
+            "floor": floors[each.prefix], "cues": None,
         }  # fmt: skip
         if each.prefix.startswith("train"):
             cues, T = next(takes).cues, len(s.training_frames)
@@ -147,11 +149,11 @@ def coverage(case: SimpleNamespace, found: dict[str, Tensor], posterior: Posteri
             continue
         for prefix in drawn:
             drawn[prefix].append(moved[prefix])
-    within = []
+    within, others = [], rival_motions(case.body, posterior, lambda: motions(case))
     for prefix, each in drawn.items():
         if len(each) >= LEAST_DRAWS:
             s = case.problem["sequences"][prefix]
-            sd = total_spread(torch.stack(each), posterior.model_error)
+            sd = total_spread(torch.stack(each), posterior.model_error, among_forms(found[prefix], [x[prefix] for x in others]))
             within.append(((found[prefix] - s["truth"]).norm(dim=-1) <= 2 * sd)[s["contact"] :].double().mean())
     return float(sum(within) / len(within)) if within else None
 

@@ -19,6 +19,7 @@ from torch import Tensor
 from mosa.errors import ConfigError, DataError
 from mosa.keys import BODY
 from mosa.limits import machine_memory
+from mosa.modules.material import RIVALS
 from mosa.physics.constitutive.laws import law_named
 from mosa.rendering.lighting import LIGHT
 from mosa.rendering.spherical_harmonics import DEGREES
@@ -194,6 +195,12 @@ def checked_posterior(checkpoint: Mapping[str, Any], numbers: int, path: str | P
         raise DataError(f"{where}.names: expected {numbers} names")
     if not is_number(found["model_error"]) or found["model_error"] < 0:
         raise DataError(f"{where}.model_error: expected a distance in m, found {found['model_error']!r}")
+    rivals = found.get("rivals", {})
+    if not isinstance(rivals, Mapping) or not set(rivals) <= set(RIVALS):
+        raise DataError(f"{where}.rivals: expected numbers of laws among {', '.join(RIVALS)}")
+    for law, value in rivals.items():
+        if not isinstance(value, Tensor) or tuple(value.shape) != (numbers,) or not bool(torch.isfinite(value).all()):
+            raise DataError(f"{where}.rivals.{law}: expected {numbers} finite numbers")
     if not float(torch.linalg.eigvalsh(found["covariance"].double()).min()) > 0:
         raise DataError(f"{where}.covariance: expected a positive definite matrix")
     return found

@@ -23,6 +23,7 @@ from mosa.errors import ConfigError, MosaError
 from mosa.limits import machine_memory
 from mosa.modules.body import Body, Start, World
 from mosa.modules.lit_mosa import LitMosa
+from mosa.modules.material import RIVALS
 from mosa.physics.engine.budget import KEPT_ON_CPU
 from mosa.prediction import DRAWS
 from mosa.reconstruction.observed import object_windows
@@ -98,7 +99,7 @@ def particle_bytes(cfg: Mapping[str, Any], size: Size) -> float:
     settings = cfg["reconstruction"]
     modes = settings["dynamic"]["modes"]
     found = PAIR_BYTES * settings["neighbours"] ** 2 + MODE_BYTES * modes + FRAME_BYTES * size.frames
-    kept = FRAME_BYTES * 3 * size.sequences * size.frames + 12 * DRAWS * size.sequences * size.frames
+    kept = FRAME_BYTES * 3 * size.sequences * size.frames + 12 * (DRAWS + len(RIVALS)) * size.sequences * size.frames
     return 1500 + max(found, cores() * FRAME_BYTES * size.frames + 1500, kept)
 
 
@@ -264,7 +265,7 @@ def seconds_of_parts(cfg: Mapping[str, Any], size: Size, window: int, module: Li
     reconstruction = (1.0 if stored else still + motion) + (size.taught - 1) * motion
     poses = (size.sequences - 1) * (0.5 + 3e-4 * size.cameras * window) + size.sequences * 4e-5 * size.cameras * window
     rollout = moving * speeds.frame
-    draws = DRAWS + 1 if any(stage.newton and stage.learns_adapter for stage in module.stages) else 0
+    draws = DRAWS + len(RIVALS) if any(stage.newton and stage.learns_adapter for stage in module.stages) else 0
     count = min(size.particles, cfg["evaluation"]["assignment"])
     distances = 0.6 * size.frames * 0.02 + 4 * 0.4 * (count / 2048) ** 2.4
     shown = 3 * size.sequences * size.cameras * size.frames

@@ -28,7 +28,7 @@ from mosa.modules.carried_splats import CarriedSplats, seen
 from mosa.modules.gauss_newton import Posterior
 from mosa.modules.identification import each_law, read_numbers
 from mosa.physics.contact.colliders import Collider
-from mosa.prediction import total_spread
+from mosa.prediction import DRAWS, among_forms, rival_motions, total_spread
 from mosa.progress import tqdm
 from mosa.rendering.cameras import look_at
 from mosa.rollout_file import save_rollout
@@ -69,7 +69,7 @@ class Twin:
         posterior = None if known is None else Posterior.read(known)
         return cls(body.to(device).eval(), world, config["frame_dt"], config, start, posterior)
 
-    def predict(self, *, draws: int = 16, seed: int = 0, **start) -> tuple[Rollout, Tensor]:
+    def predict(self, *, draws: int = DRAWS, seed: int = 0, **start) -> tuple[Rollout, Tensor]:
         """(rollout of the learned law, standard deviation (T, N) [m] of every particle's position) from a new start.
 
         start: as `simulate` takes it; draws: laws drawn from the posterior. Errors: ConfigError where the run kept no posterior
@@ -86,7 +86,8 @@ class Twin:
         if len(found) < 2:
             raise ConfigError(f"predict: expected at least two of {draws} draws of the law that can be simulated from this start, "
                               f"found {len(found)}")
-        return rollout, total_spread(torch.stack(found), self.posterior.model_error)
+        others = rival_motions(self.body, self.posterior, lambda: self.simulate(**start).x)
+        return rollout, total_spread(torch.stack(found), self.posterior.model_error, among_forms(rollout.x, others))
 
     @torch.no_grad()
     def simulate(

@@ -68,7 +68,8 @@ class Seat:
 @dataclass
 class Posterior:
     """mean (D,), covariance (D, D) float64 of the numbers of `names`; `determined` (D,) in [0, 1]: the share of each number's
-    precision that comes from the data and not from its prior; model_error [m]: distance of the identified model from what was seen.
+    precision that comes from the data and not from its prior; model_error [m]: distance of the identified model from what was seen;
+    rivals: numbers (D,) at which laws of another form explain the data too, by name.
     """
 
     names: list[str]
@@ -76,16 +77,18 @@ class Posterior:
     covariance: Tensor
     determined: Tensor
     model_error: float = 0.0
+    rivals: dict[str, Tensor] = field(default_factory=dict)
 
     def written(self) -> dict:
         """Plain containers, fit for a checkpoint; `read` gives the same numbers."""
         return {"names": list(self.names), "mean": self.mean, "covariance": self.covariance, "determined": self.determined,
-                "model_error": self.model_error}
+                "model_error": self.model_error, "rivals": dict(self.rivals)}
 
     @classmethod
     def read(cls, written: dict) -> Posterior:
         tensors = (written[name].double() for name in ("mean", "covariance", "determined"))
-        return cls(list(written["names"]), *tensors, float(written["model_error"]))
+        rivals = {name: numbers.double() for name, numbers in written.get("rivals", {}).items()}
+        return cls(list(written["names"]), *tensors, float(written["model_error"]), rivals)
 
     def draws(self, count: int, generator: torch.Generator) -> Tensor:
         """(count, D) float64."""
@@ -105,6 +108,8 @@ class GaussNewton:
     many: Callable[[Tensor], Tensor] | None = None
     matrix: Tensor | None = field(default=None, init=False)
     data: Tensor | None = field(default=None, init=False)
+    columns: Tensor | None = field(default=None, init=False)
+    """The last iteration's Jacobian (R, D)."""
 
     def _vector(self, get: Callable[[Block], Tensor | float]) -> Tensor:
         return torch.cat([torch.as_tensor(get(b), dtype=torch.float64).expand(b.size) for b in self.blocks])
@@ -178,9 +183,9 @@ class GaussNewton:
         for other in self.seats[1:]:
             other.write(numbers)
         r = seat.residuals()
-        J = self.jacobian(numbers, r)
+        self.columns = None  # before the next are made: one Jacobian is in memory at a time
+        J = self.columns = self.jacobian(numbers, r)
         H, g = (J.T @ J).double().cpu(), (J.T @ r).double().cpu()
-        del J
         if not bool(torch.isfinite(H).all()):
             raise SimulationDiverged("Gauss-Newton: a column of the Jacobian is not finite; start from a softer or stiffer prior")
         away = numbers - self.mean()
@@ -209,6 +214,34 @@ class GaussNewton:
         length = float((direction @ M @ direction).clamp(min=0).sqrt())
         return {"before": before, "after": after, "share": taken, "length": length} | {
             f"sd/{b.name}": b.factor * float(b.sd.mean()) for b in self.blocks if b.learned}
+
+    @torch.no_grad()
+    def transferred(self, steps: int) -> tuple[Tensor, float]:
+        """(numbers (D,), cost) at which a model that moves with its numbers much as this one does explains the data, after `steps`
+        with the last iteration's Jacobian. The first seat is asked, as that other model, and left where it stands.
+
+        Errors: ValueError before the first iteration; what the model raises where it stands."""
+        if self.matrix is None or self.columns is None:
+            raise ValueError("transferred: expected an iteration before it is asked for")
+        seat, precision, mean = self.seats[0], self.precision(), self.mean()
+        begun = numbers = seat.read()
+        best: tuple[float, Tensor] | None = None
+        try:
+            r = seat.residuals()
+            for _ in range(steps):
+                gradient = (self.columns.T @ r).double().cpu() + precision * (numbers - mean)
+                numbers = self.clamped(numbers - torch.linalg.solve(self.matrix, gradient))
+                seat.write(numbers)
+                r = seat.residuals()
+                cost = self.cost(numbers, r)
+                if best is None or cost < best[0]:
+                    best = (cost, numbers)
+        except MosaError:
+            if best is None:
+                raise
+        finally:
+            seat.write(begun)
+        return best[1], best[0]
 
     def _evidence(self, away: Tensor, H: Tensor, g: Tensor) -> None:
         """MacKay's fixed point of each learned block's factor: theta^2/sd^2 sums to the number of well determined directions.

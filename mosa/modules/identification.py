@@ -10,18 +10,19 @@ import copy
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from mosa.errors import ConfigError, SimulationDiverged
+from mosa.errors import ConfigError, MosaError, SimulationDiverged
 from mosa.modules import residuals
 from mosa.modules.body import Body, ContactOffset, Ready, World
 from mosa.modules.criteria import Criterion
 from mosa.modules.gauss_newton import Block, GaussNewton, Posterior, Seat
 from mosa.modules.hyperelastic import HyperelasticAdapter
-from mosa.modules.material import FORMS, NU_MAX, STIFFNESS
+from mosa.modules.material import FORMS, NU_MAX, RIVALS, STIFFNESS
 from mosa.modules.stages import Stage
 from mosa.modules.stiffness_modes import StiffnessModes
 
@@ -154,6 +155,24 @@ def compass(at: Callable[[dict[str, float]], float], row: dict[str, float], stri
         if not moved:
             share *= 0.5
     return row
+
+
+RIVAL_STEPS = 2
+"""With the fitted law's Jacobian, from its numbers on: then their costs are within a tenth of the fitted law's mostly."""
+IMPLAUSIBLE = 3.0
+"""A rival whose cost is more than so many times the fitted law's does not explain the data."""
+
+
+@contextmanager
+def as_rival(body: Body, law: str, numbers: Tensor) -> Iterator[None]:
+    """`body` as a rival of its posterior, and afterwards, whatever happens, what it was before."""
+    kept = body.material.law
+    body.material.law = law
+    try:
+        for _ in each_law(body, numbers[None]):
+            yield
+    finally:
+        body.material.law = kept
 
 
 TRIED = 4
@@ -437,7 +456,30 @@ class Identification:
             away = self.rollout(self.body, i).x - take.cues.positions
             found.append(float(away[take.first_contact :].square().sum(-1).mean()))
         share = self.independent() if self.calibrating and self.noise is not None else 1.0
-        return replace(self.newton.posterior(share), model_error=(sum(found) / len(found)) ** 0.5)
+        return replace(self.newton.posterior(share), model_error=(sum(found) / len(found)) ** 0.5, rivals=self.rivals())
+
+    @torch.no_grad()
+    def rivals(self) -> dict[str, Tensor]:
+        """Numbers (D,) of the laws of another form that explain the data about as well, by name: two steps from what was found,
+        with the same Jacobian. None beside laws that are not of `RIVALS`, and none of a calibration."""
+        own, newton = self.body.material.law, self.newton
+        if self.calibrating or own not in RIVALS:
+            return {}
+        kept, found = len(newton.seats[0].read()) - self.knows_grid, {}  # the grid's multiple is last
+        own_cost = newton.cost(newton.seats[0].read(), newton.seats[0].residuals())
+        for law in RIVALS:
+            if law == own:
+                continue
+            self.body.material.law = law
+            try:
+                numbers, cost = newton.transferred(RIVAL_STEPS)
+            except MosaError:  # it cannot be simulated there
+                continue
+            finally:
+                self.body.material.law = own
+            if cost < IMPLAUSIBLE * own_cost:
+                found[law] = numbers[:kept]
+        return found
 
     def independent(self) -> float:
         """Share of the data that a calibration counts which its residuals bear out, in (0, 1].

@@ -21,6 +21,9 @@ NU_MAX, ANGLE_MAX = 0.49, 89.0
 AUTO = "auto"
 """prior.law: the calibration chooses among prior.candidates."""
 
+RIVALS = ("neo_hookean", "corotated", "stvk")
+"""Laws of E and nu that agree at small strain: one drop hardly tells them apart, and they predict others differently."""
+
 
 class Form(NamedTuple):
     """An open range and the map onto it. low, high: its bounds; held: bounds a parameter may be held at."""

@@ -242,3 +242,27 @@ def test_draws_have_the_moments_of_the_posterior():
     assert ((torch.cov(found.T) - C).abs() < allowed).all()
     assert (C - torch.diag(C.diagonal())).abs().max() > 0.05 * C.diagonal().min()
     assert torch.equal(found, posterior.draws(n, torch.Generator().manual_seed(1)))
+
+
+def test_a_model_that_moves_alike_is_transferred_to_in_one_step():
+    """Of r = A x - b and another b the minimum is reached with the first one's columns; the seat stays where it stands."""
+    A, b, other = drawn(50, 4, seed=3), drawn(50, seed=4), drawn(50, seed=5)
+    newton = linear(two_blocks(), A, b)
+    newton.iterate(learn=False)
+    here = newton.seats[0].read()
+    newton.seats[0].residuals = linear_residuals(newton, A, other)
+    found, cost = newton.transferred(1)
+    away = found - newton.mean()
+    gradient = A.T @ (A @ found - other) + newton.precision() * away
+    assert gradient.abs().max() < 1e-6 * (A.T @ other).abs().max()
+    assert cost == pytest.approx(0.5 * float((A @ found - other).square().sum() + (newton.precision() * away.square()).sum()))
+    assert torch.equal(newton.seats[0].read(), here) and not torch.allclose(found, here, atol=1e-3)
+
+
+def test_nothing_is_transferred_before_an_iteration():
+    with pytest.raises(ValueError, match="expected an iteration"):
+        linear(two_blocks(), drawn(5, 4), drawn(5)).transferred(1)
+
+
+def linear_residuals(newton, A, b):
+    return lambda: A @ newton.seats[0].read() - b

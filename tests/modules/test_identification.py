@@ -14,7 +14,15 @@ from mosa.modules import identification as identification_module
 from mosa.modules.criteria import Criterion
 from mosa.modules.gauss_newton import Seat
 from mosa.modules.hyperelastic import anisotropic_basis
-from mosa.modules.identification import COARSER, Identification, IdentificationSettings, compass, write_numbers
+from mosa.modules.identification import (
+    COARSER,
+    Identification,
+    IdentificationSettings,
+    as_rival,
+    compass,
+    read_numbers,
+    write_numbers,
+)
 from mosa.modules.stages import Stage
 
 FRAMES = 12
@@ -115,6 +123,29 @@ def test_the_stiff_direction_of_a_body_is_found_from_its_drops(criterion):
     assert values(body)["E"] == pytest.approx(E, rel=0.03)
     assert found.distance() < 0.4 * missed
     assert len(found.posterior().names) == 2 + 19
+
+
+def test_rivals_explain_the_drop_with_their_own_numbers(monkeypatch):
+    """A neo-Hookean body, seen hitting hard, identified with a corotated backbone: the laws of other forms come nearer to the
+    drop than with the corotated law's numbers, and the body stays the corotated one."""
+    truth = small_body(adapter=False, law="neo_hookean")
+    body = small_body(law="corotated")
+    found = identification(body, [take_of(truth, start(turn=0.5, axis=(0.3, 0.5, 0.8), speed=-2.5), FRAMES)])
+    run(found)
+    posterior, here = found.posterior(), read_numbers(body)
+    assert set(posterior.rivals) == {"neo_hookean", "stvk"} and body.material.law == "corotated"
+    costs = {}
+    for law, numbers in posterior.rivals.items():
+        assert len(numbers) == len(posterior.mean)
+        for name, at in (("own", numbers), ("given", here)):
+            with as_rival(body, law, at):
+                assert body.material.law == law
+                costs[law, name] = float(found.newton.seats[0].residuals().square().sum())
+        assert costs[law, "own"] < 0.5 * costs[law, "given"]
+    assert costs["neo_hookean", "own"] < costs["stvk", "own"]
+    assert body.material.law == "corotated" and torch.equal(read_numbers(body), here)
+    monkeypatch.setattr(identification_module, "IMPLAUSIBLE", 1e-9)
+    assert not found.rivals()
 
 
 def test_an_isotropic_body_stays_isotropic():

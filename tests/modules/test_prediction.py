@@ -1,6 +1,7 @@
 """Draws of a posterior in use: what they predict, what a drop would tell, and that the body is afterwards what it was."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,9 +9,9 @@ from small_bodies import WORLD, small_body, start
 
 from mosa.errors import ConfigError
 from mosa.modules.gauss_newton import Posterior
-from mosa.modules.identification import each_law, read_numbers
+from mosa.modules.identification import as_rival, each_law, read_numbers
 from mosa.plan import drawn_starts, information, plan
-from mosa.prediction import INFLATION, total_spread
+from mosa.prediction import DRAWN, INFLATION, among_forms, total_spread
 from mosa.twin import Twin
 
 
@@ -44,6 +45,32 @@ def test_spread_of_known_draws():
     drawn = torch.zeros(2, 1, 1, 3)
     drawn[0, ..., 0], drawn[1, ..., 0] = -a, a
     assert float(total_spread(drawn, wrong)) == pytest.approx(math.hypot(INFLATION * a * 2**0.5, wrong), rel=1e-6)
+
+
+def test_spread_of_known_rivals():
+    """Two rivals, a to one side and 2 a to the other: with the law itself a third of 5 a^2; draws then count for little."""
+    a, wrong = 0.003, 0.004
+    base, step = torch.zeros(1, 1, 3), torch.tensor([[[0.0, 0.0, a]]])
+    forms = among_forms(base, [base + step, base - 2 * step])
+    assert float(forms) == pytest.approx(5 * a**2 / 3, rel=1e-6) and among_forms(base, []) is None
+    drawn = torch.stack([base - step, base + step])
+    assert float(total_spread(drawn, wrong, forms)) == pytest.approx(
+        math.sqrt((DRAWN * 2**0.5 * a) ** 2 + 5 * a**2 / 3 + wrong**2), rel=1e-6)
+
+
+def test_a_law_with_a_rival_is_less_sure_where_the_two_part():
+    """The same numbers under another law: where the two start they agree."""
+    sure, rival = twin_of(1e-7), twin_of(1e-7)
+    numbers = read_numbers(rival.body)
+    for twin, rivals in ((sure, {}), (rival, {"neo_hookean": numbers})):
+        twin.posterior = replace(twin.posterior, rivals=rivals, model_error=1e-6)
+    rollout, sd = rival.predict(draws=4, frames=9)
+    _, alone = sure.predict(draws=4, frames=9)
+    assert torch.allclose(sd[0], alone[0], rtol=1e-9)
+    with as_rival(rival.body, "neo_hookean", numbers):
+        apart = (rival.simulate(frames=9).x - rollout.x).square().sum(-1)
+    assert torch.allclose(sd[-1] ** 2, apart[-1] / 2 + 1e-12, rtol=0.05) and float(sd[-1].mean()) > 10 * float(alone[-1].mean())
+    assert rival.body.material.law == "corotated"
 
 
 def test_a_sure_law_is_off_by_the_models_error_alone_and_an_unsure_one_by_more():
