@@ -44,7 +44,8 @@ SECTIONS = ("scene", "prior", "adapter", "reconstruction", "simulation", "fit", 
 
 FIGURE = Kind("a figure's name like test/rms_m (docs/figures.md)",
               lambda v: isinstance(v, str) and v.split("/")[0] in FIGURES and "/" in v)
-FIGURES = ("train", "test", "camera", "prior", "prior_eta", "id", "id_prior", "floor", "time", "posterior", "geometry", "frames")
+FIGURES = ("train", "test", "camera", "prior", "prior_eta", "id", "id_prior", "floor", "time", "posterior", "geometry", "frames",
+           "extrapolated")
 """What the names of figures begin with."""
 
 TRAINING: dict[str, Kind] = {
@@ -57,6 +58,7 @@ TRAINING: dict[str, Kind] = {
     **kinds_of(CarriedSettings, "reconstruction.carried"),
     **kinds_of(InformedSettings, "reconstruction.informed"),
     "seed": whole(0, 2**32 - 1),
+    "extrapolate": FLAG,
     "extensions": or_null(NAMES),
     "scene.also_train": or_null(SEQUENCES),
     "scene.test": or_null(SEQUENCES),

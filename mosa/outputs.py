@@ -8,7 +8,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from mosa.analysis.comparison import compare, write_comparisons
-from mosa.analysis.tables import determined_text, geometry_lines, parameter_table, results_table
+from mosa.analysis.tables import continued_text, determined_text, geometry_lines, parameter_table, results_table
 from mosa.data.builtin.true_geometry import geometry_figures
 from mosa.data.splats import save_ply
 from mosa.evaluation import (
@@ -83,7 +83,8 @@ def write_outputs(
     if cfg.evaluation.video:
         shown = [s for s in evaluated if s.prefix.startswith("test")] or evaluated[-1:]
         write_comparisons(folder, {s.prefix: compare(body, s, kept[s.prefix]) for s in shown})
-    parts = (results_table(figures), parameter_table(figures), determined_text(figures), geometry_lines(figures))
+    parts = (results_table(figures), parameter_table(figures), continued_text(figures), determined_text(figures),
+             geometry_lines(figures))  # fmt: skip
     table = "\n\n".join(filter(None, parts))
     (folder / "results.md").write_text(table + "\n")
     write_figures(folder, figures)  # the last file: the run is complete

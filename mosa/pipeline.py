@@ -18,6 +18,7 @@ from mosa.costs import Costs, before_data, estimate
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation import sequences
 from mosa.extensions import load_extensions
+from mosa.extrapolation import check_can_extrapolate, extrapolated
 from mosa.fitting import fit, fit_estimate
 from mosa.guards import check_begin, check_configuration, check_evaluation, check_seen, check_starts, evaluated_scene
 from mosa.loggers import chosen, log_outcome
@@ -105,6 +106,8 @@ def train(cfg: DictConfig) -> float | None:
     check_starts(world, body, run.starts)
     with clock.measure("fit"):
         module = run.module
+        if cfg.extrapolate:
+            check_can_extrapolate(module)
         if parallel.launched_rank() == 0:
             log.info(fit_estimate(module, clock.costs, len(device_names(cfg))))
         fit(cfg, module, run.data, folder, device)
@@ -117,6 +120,9 @@ def train(cfg: DictConfig) -> float | None:
         figures, kept = figures_of(cfg.evaluation, body, evaluated, world, module.posterior, folder)
         figures |= start_figures(run.starts["train"]) | reconstruction.geometry
         figures |= {f"id_prior/compared/{law}_m": distance for law, distance in module.compared.items()}
+    if cfg.extrapolate:
+        with clock.measure("extrapolation"):
+            figures |= extrapolated(cfg, run, scene.known_parameters)
     figures |= clock.figures | cost(device) | {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
     figures["geometry/cells_across"] = resolved.cells
     log_outcome(plain(cfg.logger), folder, plain(cfg), figures)

@@ -27,6 +27,7 @@ from mosa.modules.residuals import SAMPLES
 from mosa.modules.restorable import Restorable
 from mosa.modules.stages import Stage
 from mosa.modules.terms import MISFIT, Step, check_terms, evaluate_terms
+from mosa.progress import tqdm
 from mosa.reconstruction.pipeline import SecondLook
 from mosa.types import MotionCues, Rollout
 
@@ -195,15 +196,8 @@ class LitMosa(Restorable, L.LightningModule):
         failure, found = None, {}
         try:
             if self.identification is None:
-                searched = bool(self.body.material.candidates)  # then the best of them is where its calibration left it
-                if searched:
-                    self.compared = choose_law(self.body, self.body.material.candidates, lambda: self.identifying(stage))
-                    self.settle_law()
-                self.identification = self.identifying(stage)
-                if iteration > 0 and self.saved_identification is not None:
-                    self.go_on(self.identification, self.saved_identification)
-                elif stage.calibrates and not searched:
-                    self.identification.search()
+                saved = self.saved_identification if iteration > 0 else None
+                self.identification = self.begun(stage, saved)
             found = self.identification.iterate()
         except MosaError as error:
             failure = error
@@ -213,10 +207,39 @@ class LitMosa(Restorable, L.LightningModule):
         self.steps_done += 1
         self.report_newton(found)
         if self.identification.converged or stage.ended(self.losses):
-            alone = self.body.adapter is None and self.body.heterogeneity is None  # then the calibration is all there is
-            if stage.learns_adapter or (stage.calibrates and alone):
-                self.posterior = self.identification.posterior()
+            self.keep_posterior(stage)
             self.finish(stage)
+
+    def begun(self, stage: Stage, saved: Mapping[str, Any] | None = None) -> Identification:
+        """A stage's identification, ready for its first iteration, or for the next one where `saved` is what a checkpoint kept."""
+        searched = bool(self.body.material.candidates)  # then the best of them is where its calibration left it
+        if searched:
+            self.compared = choose_law(self.body, self.body.material.candidates, lambda: self.identifying(stage))
+            self.settle_law()
+        identification = self.identifying(stage)
+        if saved is not None:
+            self.go_on(identification, saved)
+        elif stage.calibrates and not searched:
+            identification.search()
+        return identification
+
+    def keep_posterior(self, stage: Stage) -> None:
+        """Of the running identification, where it is the last one."""
+        alone = self.body.adapter is None and self.body.heterogeneity is None  # then the calibration is all there is
+        if stage.learns_adapter or (stage.calibrates and alone):
+            self.posterior = self.identification.posterior()
+
+    def identify(self) -> None:
+        """All stages by Gauss-Newton without a trainer: nothing is logged or kept. Errors: those of an iteration."""
+        for stage in self.stages[self.stage_index :]:
+            self.begin(stage)
+            self.identification = self.begun(stage)
+            for _ in tqdm(range(stage.iterations), f"stage {stage.name}", leave=False):
+                self.identification.iterate()
+                if self.identification.converged:
+                    break
+            self.keep_posterior(stage)
+            self.end(stage)
 
     def identifying(self, stage: Stage) -> Identification:
         """A stage's identification on the takes, from where the body stands."""
@@ -383,12 +406,16 @@ class LitMosa(Restorable, L.LightningModule):
         return sum(misfits) / len(misfits)
 
     def finish(self, stage: Stage) -> None:
-        """Keep the stage's result as a backbone and go on to the next; stop the trainer after the last."""
+        """Keep the stage's result and go on to the next; stop the trainer after the last."""
+        self.end(stage)
+        if self.stage is None:
+            self.trainer.should_stop = True
+
+    def end(self, stage: Stage) -> None:
+        """Keep the stage's result as a backbone and go on to the next."""
         for name in stage.keeps:
             self.body.freeze(name)
         self.stage_index, self.losses, self.identification = self.stage_index + 1, [], None
-        if self.stage is None:
-            self.trainer.should_stop = True
 
     def on_train_start(self) -> None:
         if self.stage is None:  # a run that was stopped after its fit
