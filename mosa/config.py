@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -13,10 +12,11 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from mosa.errors import ConfigError
+from mosa.evaluation_settings import EvaluationSettings
 from mosa.modules.adapters import adapter_class
 from mosa.modules.body import Body, SimulationSettings, World
 from mosa.modules.criteria import Criterion
-from mosa.modules.heterogeneity import HeterogeneityField
+from mosa.modules.heterogeneity import HeterogeneityField, HeterogeneitySettings
 from mosa.modules.identification import IdentificationSettings, few_numbers
 from mosa.modules.material import Material
 from mosa.modules.stages import STAGES, Stage
@@ -27,6 +27,7 @@ from mosa.physics.contact.colliders import colliders_from_config, domain_walls
 from mosa.physics.contact.motion import Motion
 from mosa.physics.contact.planes import Plane
 from mosa.reconstruction.settings import build_settings
+from mosa.schema import known_keys
 from mosa.types import Ground, Scene
 
 LAW_OPTIONS = ("yield_convention", "norm_eps", "rebuild", "on_inversion", "init_affine")
@@ -121,17 +122,8 @@ def build_prior(config: Mapping[str, Any]) -> tuple[Material, dict[str, Any]]:
 
 def build_heterogeneity(config: Mapping[str, Any], low: Tensor, high: Tensor) -> torch.nn.Module | None:
     """The field on the box (3,) to (3,) [m], None where it is switched off. Errors: ConfigError naming the key."""
-    if not config["enabled"]:
-        return None
-    kind = config.get("kind", "network")  # checkpoints from before there were modes
-    if kind not in HETEROGENEITY:
-        raise ConfigError(f"heterogeneity.kind: expected {' or '.join(HETEROGENEITY)}, found {kind!r}")
-    build, others = HETEROGENEITY[kind], set()
-    for other in HETEROGENEITY.values():
-        others |= set(inspect.signature(other).parameters)
-    foreign = others - set(inspect.signature(build).parameters)
-    keys = {k: v for k, v in config.items() if k not in ("enabled", "kind") and k not in foreign}
-    return known_keys("heterogeneity", build, keys | {"low": low, "high": high})
+    settings = known_keys("heterogeneity", HeterogeneitySettings, config)
+    return HETEROGENEITY[settings.kind](low, high, settings) if settings.enabled else None
 
 
 def rehearse(cfg: Mapping[str, Any]) -> None:
@@ -148,6 +140,7 @@ def rehearse(cfg: Mapping[str, Any]) -> None:
     build_stages(cfg["fit"], heterogeneity, adapter, bool(material.candidates))
     build_criterion(cfg)
     build_identification(cfg)
+    build_evaluation(cfg)
     check_terms(cfg["losses"])
     if not any(cfg["losses"].get(name) for name in ("image", "mask", "flow", "rotation", "stretch", "position")):
         raise ConfigError("losses: expected a weight above 0 for image, mask, flow, rotation, stretch or position: nothing else "
@@ -156,17 +149,6 @@ def rehearse(cfg: Mapping[str, Any]) -> None:
     for collider in colliders_from_config(cfg["world"]["colliders"] or ()):
         if isinstance(collider.motion, Motion) and collider.motion.times is not None:
             collider.motion.sample(1, 1, 1.0)  # as many velocities as times
-
-
-def known_keys(where: str, build: Callable, keys: Mapping[str, Any], *positional: Any) -> Any:
-    """build(*positional, **keys). Errors: ConfigError for a key that it does not take."""
-    known = inspect.signature(build).parameters
-    if unknown := [k for k in keys if k not in known]:
-        raise ConfigError(f"{where}.{unknown[0]}: unknown key; expected one of {', '.join(list(known)[len(positional):])}")
-    needed = [k for k, parameter in list(known.items())[len(positional):] if parameter.default is parameter.empty]
-    if missing := [k for k in needed if k not in keys]:
-        raise ConfigError(f"{where}.{missing[0]}: expected this key, found none")
-    return build(*positional, **keys)
 
 
 def build_adapter(config: Mapping[str, Any]) -> torch.nn.Module | None:
@@ -185,6 +167,11 @@ def build_criterion(cfg: Mapping[str, Any]) -> Criterion:
 def build_identification(cfg: Mapping[str, Any]) -> IdentificationSettings:
     """Errors: ConfigError naming the key."""
     return known_keys("identification", IdentificationSettings, cfg.get("identification") or {})
+
+
+def build_evaluation(cfg: Mapping[str, Any]) -> EvaluationSettings:
+    """Errors: ConfigError naming the key."""
+    return known_keys("evaluation", EvaluationSettings, cfg.get("evaluation") or {})
 
 
 def build_stages(

@@ -17,6 +17,7 @@ from mosa.analysis.stiffness import angle_between, stiffest
 from mosa.analysis.vibration import GROWTH_LIMIT, vibration_growth
 from mosa.data.sequences import load_sequences
 from mosa.errors import SimulationDiverged
+from mosa.evaluation_settings import EvaluationSettings
 from mosa.modules.body import VARIANTS, Body, Start, World
 from mosa.modules.carried_splats import seen
 from mosa.modules.hyperelastic import HyperelasticAdapter
@@ -53,16 +54,14 @@ def run_sequences(config: Mapping, body: Body) -> list[Sequence]:
 
 
 @torch.no_grad()
-def rollouts(
-    body: Body, sequence: Sequence, world: World, variants=VARIANTS
-) -> tuple[dict[str, Rollout], float | None, float]:
+def rollouts(body: Body, sequence: Sequence, world: World) -> tuple[dict[str, Rollout], float | None, float]:
     """Every variant's rollout over all frames of `sequence`, mean |C| of the adapted one (None without an adapter), and the
     particle substeps per second of the last."""
     scene = sequence.scene
     frame_dt = float(scene.times[1] - scene.times[0])
     sizes: list[float] = []
     result, rate = {}, 0.0
-    for v in variants:
+    for v in VARIANTS:
         began = time.perf_counter()
         result[v] = body.simulate(sequence.start, world, scene.frames, frame_dt, model=body.model(v),
                                   collect=lambda found: sizes.append(float(found.mean_abs_C)))
@@ -101,7 +100,7 @@ def image_metrics(images: Tensor, scene: Scene, cameras: list[int], frames: list
 
 
 def motion_metrics(
-    x: Tensor, body: Body, sequence: Sequence, frames: list[int], samples: int, assignment: int, target: Tensor | None = None
+    x: Tensor, body: Body, sequence: Sequence, frames: list[int], settings: EvaluationSettings, target: Tensor | None = None
 ) -> dict[str, float]:
     """rms_m, chamfer and earth mover's distance after first contact, where the true motion is known.
 
@@ -122,10 +121,10 @@ def motion_metrics(
         result = {"rms_m": metrics.rms(x[after], target[after])}
         result |= {name: metric.function(x[after], target[after]) for name, metric in metrics.MOTION_METRICS.items()}
         pairs = [(x[t], truth.positions[t]) for t in after]
-    each = list(threaded(lambda pair: metrics.chamfer_distances(*pair, samples=samples), pairs))
+    each = list(threaded(lambda pair: metrics.chamfer_distances(*pair, samples=settings.samples), pairs))
     result |= {name: float(np.mean([found[name] for found in each])) for name in each[0]}
     last = pairs[:: max(1, len(pairs) // 3)]
-    result["emd_m"] = float(np.mean(list(threaded(lambda pair: metrics.emd(*pair, samples=assignment), last))))
+    result["emd_m"] = float(np.mean(list(threaded(lambda pair: metrics.emd(*pair, samples=settings.assignment), last))))
     return result
 
 
@@ -136,23 +135,24 @@ def true_motion(body: Body, scene: Scene) -> Tensor | None:
 
 
 @torch.no_grad()
-def evaluate(body: Body, sequences: list[Sequence], world: World, *, samples: int = 8192, assignment: int = 2048,
-             variants=VARIANTS) -> tuple[dict[str, float], dict[str, dict[str, Rollout]]]:
+def evaluate(
+    body: Body, sequences: list[Sequence], world: World, settings: EvaluationSettings
+) -> tuple[dict[str, float], dict[str, dict[str, Rollout]]]:
     """All figures, flat, named as in docs/figures.md, and the rollouts: result[sequence prefix][variant]."""
     figures: dict[str, float] = {}
     kept: dict[str, dict[str, Rollout]] = {}
-    bar = tqdm(total=len(sequences) * len(variants), desc="evaluate", unit="rollout", dynamic_ncols=True)
+    bar = tqdm(total=len(sequences) * len(VARIANTS), desc="evaluate", unit="rollout", dynamic_ncols=True)
     rates = []
     for sequence in sequences:
         kept[sequence.prefix] = {}
-        simulated, size, rate = rollouts(body, sequence, world, variants)
+        simulated, size, rate = rollouts(body, sequence, world)
         rates.append(rate)
         if size is not None:
             figures[f"{sequence.prefix}/mean_abs_C"] = size
         target = true_motion(body, sequence.scene)
         for variant, rollout in simulated.items():
             kept[sequence.prefix][variant] = rollout
-            figures |= sequence_metrics(body, sequence, rollout, PREFIX[variant], samples, assignment, target)
+            figures |= sequence_metrics(body, sequence, rollout, PREFIX[variant], settings, target)
             bar.update()
     bar.close()
     figures |= test_means(figures)
@@ -161,7 +161,7 @@ def evaluate(body: Body, sequences: list[Sequence], world: World, *, samples: in
 
 
 def sequence_metrics(
-    body, sequence: Sequence, rollout: Rollout, model: str, samples: int, assignment: int, target: Tensor | None
+    body, sequence: Sequence, rollout: Rollout, model: str, settings: EvaluationSettings, target: Tensor | None
 ) -> dict[str, float]:
     """The figures of one rollout: training views and frames, held-out frames, held-out cameras."""
     scene, x = sequence.scene, rollout.x.cpu()
@@ -170,13 +170,13 @@ def sequence_metrics(
     cameras = scene.training_cameras if training else list(range(len(scene.cameras)))
     images = render(body, rollout, scene, cameras)
     figures: Mapping[str, float] = {
-        **motion_metrics(x, body, sequence, frames, samples, assignment, target),
+        **motion_metrics(x, body, sequence, frames, settings, target),
         **image_metrics(images, scene, cameras, frames),
     }
     result = {f"{model}{sequence.prefix}/{k}": v for k, v in figures.items()}
     if sequence.prefix == "train" and scene.holdout_frames:
         held = list(scene.holdout_frames)
-        figures = {**motion_metrics(x, body, sequence, held, samples, assignment, target),
+        figures = {**motion_metrics(x, body, sequence, held, settings, target),
                    **image_metrics(images, scene, cameras, held)}
         result |= {f"{model}frames/{k}": v for k, v in figures.items()}
     if sequence.prefix == "train" and scene.holdout_cameras:
@@ -199,7 +199,7 @@ def test_means(figures: Mapping[str, float]) -> dict[str, float]:
     return {key: float(np.mean(values)) for key, values in groups.items()}
 
 
-def floor_figures(body: Body, evaluated: list[Sequence], world: World, *, samples: int, assignment: int) -> dict[str, float]:
+def floor_figures(body: Body, evaluated: list[Sequence], world: World, settings: EvaluationSettings) -> dict[str, float]:
     """What no law can get below, to read the figures of a model against.
 
     `floor/<part>/...`: the true law on the learner's own grid and particles, on synthetic scenes, over the same frames and with as
@@ -214,13 +214,14 @@ def floor_figures(body: Body, evaluated: list[Sequence], world: World, *, sample
             continue
         x = floor_rollout(body, scene, world)
         frames = scene.training_frames if sequence.prefix.startswith("train") else list(range(scene.frames))
-        result = motion_metrics(x, body, sequence, frames, samples, assignment)
+        result = motion_metrics(x, body, sequence, frames, settings)
         figures |= {f"floor/{sequence.prefix}/{k}": v for k, v in result.items()}
     figures |= test_means(figures)
     clouds = [scene.truth.rest if scene.truth is not None else scene.particles[0] for scene in (s.scene for s in evaluated)
               if scene.truth is not None or scene.particles is not None]
     if clouds:
-        floors = metrics.sampling_floors(clouds[0], len(body.rest), len(clouds[0]), samples=samples, assignment=assignment)
+        floors = metrics.sampling_floors(clouds[0], len(body.rest), len(clouds[0]), samples=settings.samples,
+                                          assignment=settings.assignment)
         figures |= {f"floor/sampling/{name}": value for name, value in floors.items()}
     return figures
 

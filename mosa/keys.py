@@ -6,11 +6,17 @@ files and combinations exist is said where they are used.
 
 from __future__ import annotations
 
+from mosa.evaluation_settings import EvaluationSettings
+from mosa.modules.criteria import Criterion
+from mosa.modules.heterogeneity import HeterogeneitySettings
+from mosa.modules.identification import IdentificationSettings
 from mosa.modules.simulation_settings import SimulationSettings
 from mosa.modules.stages import Stage
 from mosa.reconstruction.carried import CarriedSettings
+from mosa.reconstruction.dynamic import DynamicSettings
 from mosa.reconstruction.geometry import GeometrySettings
 from mosa.reconstruction.informed import InformedSettings
+from mosa.reconstruction.settings import ReconstructionSettings
 from mosa.reconstruction.static import FitSettings, StaticSettings
 from mosa.schema import (
     COUNT,
@@ -57,6 +63,11 @@ TRAINING: dict[str, Kind] = {
     **kinds_of(FitSettings, "reconstruction.appearance"),
     **kinds_of(CarriedSettings, "reconstruction.carried"),
     **kinds_of(InformedSettings, "reconstruction.informed"),
+    **kinds_of(ReconstructionSettings, "reconstruction"),
+    **kinds_of(DynamicSettings, "reconstruction.dynamic"),
+    **kinds_of(HeterogeneitySettings, "heterogeneity"),
+    **kinds_of(Criterion, "criterion"),
+    **kinds_of(IdentificationSettings, "identification"),
     "seed": whole(0, 2**32 - 1),
     "extrapolate": FLAG,
     "extensions": or_null(NAMES),
@@ -65,26 +76,8 @@ TRAINING: dict[str, Kind] = {
     "fit.views": COUNT,
     "fit.clip": POSITIVE,
     "losses.*": WEIGHT,
-    "heterogeneity.enabled": FLAG,
-    "heterogeneity.kind": one_of("modes", "network"),
-    "heterogeneity.wavelength": number(0, 2, above=True),
-    "heterogeneity.most": whole(1, WIDEST),
-    "criterion.name": one_of("free", "corrected", "both"),
-    "criterion.gain": number(0, 1, above=True),
-    "identification.count": POSITIVE,
-    "identification.grid_error": number(0, 10),
-    "identification.model_error": number(0, 1),
-    "identification.operator_sd": POSITIVE,
-    "identification.stiffness_sd": POSITIVE,
-    "identification.smoothness": WEIGHT,
-    "identification.evidence": FLAG,
-    "identification.tolerance": POSITIVE,
-    "identification.threads": whole(0, 256),
     "adapter.strain": one_of("green", "biot", "hencky"),
     "prior.candidates": or_null(NAMES),
-    "heterogeneity.amplitude": POSITIVE,
-    "heterogeneity.hidden": whole(1, WIDEST),
-    "heterogeneity.frequencies": whole(0, 32),
     "adapter.name": or_null(TEXT),
     "adapter._target_": or_null(TEXT),
     "adapter.alpha": POSITIVE,
@@ -115,28 +108,6 @@ TRAINING: dict[str, Kind] = {
     "prior.options.on_inversion": one_of("warn", "ignore", "error"),
     "prior.options.init_affine": one_of("spin", "zero"),
     "rendering.margin": whole(0),
-    "reconstruction.resolution": whole(8, 1024),  # a hull of that many voxels per side has 4 GB
-    "reconstruction.splats": or_null(TEXT),
-    "reconstruction.cue": one_of("neighbourhood", "gaussian"),
-    "reconstruction.dynamic.model": one_of("modes", "network"),
-    "reconstruction.dynamic.carriers": one_of("static", "particles"),
-    "reconstruction.ridge_passes": whole(0),
-    "reconstruction.points": whole(8, 10**8),
-    "reconstruction.neighbours": whole(4),  # fewer leave every deformation gradient open
-    "reconstruction.margin": whole(0),
-    "reconstruction.dynamic.iterations": whole(0),
-    "reconstruction.dynamic.views": COUNT,
-    "reconstruction.dynamic.lr*": WEIGHT,
-    "reconstruction.dynamic.ssim": number(0, 1),
-    "reconstruction.dynamic.matte": WEIGHT,
-    "reconstruction.dynamic.modes": COUNT,
-    "reconstruction.dynamic.track_iterations": whole(0),
-    "reconstruction.dynamic.track_views": COUNT,
-    "reconstruction.dynamic.free_shape": FLAG,
-    "reconstruction.dynamic.elastic": WEIGHT,
-    "reconstruction.dynamic.bending": WEIGHT,
-    "reconstruction.dynamic.bending_scale": WEIGHT,
-    "reconstruction.dynamic.hidden": whole(1, WIDEST),
     "world.walls": or_null(SECTION),
     "world.colliders": or_null(ENTRIES),
     "logger.tensorboard": or_null(SECTION),
@@ -154,12 +125,7 @@ TRAINING: dict[str, Kind] = {
 BODY = {key: kind for key, kind in TRAINING.items()
         if key.split(".")[0] in ("seed", "simulation", "prior", "heterogeneity", "adapter", "world")}  # fmt: skip
 """Of these, what a checkpoint's body is built from."""
-EVALUATION: dict[str, Kind] = {
-    "evaluation.floor": FLAG,
-    "evaluation.samples": COUNT,
-    "evaluation.assignment": COUNT,
-    "evaluation.video": FLAG,
-}
+EVALUATION: dict[str, Kind] = kinds_of(EvaluationSettings, "evaluation")
 SIMULATION: dict[str, Kind] = {
     **{name: SECTION for name in ("simulate", "evaluation")},
     "extensions": or_null(NAMES),

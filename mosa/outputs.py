@@ -21,6 +21,7 @@ from mosa.evaluation import (
     test_means,
     true_motion,
 )
+from mosa.evaluation_settings import EvaluationSettings
 from mosa.modules.body import Body, Start, World
 from mosa.modules.gauss_newton import Posterior
 from mosa.prediction import determined, predicted_spread
@@ -32,17 +33,17 @@ log = logging.getLogger(__name__)
 
 
 def figures_of(
-    settings: DictConfig, body: Body, evaluated: list[Sequence], world: World, posterior: Posterior | None, folder: Path
+    settings: EvaluationSettings, body: Body, evaluated: list[Sequence], world: World, posterior: Posterior | None, folder: Path
 ) -> tuple[dict[str, float], dict[str, dict[str, Rollout]]]:
-    """All that is measured on a fitted body, and the rollouts by sequence and variant. settings: the section `evaluation`.
+    """All that is measured on a fitted body, and the rollouts by sequence and variant.
 
     Writes uncertainty.npz into `folder` where there is a posterior."""
-    scene, sizes = evaluated[0].scene, {"samples": settings.samples, "assignment": settings.assignment}
-    figures, kept = evaluate(body, evaluated, world, **sizes)
+    scene = evaluated[0].scene
+    figures, kept = evaluate(body, evaluated, world, settings)
     figures |= identification(body, scene) | law_figures(body)
     figures |= hidden_figures(body, scene, figures) | posterior_figures(body, posterior, evaluated, world, folder)
     if settings.floor:
-        figures |= floor_figures(body, evaluated, world, **sizes) | true_geometry(body, scene)
+        figures |= floor_figures(body, evaluated, world, settings) | true_geometry(body, scene)
     return figures, kept
 
 

@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mosa import __version__, parallel
 from mosa.assembly import assemble, scenes
-from mosa.config import build_world, plain, world_config
+from mosa.config import build_evaluation, build_world, plain, world_config
 from mosa.costs import Costs, before_data, estimate
 from mosa.errors import ConfigError, DataError
 from mosa.evaluation import sequences
@@ -117,7 +117,7 @@ def train(cfg: DictConfig) -> float | None:
     save_observed(folder / "observed.npz", {prefix: take.cues for prefix, take in zip(learned_from, module.takes)})
     with clock.measure("evaluation"):
         evaluated = run.sequences
-        figures, kept = figures_of(cfg.evaluation, body, evaluated, world, module.posterior, folder)
+        figures, kept = figures_of(build_evaluation(plain(cfg)), body, evaluated, world, module.posterior, folder)
         figures |= start_figures(run.starts["train"]) | reconstruction.geometry
         figures |= {f"id_prior/compared/{law}_m": distance for law, distance in module.compared.items()}
     if cfg.extrapolate:
@@ -167,7 +167,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
                             f"found {len(found)}: the scene is another one than the run's")
     check_starts(world, body, found)
     evaluated = sequences(body, scene, held_out, found)
-    figures, kept = figures_of(cfg.evaluation, body, evaluated, world, twin.posterior, folder)
+    figures, kept = figures_of(build_evaluation(plain(cfg)), body, evaluated, world, twin.posterior, folder)
     write_outputs(folder, cfg, body, evaluated, figures, kept, world)
     return optimized(figures, "test/rms_m")
 

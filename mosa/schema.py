@@ -5,6 +5,7 @@ The dataclass checks itself by them, the check of a configuration and of a check
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import field, fields
@@ -88,6 +89,17 @@ def check_knobs(settings: Any, where: str) -> None:
         kind, value = f.metadata.get("kind"), getattr(settings, f.name)
         if kind is not None and not kind.fits(value):
             raise ConfigError(f"{where}.{f.name}: expected {kind.described}, found {value!r}")
+
+
+def known_keys(where: str, build: Callable, keys: Mapping[str, Any], *positional: Any) -> Any:
+    """build(*positional, **keys). Errors: ConfigError for a key that it does not take."""
+    known = inspect.signature(build).parameters
+    if unknown := [k for k in keys if k not in known]:
+        raise ConfigError(f"{where}.{unknown[0]}: unknown key; expected one of {', '.join(list(known)[len(positional):])}")
+    needed = [k for k, parameter in list(known.items())[len(positional):] if parameter.default is parameter.empty]
+    if missing := [k for k in needed if k not in keys]:
+        raise ConfigError(f"{where}.{missing[0]}: expected this key, found none")
+    return build(*positional, **keys)
 
 
 def check(values: Mapping[str, Any], *schemas: Mapping[str, Kind]) -> None:

@@ -1,7 +1,7 @@
 """Every combination of the config groups composes, and a switch changes what it names and nothing else."""
 
 import re
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from pathlib import Path
 
 import pytest
@@ -12,11 +12,18 @@ from omegaconf import OmegaConf
 
 from mosa.config import build_adapter, build_stages, rehearse
 from mosa.errors import ConfigError
+from mosa.evaluation_settings import EvaluationSettings
 from mosa.keys import EVALUATION, SIMULATION, TRAINING
+from mosa.modules.criteria import Criterion
+from mosa.modules.heterogeneity import HeterogeneitySettings
+from mosa.modules.identification import IdentificationSettings
 from mosa.modules.simulation_settings import SimulationSettings
 from mosa.modules.stages import Stage
 from mosa.reconstruction.carried import CarriedSettings
+from mosa.reconstruction.dynamic import DynamicSettings
 from mosa.reconstruction.geometry import GeometrySettings
+from mosa.reconstruction.informed import InformedSettings
+from mosa.reconstruction.settings import ReconstructionSettings
 from mosa.reconstruction.static import FitSettings, StaticSettings
 from mosa.schema import check
 
@@ -204,12 +211,14 @@ def test_an_experiment_is_what_its_overrides_are(name, overrides):
     assert composed(f"experiment={name}", "seed=3", "prior=stvk")["prior"]["law"] == composed("prior=stvk")["prior"]["law"]
 
 
-@pytest.mark.parametrize("settings", [SimulationSettings, Stage, FitSettings, StaticSettings, CarriedSettings, GeometrySettings])
+@pytest.mark.parametrize("settings", [
+    SimulationSettings, Stage, FitSettings, StaticSettings, CarriedSettings, GeometrySettings, InformedSettings, DynamicSettings,
+    ReconstructionSettings, HeterogeneitySettings, Criterion, IdentificationSettings, EvaluationSettings])  # fmt: skip
 def test_a_knob_is_written_once(settings):
     """Its default is of its kind, the check of a configuration has the same kind, and the settings refuse what that refuses."""
     given = {"dx": 0.1, "name": "joint", "iterations": 3, "lr": 0.1}
-    given = {name: value for name, value in given.items() if name in {f.name for f in fields(settings)}}
-    made, known = settings(**given), set(map(id, TRAINING.values()))
+    given = {name: value for name, value in given.items() if name in {f.name for f in fields(settings) if f.default is MISSING}}
+    made, known = settings(**given), set(map(id, (TRAINING | EVALUATION).values()))
     knobs = [f for f in fields(settings) if "kind" in f.metadata]
     assert len(knobs) >= 2
     for f in knobs:

@@ -17,7 +17,7 @@ from mosa.config import build_world
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body import Body, SimulationSettings, Start
 from mosa.modules.carried_splats import CarriedSplats
-from mosa.modules.heterogeneity import HeterogeneityField
+from mosa.modules.heterogeneity import HeterogeneityField, HeterogeneitySettings
 from mosa.modules.material import Material
 from mosa.physics.contact.colliders import domain_walls
 from mosa.rollout_file import save_observed, save_rollout
@@ -45,7 +45,7 @@ def run(tmp_path, monkeypatch):
     tensors = {"rest": rollout(0).x[0], "volume": torch.full((N,), 1e-4), "colors": torch.full((N, 3), 0.25),
                "opacities": torch.full((N,), 0.9), "covariances": 1e-4 * torch.eye(3).expand(N, 3, 3).clone()}  # fmt: skip
     world = {"ground": {"height": GROUND}, "gravity": [0, -9.8, 0], "up": [0, 1, 0], "box": [[-1, -1, -1], [1, 1, 1]]}
-    field = HeterogeneityField(tensors["rest"].amin(0), tensors["rest"].amax(0), hidden=8)
+    field = HeterogeneityField(tensors["rest"].amin(0), tensors["rest"].amax(0), HeterogeneitySettings(hidden=8))
     material = Material("neo_hookean", {"E": 1e5, "nu": 0.3})
     body = Body(**tensors, density=1000.0, material=material, heterogeneity=field, adapter=None,
                 settings=SimulationSettings(dx=0.1))

@@ -13,10 +13,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from mosa.errors import ConfigError
+from mosa.schema import check_knobs, knob, number, one_of
 from mosa.types import Rollout
-
-CRITERIA = ("free", "corrected", "both")
 
 
 @dataclass(frozen=True)
@@ -26,14 +24,11 @@ class Criterion:
     Errors: ConfigError naming the key.
     """
 
-    name: str = "corrected"
-    gain: float = 0.5
+    name: str = knob("corrected", one_of("free", "corrected", "both"))
+    gain: float = knob(0.5, number(0, 1, above=True))
 
     def __post_init__(self) -> None:
-        if self.name not in CRITERIA:
-            raise ConfigError(f"criterion.name: expected one of {', '.join(CRITERIA)}, found {self.name!r}")
-        if not 0 < self.gain <= 1:
-            raise ConfigError(f"criterion.gain: expected a number above 0 and at most 1, found {self.gain}")
+        check_knobs(self, "criterion")
 
     @property
     def gains(self) -> tuple[float, ...]:

@@ -2,32 +2,53 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError
 from mosa.modules.networks import TwoHiddenLayers, zero_outputs
+from mosa.schema import FLAG, WIDEST, Kind, check_knobs, is_number, knob, number, one_of, whole
+
+FRACTION = Kind("a number between 0 and 1", lambda v: is_number(v) and 0 < v < 1)
+
+
+@dataclass(frozen=True)
+class HeterogeneitySettings:
+    """kind: modes (`StiffnessModes`) | network (`HeterogeneityField`), what checkpoints that do not say have; amplitude: largest
+    relative deviation.
+
+    Of the modes, wavelength: of the shortest, over the box's longest side; most: of them, the longest waves first. Of the network,
+    hidden: width of its layers; frequencies: sines and cosines of pi 2^k x, k = 0 .. frequencies - 1, beside x in [-1, 1] itself.
+    Errors: ConfigError naming the key."""
+
+    enabled: bool = knob(True, FLAG)
+    kind: str = knob("network", one_of("modes", "network"))
+    amplitude: float = knob(0.2, FRACTION)
+    wavelength: float = knob(0.33, number(0, 2, above=True))
+    most: int = knob(50, whole(1, WIDEST))
+    hidden: int = knob(32, whole(1, WIDEST))
+    frequencies: int = knob(2, whole(0, 32))
+
+    def __post_init__(self) -> None:
+        check_knobs(self, "heterogeneity")
 
 
 class HeterogeneityField(nn.Module):
     """Coordinate network eta on rest positions normalised to the object's box. eta is exactly 0 at initialisation.
 
-    low, high: (3,) [m] corners of the box; amplitude: largest relative deviation; frequencies: sines and cosines of pi 2^k x,
-    k = 0 .. frequencies - 1, beside x in [-1, 1] itself. Errors: ConfigError naming the key.
+    low, high: (3,) [m] corners of the box. Errors: ConfigError for a box without volume.
     """
 
-    def __init__(self, low: Tensor, high: Tensor, amplitude: float = 0.2, hidden: int = 32, frequencies: int = 2) -> None:
+    def __init__(self, low: Tensor, high: Tensor, settings: HeterogeneitySettings | None = None) -> None:
         super().__init__()
-        if not 0 < amplitude < 1:
-            raise ConfigError(f"heterogeneity.amplitude: expected a number between 0 and 1, found {amplitude}")
-        if frequencies < 0 or hidden < 1:
-            raise ConfigError(f"heterogeneity: expected frequencies >= 0 and hidden >= 1, found {frequencies} and {hidden}")
-        if not bool((high > low).all()):
-            raise ConfigError(f"heterogeneity: the box of the object has no volume: {low.tolist()} to {high.tolist()}")
+        settings = settings or HeterogeneitySettings()
+        check_box(low, high)
         self.register_buffer("low", low.detach().clone())
         self.register_buffer("high", high.detach().clone())
-        self.amplitude, self.frequencies = amplitude, frequencies
-        self.net = TwoHiddenLayers(3 + 6 * frequencies, 1, hidden)
+        self.amplitude, self.frequencies = settings.amplitude, settings.frequencies
+        self.net = TwoHiddenLayers(3 + 6 * self.frequencies, 1, settings.hidden)
         zero_outputs(self.net[-1])
 
     def forward(self, X: Tensor) -> Tensor:
@@ -39,3 +60,9 @@ class HeterogeneityField(nn.Module):
     def factor(self, X: Tensor) -> Tensor:
         """1 + amplitude tanh eta(X), (N,)."""
         return 1 + self.amplitude * torch.tanh(self(X))
+
+
+def check_box(low: Tensor, high: Tensor) -> None:
+    """Errors: ConfigError for a box from low to high (3,) [m] without volume."""
+    if not bool((high > low).all()):
+        raise ConfigError(f"heterogeneity: the box of the object has no volume: {low.tolist()} to {high.tolist()}")

@@ -25,6 +25,7 @@ from mosa.modules.hyperelastic import HyperelasticAdapter
 from mosa.modules.material import FORMS, NU_MAX, RIVALS, STIFFNESS
 from mosa.modules.stages import Stage
 from mosa.modules.stiffness_modes import StiffnessModes
+from mosa.schema import FLAG, POSITIVE, WEIGHT, check_knobs, knob, number, whole
 
 STIFFNESS_STEPS = (0.3, 0.6, 1.0, 1.5, 2.2, 3.2, 4.5, 7.0)
 POISSON_STEPS = (0.2, 0.32, 0.42)
@@ -56,27 +57,18 @@ class IdentificationSettings:
     power with which that of the modes falls with their wave number; evidence: whether it is found; tolerance: of the last step, in
     posterior standard deviations; threads: rollouts side by side on a CPU, 0 for one a core. Errors: ConfigError naming the key."""
 
-    count: float = 30.0
-    grid_error: float = 1.0
-    model_error: float = 0.02
-    operator_sd: float = 0.1
-    stiffness_sd: float = 0.3
-    smoothness: float = 1.0
-    evidence: bool = True
-    tolerance: float = 0.3
-    threads: int = 0
+    count: float = knob(30.0, POSITIVE)
+    grid_error: float = knob(1.0, number(0, 10))
+    model_error: float = knob(0.02, number(0, 1))
+    operator_sd: float = knob(0.1, POSITIVE)
+    stiffness_sd: float = knob(0.3, POSITIVE)
+    smoothness: float = knob(1.0, WEIGHT)
+    evidence: bool = knob(True, FLAG)
+    tolerance: float = knob(0.3, POSITIVE)
+    threads: int = knob(0, whole(0, 256))
 
     def __post_init__(self) -> None:
-        for name in ("count", "operator_sd", "stiffness_sd", "tolerance"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0):
-                raise ConfigError(f"identification.{name}: expected a positive number, found {value!r}")
-        for name, most in (("model_error", 1), ("grid_error", 10)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not (isinstance(value, (int, float)) and 0 <= value <= most):
-                raise ConfigError(f"identification.{name}: expected a number from 0 to {most}, found {value!r}")
-        if isinstance(self.threads, bool) or not (isinstance(self.threads, int) and self.threads >= 0):
-            raise ConfigError(f"identification.threads: expected a whole number of at least 0, found {self.threads!r}")
+        check_knobs(self, "identification")
 
 
 def few_numbers(module: torch.nn.Module | None) -> bool:

@@ -13,6 +13,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from mosa.checkpoints import read_checkpoint
+from mosa.config import build_evaluation
 from mosa.evaluation import evaluate, run_sequences
 from mosa.twin import Twin
 
@@ -42,9 +43,7 @@ class Restorable:
 
     def test_step(self, sequence, _index: int) -> None:
         """Logs the figures of docs/figures.md of one sequence, of every model."""
-        settings = self.config["cfg"].get("evaluation") or {}
         here = replace(sequence, start=type(sequence.start).read(sequence.start.written(), self.body.rest))
-        sizes = {name: settings[name] for name in ("samples", "assignment") if name in settings}
-        figures, _ = evaluate(self.body, [here], self.world, **sizes)
+        figures, _ = evaluate(self.body, [here], self.world, build_evaluation(self.config["cfg"]))
         figures.pop("time/particle_substeps_per_s")
         self.log_dict(figures, batch_size=1)  # `test/<metric>` of several sequences is averaged

@@ -10,28 +10,22 @@ import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError
+from mosa.modules.heterogeneity import HeterogeneitySettings, check_box
 
 
 class StiffnessModes(nn.Module):
-    """low, high: (3,) corners of the body's box [m]; amplitude: largest relative deviation; wavelength: of the shortest mode, over
-    the box's longest side; most: of the modes, the longest waves first. Call `settle(rest)` once with the particles.
+    """low, high: (3,) corners of the body's box [m]. Call `settle(rest)` once with the particles.
 
-    Errors: ConfigError naming the key.
+    Errors: ConfigError for a box without volume.
     """
 
-    def __init__(self, low: Tensor, high: Tensor, amplitude: float = 0.2, wavelength: float = 0.33, most: int = 50) -> None:
+    def __init__(self, low: Tensor, high: Tensor, settings: HeterogeneitySettings | None = None) -> None:
         super().__init__()
-        if not 0 < amplitude < 1:
-            raise ConfigError(f"heterogeneity.amplitude: expected a number between 0 and 1, found {amplitude}")
-        if not 0 < wavelength <= 2:
-            raise ConfigError(f"heterogeneity.wavelength: expected a number above 0 and at most 2, found {wavelength}")
-        if not (isinstance(most, int) and most >= 1):
-            raise ConfigError(f"heterogeneity.most: expected a whole number of at least 1, found {most!r}")
-        if not bool((high > low).all()):
-            raise ConfigError(f"heterogeneity: the box of the object has no volume: {low.tolist()} to {high.tolist()}")
+        settings = settings or HeterogeneitySettings()
+        check_box(low, high)
         self.register_buffer("low", low.detach().clone())
         self.register_buffer("high", high.detach().clone())
-        self.amplitude = amplitude
+        self.amplitude, wavelength = settings.amplitude, settings.wavelength
         extent = (high - low).double().cpu()
         sides = (extent / extent.max()).tolist()
         limit = 2 / wavelength  # in half waves per longest side
@@ -43,7 +37,7 @@ class StiffnessModes(nn.Module):
                     size = sum((n / s) ** 2 for n, s in zip((a, b, c), sides)) ** 0.5
                     if 0 < size <= limit:
                         found.append((size, a, b, c))
-        found = sorted(found)[:most]
+        found = sorted(found)[: settings.most]
         if not found:
             raise ConfigError(f"heterogeneity.wavelength: no wave of {wavelength} times the body fits; expected less than 2")
         self.register_buffer("waves", torch.tensor([f[1:] for f in found], dtype=torch.float32))

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mosa.errors import ConfigError
 from mosa.reconstruction.cues import Neighbourhood
 from mosa.reconstruction.modes import Modes
 from mosa.reconstruction.motion import ModalMotion, MotionBasisNetwork, MotionSample
@@ -22,6 +21,7 @@ from mosa.reconstruction.observed import Windows
 from mosa.reconstruction.photometric import image_loss
 from mosa.reconstruction.uniform_adam import UniformAdam
 from mosa.rendering.rasterizer import rasterize
+from mosa.schema import COUNT, FLAG, WEIGHT, WIDEST, check_knobs, knob, number, one_of, whole
 from mosa.types import Splats
 
 Motion = ModalMotion | MotionBasisNetwork
@@ -54,33 +54,30 @@ class DynamicSettings:
     bases, hidden, basis_layers, coefficient_layers, lr_network: size and Adam step of the network.
     """
 
-    model: str = "modes"
-    carriers: str = "static"
-    modes: int = 120
-    free_shape: bool = False
-    track_iterations: int = 40
-    track_views: int = 4
-    iterations: int = 150
-    views: int = 1
-    lr_track: float = 0.03
-    lr: float = 0.01
-    ssim: float = 0.0
-    matte: float = 1.0
-    elastic: float = 0.01
-    bending: float = 3.5
-    bending_scale: float = 0.001
-    poisson: float = 0.3
-    bases: int = 10
-    hidden: int = 256
-    basis_layers: int = 8
-    coefficient_layers: int = 3
-    lr_network: float = 5e-4
+    model: str = knob("modes", one_of("modes", "network"))
+    carriers: str = knob("static", one_of("static", "particles"))
+    modes: int = knob(120, COUNT)
+    free_shape: bool = knob(False, FLAG)
+    track_iterations: int = knob(40, whole(0))
+    track_views: int = knob(4, COUNT)
+    iterations: int = knob(150, whole(0))
+    views: int = knob(1, COUNT)
+    lr_track: float = knob(0.03, WEIGHT)
+    lr: float = knob(0.01, WEIGHT)
+    ssim: float = knob(0.0, number(0, 1))
+    matte: float = knob(1.0, WEIGHT)
+    elastic: float = knob(0.01, WEIGHT)
+    bending: float = knob(3.5, WEIGHT)
+    bending_scale: float = knob(0.001, WEIGHT)
+    poisson: float = knob(0.3, number(0, 0.49))
+    bases: int = knob(10, whole(1, WIDEST))
+    hidden: int = knob(256, whole(1, WIDEST))
+    basis_layers: int = knob(8, whole(1, 100))
+    coefficient_layers: int = knob(3, whole(1, 100))
+    lr_network: float = knob(5e-4, WEIGHT)
 
     def __post_init__(self) -> None:
-        if self.carriers not in ("static", "particles"):
-            raise ConfigError(f"reconstruction.dynamic.carriers: expected static or particles, found {self.carriers!r}")
-        if self.model not in ("modes", "network"):
-            raise ConfigError(f"reconstruction.dynamic.model: expected modes or network, found {self.model!r}")
+        check_knobs(self, "reconstruction.dynamic")
 
 
 def elastic_energy(deformation: Tensor, poisson: float) -> Tensor:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 from mosa.errors import ConfigError
@@ -12,6 +11,7 @@ from mosa.reconstruction.dynamic import DynamicSettings
 from mosa.reconstruction.geometry import GeometrySettings
 from mosa.reconstruction.informed import InformedSettings
 from mosa.reconstruction.static import FitSettings, StaticSettings
+from mosa.schema import TEXT, check_knobs, knob, known_keys, one_of, or_null, whole
 
 
 @dataclass(frozen=True)
@@ -23,13 +23,13 @@ class ReconstructionSettings:
     world, that replaces the static stage (None: fit it); informed: the motion once more, about the calibrated
     backbone's, where it is one of modes and the cue that of the neighbourhood."""
 
-    resolution: int = 80
-    ridge_passes: int = 24
-    points: int = 3000
-    neighbours: int = 20
-    cue: str = "neighbourhood"
-    margin: int = 6
-    splats: str | None = None
+    resolution: int = knob(80, whole(8, 1024))  # a hull of that many voxels per side has 4 GB
+    ridge_passes: int = knob(24, whole(0))
+    points: int = knob(3000, whole(8, 10**8))
+    neighbours: int = knob(20, whole(4))  # fewer leave every deformation gradient open
+    cue: str = knob("neighbourhood", one_of("neighbourhood", "gaussian"))
+    margin: int = knob(6, whole(0))
+    splats: str | None = knob(None, or_null(TEXT))
     geometry: GeometrySettings = field(default_factory=GeometrySettings)
     static: StaticSettings = field(default_factory=StaticSettings)
     appearance: FitSettings = field(default_factory=lambda: FitSettings(keep=1.0))
@@ -43,8 +43,7 @@ class ReconstructionSettings:
         return self.informed.iterations > 0 and self.cue == "neighbourhood" and self.dynamic.model == "modes"
 
     def __post_init__(self) -> None:
-        if self.cue not in ("neighbourhood", "gaussian"):
-            raise ConfigError(f"reconstruction.cue: expected neighbourhood or gaussian, found {self.cue!r}")
+        check_knobs(self, "reconstruction")
         if self.static.max_points is not None and self.static.max_points < self.points:
             raise ConfigError(
                 f"reconstruction.static.max_points: expected at least reconstruction.points={self.points}, the number at the "
@@ -58,14 +57,6 @@ class ReconstructionSettings:
             )
 
 
-def _section(cls: type, values: Mapping[str, Any], where: str) -> Any:
-    known = {f.name for f in fields(cls)}
-    unknown = sorted(set(values) - known)
-    if unknown:
-        raise ConfigError(f"{where}: unknown key {unknown[0]!r}, expected one of {', '.join(sorted(known))}")
-    return cls(**values)
-
-
 def build_settings(**keys: Any) -> ReconstructionSettings:
     """Settings from the plain keys of conf/reconstruction; ConfigError names an unknown key."""
     keys = dict(keys)
@@ -73,5 +64,5 @@ def build_settings(**keys: Any) -> ReconstructionSettings:
                 "carried": CarriedSettings, "informed": InformedSettings}  # fmt: skip
     for name, cls in sections.items():
         if name in keys:
-            keys[name] = _section(cls, keys[name] or {}, f"reconstruction.{name}")
-    return _section(ReconstructionSettings, keys, "reconstruction")
+            keys[name] = known_keys(f"reconstruction.{name}", cls, keys[name] or {})
+    return known_keys("reconstruction", ReconstructionSettings, keys)

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import torch
 
 from mosa.modules.body import Body, SimulationSettings, Start, World
+from mosa.modules.heterogeneity import HeterogeneitySettings
 from mosa.modules.hyperelastic import HyperelasticAdapter
 from mosa.modules.material import Material
 from mosa.modules.stiffness_modes import StiffnessModes
@@ -30,7 +31,7 @@ def small_body(*, numbers=None, strain="green", adapter=True, modes=False, law="
     rest = lattice(counts)
     n = len(rest)
     module = HyperelasticAdapter(strain=strain) if adapter else None
-    field = StiffnessModes(rest.amin(0) - DX / 4, rest.amax(0) + DX / 4, wavelength=1.0) if modes else None
+    field = StiffnessModes(rest.amin(0) - DX / 4, rest.amax(0) + DX / 4, HeterogeneitySettings(wavelength=1.0)) if modes else None
     body = Body(
         rest=rest, volume=torch.full((n,), (DX / 2) ** 3).double(), colors=torch.ones(n, 3), opacities=torch.ones(n),
         covariances=1e-4 * torch.eye(3).expand(n, 3, 3), density=1000.0, material=Material(law, {"E": E, "nu": nu}),

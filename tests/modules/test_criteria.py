@@ -103,7 +103,7 @@ def test_one_frame_is_the_start():
 def test_what_a_criterion_compares_and_refuses():
     assert Criterion("free", 0.5).gains == (0.0,) and Criterion("corrected", 0.3).gains == (0.3,)
     assert Criterion("both", 0.3).gains == (0.0, 0.3)
-    with pytest.raises(ConfigError, match=r"criterion\.name: expected one of free, corrected, both, found 'open'"):
+    with pytest.raises(ConfigError, match=r"criterion\.name: expected free or corrected or both, found 'open'"):
         Criterion("open")
     for gain in (0.0, -0.1, 1.1, float("nan")):
         with pytest.raises(ConfigError, match=r"criterion\.gain: expected"):

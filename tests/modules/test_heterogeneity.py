@@ -5,7 +5,7 @@ import torch
 from drawn_adapters import randomise
 
 from mosa.errors import ConfigError
-from mosa.modules.heterogeneity import HeterogeneityField
+from mosa.modules.heterogeneity import HeterogeneityField, HeterogeneitySettings
 
 LOW, HIGH = torch.tensor([-0.1, 0.0, 0.2]), torch.tensor([0.1, 0.4, 0.5])
 
@@ -22,7 +22,7 @@ def test_it_starts_at_one_exactly():
 
 @pytest.mark.parametrize("size", [0.3, 30.0])
 def test_the_factor_stays_within_its_amplitude_and_varies_in_space(size):
-    field = HeterogeneityField(LOW, HIGH, amplitude=0.2)
+    field = HeterogeneityField(LOW, HIGH, HeterogeneitySettings(amplitude=0.2))
     randomise(field, size)
     factor = field.factor(places())
     assert factor.min() >= 0.8 - 1e-6 and factor.max() <= 1.2 + 1e-6 and factor.std() > 1e-3
@@ -52,8 +52,13 @@ def test_its_last_layer_learns_from_the_first_step():
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"amplitude": 1.0}, "amplitude"), ({"frequencies": -1}, "frequencies"), ({"high": LOW}, "no volume")],
+    [({"amplitude": 1.0}, "amplitude"), ({"frequencies": -1}, "frequencies"), ({"hidden": 0}, "hidden")],
 )
 def test_a_value_out_of_range_is_named(options, message):
     with pytest.raises(ConfigError, match=message):
-        HeterogeneityField(**{"low": LOW, "high": HIGH, **options})
+        HeterogeneityField(LOW, HIGH, HeterogeneitySettings(**options))
+
+
+def test_a_flat_box_is_refused():
+    with pytest.raises(ConfigError, match="no volume"):
+        HeterogeneityField(LOW, LOW)

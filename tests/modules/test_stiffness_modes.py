@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError
+from mosa.modules.heterogeneity import HeterogeneitySettings
 from mosa.modules.stiffness_modes import StiffnessModes
 
 LOW, HIGH = torch.tensor([-0.1, 0.0, 0.2]).double(), torch.tensor([0.3, 0.2, 0.4]).double()
@@ -16,7 +17,7 @@ def particles(count=500):
 
 
 def modes(**options) -> StiffnessModes:
-    found = StiffnessModes(LOW, HIGH, **options).double()
+    found = StiffnessModes(LOW, HIGH, HeterogeneitySettings(**options)).double()
     found.settle(particles())
     return found
 
@@ -34,7 +35,7 @@ def test_modes_have_mean_0_and_variance_1_and_differ(wavelength):
 @pytest.mark.parametrize("wavelength", [0.25, 0.33, 0.5, 1.0])
 def test_no_wave_is_shorter_than_promised_and_none_that_fits_is_left_out(wavelength):
     """cos(pi a x/L_x) ... has the wave vector pi (a/L_x, b/L_y, c/L_z): its length is 2/|(a/L_x, ...)|."""
-    field, sides = modes(wavelength=wavelength, most=10_000), HIGH - LOW
+    field, sides = modes(wavelength=wavelength, most=4096), HIGH - LOW
     lengths = 2 / (field.waves.double() / sides).norm(dim=1)
     longest = float(sides.max())
     assert lengths.min() >= wavelength * longest * (1 - 1e-6) and (lengths.diff() <= 1e-6).all()
@@ -54,7 +55,7 @@ def test_a_mode_is_the_product_of_its_cosines():
 
 
 def test_the_longest_waves_come_first_where_there_are_too_many():
-    every, few = modes(most=10_000), modes(most=7)
+    every, few = modes(most=4096), modes(most=7)
     assert len(few.size) == 7 < len(every.size) and torch.equal(few.waves, every.waves[:7])
 
 
@@ -76,10 +77,10 @@ def test_the_factor_is_within_its_amplitude_and_1_without_coefficients():
 ])  # fmt: skip
 def test_what_is_out_of_range_is_named(options, key):
     with pytest.raises(ConfigError, match=rf"heterogeneity\.{key}: expected"):
-        StiffnessModes(LOW, HIGH, **options)
+        StiffnessModes(LOW, HIGH, HeterogeneitySettings(**options))
 
 
 def test_a_flat_box_is_refused_and_the_longest_wavelength_is_one_mode():
     with pytest.raises(ConfigError, match="no volume"):
         StiffnessModes(LOW, torch.tensor([0.3, 0.0, 0.4]))
-    assert StiffnessModes(LOW, HIGH, wavelength=2.0).waves.tolist() == [[1.0, 0.0, 0.0]]
+    assert StiffnessModes(LOW, HIGH, HeterogeneitySettings(wavelength=2.0)).waves.tolist() == [[1.0, 0.0, 0.0]]
