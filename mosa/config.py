@@ -90,12 +90,10 @@ def build_body(config: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Body
 
 
 def fitting(adapter: torch.nn.Module | None, law: str) -> torch.nn.Module | None:
-    """The adapter, or None with a warning where it adds stiffness and the law is a fluid's."""
-    known = law_named(law)
-    if getattr(adapter, "strain", None) is None or ("mu" in known.offsets and known.viscosity is None):
+    """The adapter, or None with a warning where there is nothing of this law that it could correct."""
+    if adapter is None or (reason := adapter.unsuited(law_named(law))) is None:
         return adapter
-    warnings.warn(f"adapter: {law} has no shear stiffness that could be anisotropic; the run learns its parameters and stiffness "
-                  "modes alone (adapter=mosa corrects its stress by networks)", stacklevel=2)
+    warnings.warn(f"adapter: {reason}", stacklevel=2)
     return None
 
 
@@ -141,7 +139,7 @@ def rehearse(cfg: Mapping[str, Any]) -> None:
     build_criterion(cfg)
     build_identification(cfg)
     build_evaluation(cfg)
-    check_terms(cfg["losses"])
+    check_terms(cfg["losses"], adapter)
     if not any(cfg["losses"].get(name) for name in ("image", "mask", "flow", "rotation", "stretch", "position")):
         raise ConfigError("losses: expected a weight above 0 for image, mask, flow, rotation, stretch or position: nothing else "
                           "tells the prior anything")

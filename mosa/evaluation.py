@@ -20,7 +20,6 @@ from mosa.errors import SimulationDiverged
 from mosa.evaluation_settings import EvaluationSettings
 from mosa.modules.body import VARIANTS, Body, Start, World
 from mosa.modules.carried_splats import seen
-from mosa.modules.hyperelastic import HyperelasticAdapter
 from mosa.modules.material import material_states
 from mosa.progress import tqdm
 from mosa.reconstruction.starts import first_contact
@@ -263,7 +262,7 @@ def hidden_figures(body: Body, scene: Scene, figures: Mapping[str, float]) -> di
 def law_figures(body: Body) -> dict[str, float]:
     """What the learned law is like by itself: its stiffest direction, and whether it makes energy (with a warning)."""
     adapter, material = body.adapter, body.material
-    if adapter is None or not adapter.is_on or hasattr(adapter, "simulator"):  # which brings no law
+    if adapter is None or not adapter.is_on or adapter.own_dynamics:  # which brings no law
         return {}
     figures = {}
     adapter.follow(material.poisson())
@@ -272,8 +271,8 @@ def law_figures(body: Body) -> dict[str, float]:
     if growth > GROWTH_LIMIT:
         warn(f"the learned law makes energy: a freely vibrating block grows by a factor of {growth:.3g} in a period; the law of "
              "adapter=operator has an energy and cannot", stacklevel=2)
-    if isinstance(adapter, HyperelasticAdapter):
-        axis, ratio = stiffest(adapter.stiffness().detach().cpu())
+    if (stiffness := adapter.stiffness()) is not None:
+        axis, ratio = stiffest(stiffness.detach().cpu())
         figures["id/stiffness_ratio"] = float(ratio)
         return figures | {f"id/stiffest_{name}": float(value) for name, value in zip("xyz", axis)}
     if "E" in material.physical():

@@ -13,7 +13,7 @@ from typing import Any
 
 from mosa.errors import ConfigError, MosaError
 from mosa.modules.adapters import adapter_class
-from mosa.modules.terms import TERMS
+from mosa.modules.terms import term_names
 from mosa.schema import NAMES, WEIGHT, Kind
 
 
@@ -38,9 +38,9 @@ def registered_keys(values: Mapping[str, Any]) -> dict[str, Kind]:
     """Keys of the configuration that what is registered brings: a weight for each loss term, the arguments of the chosen adapter.
 
     Errors: ConfigError for an adapter that is not known."""
-    keys = {f"losses.{name}": WEIGHT for name in TERMS}
     section = values.get("adapter")
     build = adapter_class(section) if isinstance(section, Mapping) else None
+    keys = {f"losses.{name}": WEIGHT for name in term_names(build)}
     if build is not None:
         anything = Kind("a value", lambda value: True)  # which the adapter checks itself
         keys |= {f"adapter.{name}": anything for name in inspect.signature(build).parameters}

@@ -14,7 +14,6 @@ from mosa.errors import MosaError
 from mosa.evaluation import Sequence, true_motion
 from mosa.modules.body import Body, World
 from mosa.modules.gauss_newton import Posterior
-from mosa.modules.hyperelastic import HyperelasticAdapter
 from mosa.modules.identification import as_rival, each_law
 from mosa.progress import tqdm
 
@@ -127,7 +126,7 @@ def determined(body: Body, posterior: Posterior, *, draws: int = 400, seed: int 
         elif name in ("operator", "stiffness"):
             figures[f"posterior/{name}_numbers"] = float(len(index))
             figures[f"posterior/{name}_determined"] = float(posterior.determined[index].sum())
-    if isinstance(body.adapter, HyperelasticAdapter) and body.adapter.is_on:
+    if body.adapter is not None and body.adapter.is_on and body.adapter.stiffness() is not None:
         generator = torch.Generator().manual_seed(seed)
         axis, _ = stiffest(body.adapter.stiffness().cpu())
         stiffnesses = []

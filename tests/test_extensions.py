@@ -1,14 +1,19 @@
 """What another package registers: once, under a name of its own, with its keys known to the check of a configuration."""
 
+from types import SimpleNamespace
+
 import pytest
+import torch
 
 from mosa import metrics
 from mosa.data import scene
 from mosa.errors import ConfigError
 from mosa.extensions import load_extensions, registered_keys
 from mosa.metrics import Metric, register_metric
-from mosa.modules import adapters, terms
+from mosa.modules import adapters, direct, terms
 from mosa.modules.adapters import register_adapter
+from mosa.modules.direct import DirectAdapter
+from mosa.modules.penalties import PENALTIES, OperatorStatistics
 from mosa.modules.terms import register_term
 
 
@@ -66,5 +71,23 @@ def test_a_name_is_taken_once(monkeypatch):
 def test_the_arguments_of_an_adapter_and_the_weights_of_terms_are_keys():
     keys = registered_keys({"adapter": {"name": "nclaw", "hidden": 8}})
     assert {"adapter.start", "adapter.plastic_rate"} <= set(keys) and "adapter.rank" not in keys
-    weights = {f"losses.{name}" for name in terms.TERMS}
+    weights = {f"losses.{name}" for name in (*terms.TERMS, *PENALTIES)}
     assert set(registered_keys({"adapter": {"name": None}})) == weights == set(registered_keys({"adapter": None}))
+
+
+def test_an_adapter_brings_its_penalties(monkeypatch):
+    class Costly(DirectAdapter):
+        penalties = {**PENALTIES, "cost": lambda found, misfit: found.mean_abs_C + misfit}
+
+    monkeypatch.setattr(direct, "Costly", Costly, raising=False)
+    monkeypatch.setattr(adapters, "ADAPTERS", adapters.ADAPTERS | {"costly": "mosa.modules.direct:Costly"})
+    assert "losses.cost" in registered_keys({"adapter": {"name": "costly"}})
+    terms.check_terms({"cost": 1.0}, Costly())
+    with pytest.raises(ConfigError, match="cost"):
+        terms.check_terms({"cost": 1.0}, DirectAdapter())
+    found = OperatorStatistics(torch.tensor(2.0), torch.zeros(3), torch.ones(3))
+    step = SimpleNamespace(operator=found, misfit=0.5, body=SimpleNamespace(adapter=Costly()))
+    assert terms.evaluate_terms({"cost": 1.0, "operator_variance": 1.0}, step) == {"operator_variance": 1.0, "cost": 2.5}
+    assert terms.evaluate_terms({"cost": 1.0}, SimpleNamespace(operator=None)) == {}
+    with pytest.raises(ConfigError, match="another"):
+        register_term("operator", lambda step: None)

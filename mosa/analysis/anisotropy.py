@@ -6,7 +6,6 @@ product; in plain 6-vectors even an isotropic law would look anisotropic.
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Sequence
 
@@ -14,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError, SimulationDiverged
-from mosa.modules.adapter_base import Adapter
+from mosa.modules.adapter_protocol import AdapterProtocol
 from mosa.modules.microplane import MANDEL
 from mosa.physics.engine.adapter_interface import MaterialState
 
@@ -65,21 +64,12 @@ def directions_on_sphere(count: int = 200) -> Tensor:
     return torch.stack([r * torch.cos(turn), r * torch.sin(turn), z], -1)
 
 
-def in_double(adapter: Adapter) -> Adapter:
-    """A copy of the adapter in float64 on the CPU, without gradients of its weights. Errors: ConfigError where it is not on."""
-    adapter.check_on()
-    held = copy.deepcopy(adapter).double().cpu().requires_grad_(False)
-    if getattr(held, "fused", None) is True:  # the kernels run on CUDA only
-        held.fused = "auto"
-    return held
-
-
-def stress_jacobian(adapter: Adapter, w: Tensor, s: Tensor) -> Tensor:
+def stress_jacobian(adapter: AdapterProtocol, w: Tensor, s: Tensor) -> Tensor:
     """d tau_hat/d tau_iso at held stretch, (N, 6, 6) on vech components, I where the law is the prior.
 
     w, s: (N, 6) dimensionless states vech(W - I) and vech(R^T tau R)/E_ref. The networks' dependence on the stress is included.
     """
-    adapter = in_double(adapter)
+    adapter = adapter.in_double()
     s = s.detach().double().cpu().requires_grad_(True)
     with torch.enable_grad():
         d = adapter.increment(w.detach().double().cpu(), s)
@@ -97,14 +87,14 @@ def redistribution_response(jacobian: Tensor, directions: Tensor) -> Tensor:
     return (change @ dyads(directions).to(jacobian).T).norm(dim=-2)
 
 
-def response_of(states: States, adapter: Adapter | None) -> Callable[[Tensor], Tensor]:
+def response_of(states: States, adapter: AdapterProtocol | None) -> Callable[[Tensor], Tensor]:
     """Corrected stress (M, 6) [Pa] as a function of the Hencky strain (M, 6): both Mandel, in the material frame.
 
     Errors: ConfigError for the default adapter, whose operator is a stiffness."""
-    if getattr(adapter, "strain", None) is not None:
+    if adapter is not None and adapter.strain is not None:
         raise ConfigError("anisotropy: expected an adapter whose operator acts on the prior's stress; a stiffness has its in "
                           "mosa.analysis.stiffness")
-    adapter = None if adapter is None else in_double(adapter)
+    adapter = None if adapter is None else adapter.in_double()
 
     def response(strain: Tensor) -> Tensor:
         plain = strain / mandel_scale(strain)
@@ -152,7 +142,7 @@ def uniaxial_stress(response: Callable[[Tensor], Tensor], directions: Tensor, st
     )
 
 
-def directional_modulus(states: States, adapter: Adapter | None, directions: Tensor, strain: float = 5e-3) -> Tensor:
+def directional_modulus(states: States, adapter: AdapterProtocol | None, directions: Tensor, strain: float = 5e-3) -> Tensor:
     """E(n) (K,) [Pa] along (K, 3): central difference of the uniaxial stress at +-strain, lateral stress free.
 
     states: of the prior at its global parameters; adapter: None for the prior alone, whose E(n) is Young's modulus.
@@ -162,7 +152,7 @@ def directional_modulus(states: States, adapter: Adapter | None, directions: Ten
     return (tension - compression) / (2 * strain)
 
 
-def modulus_ratio(states: States, adapter: Adapter | None, axis: Sequence[float], strain: float = 5e-3) -> float:
+def modulus_ratio(states: States, adapter: AdapterProtocol | None, axis: Sequence[float], strain: float = 5e-3) -> float:
     """E along `axis` over the mean of E across it (18 directions); 1 for an isotropic law."""
     along = torch.tensor(axis, dtype=torch.float64)
     along = along / along.norm()
@@ -173,7 +163,7 @@ def modulus_ratio(states: States, adapter: Adapter | None, axis: Sequence[float]
     return float(modulus[0] / modulus[1:].mean())
 
 
-def stiffest_axis(states: States, adapter: Adapter | None, count: int = 200, strain: float = 5e-3) -> tuple[Tensor, float]:
+def stiffest_axis(states: States, adapter: AdapterProtocol | None, count: int = 200, strain: float = 5e-3) -> tuple[Tensor, float]:
     """(unit vector (3,) of the largest E(n), E_max/E_min) over a half sphere of `count` directions: which way a learned law is
     stiff, to be compared with a known fibre."""
     directions = directions_on_sphere(count)

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mosa.analysis.anisotropy import in_double
-from mosa.modules.adapter_base import Adapter
+from mosa.modules.adapter_protocol import AdapterProtocol
 from mosa.physics.constitutive.elasticity import wave_modulus
 from mosa.physics.contact.colliders import Box, Collider
 from mosa.physics.contact.motion import Motion
@@ -54,7 +53,8 @@ def turned_to(direction: Tensor) -> Tensor:
 @torch.no_grad()
 def press(
     law: str, parameters: Mapping[str, Tensor], direction: Tensor, *, modulus: float, poisson: float, density: float = 1000.0,
-    adapter: Adapter | None = None, stride: int = 8, stiffening: float = 1.85, cells: int = CELLS, law_options: dict | None = None,
+    adapter: AdapterProtocol | None = None, stride: int = 8, stiffening: float = 1.85, cells: int = CELLS,
+    law_options: dict | None = None,
 ) -> Pressed:  # fmt: skip
     """Compress a specimen along a material direction (3,), between frictionless plates, without gravity; float64 on the CPU.
 
@@ -80,13 +80,13 @@ def press(
     steady = adapter is None or adapter.steady
     simulator = Simulator(
         law, dx=dx, substeps=substeps if steady else -(-substeps // stride) * stride, frame_dt=duration / FRAMES, gravity=(0, 0, 0),
-        colliders=plates, dtype=torch.float64, strain=getattr(adapter, "strain", None), **(law_options or {}),
+        colliders=plates, dtype=torch.float64, strain=None if adapter is None else adapter.strain, **(law_options or {}),
     )  # fmt: skip
     F = Q.expand(n, 3, 3).contiguous()
     state = ParticleState(x, (x @ shear).contiguous(), shear.expand(n, 3, 3).contiguous(), F, F)
     held = None
     if adapter is not None:
-        held = in_double(adapter)
+        held = adapter.in_double()
         held.follow(torch.tensor(poisson).double())
     volume = torch.full((n,), (dx / 2) ** 3).double()
     found = simulator.rollout(state, numbers, volume, density, FRAMES + 1, adapter=held, stride=None if steady else stride)

@@ -7,9 +7,8 @@ import math
 
 import torch
 
-from mosa.analysis.anisotropy import in_double
 from mosa.errors import SimulationDiverged
-from mosa.modules.adapter_base import Adapter
+from mosa.modules.adapter_protocol import AdapterProtocol
 from mosa.modules.material import Material
 from mosa.modules.stiffening import ADAPTER_MARGIN
 from mosa.physics.engine.simulator import Simulator
@@ -37,7 +36,7 @@ def longitudinal_modulus(material: Material) -> float:
 @torch.no_grad()
 def vibration_growth(
     material: Material,
-    adapter: Adapter | None,
+    adapter: AdapterProtocol | None,
     *,
     density: float,
     stride: int,
@@ -70,9 +69,9 @@ def vibration_growth(
     steady = adapter is None or adapter.steady
     substeps = needed if steady else -(-needed // stride) * stride
     simulator = Simulator(material.law, dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=(0, 0, 0), dtype=torch.float64,
-                          strain=getattr(adapter, "strain", None), **(law_options or {}))
+                          strain=None if adapter is None else adapter.strain, **(law_options or {}))
     parameters = {name: value.detach().double().cpu() for name, value in material.per_particle().items()}
-    held = None if adapter is None else in_double(adapter)
+    held = None if adapter is None else adapter.in_double()
     if held is not None:
         held.follow(material.poisson().double().cpu())  # a copy has forgotten which prior it followed
     try:
@@ -84,7 +83,7 @@ def vibration_growth(
         return math.inf
     energy = rollout.v.square().sum((1, 2))
     maxima = [float(energy[0]), *energy[1:].reshape(periods, FRAMES).amax(1).tolist()]
-    if getattr(adapter, "strain", None) is not None or adapter is None:
+    if adapter is None or adapter.strain is not None:
         # modes that meet lend kinetic energy to strain for a period and give it back: that is no growth where the law has an
         # energy. What it had before, the start's, is a bound. A law without one has to be caught while it grows from little
         return max(later / before for before, later in zip(itertools.accumulate(maxima, max), maxima[1:]))

@@ -25,7 +25,6 @@ from mosa.experiments.collecting import Record
 from mosa.experiments.drawing import save
 from mosa.experiments.specification import Experiment
 from mosa.modules.body import Body
-from mosa.modules.hyperelastic import HyperelasticAdapter
 from mosa.modules.material import material_states
 from mosa.twin import Twin
 
@@ -113,13 +112,14 @@ def loaded(records: Sequence[Record], prefixes: Sequence[str] = ("",)) -> Iterat
 def learned_modulus(body: Body, directions: Tensor) -> Tensor:
     """(K,) Young's modulus [Pa] of the learned law along unit vectors (K, 3) at small strain, without the heterogeneity."""
     material, adapter = body.material, body.adapter
-    if adapter is not None and adapter.is_on:
+    adapter = adapter if adapter is not None and adapter.is_on else None
+    if adapter is not None:
         adapter.follow(material.poisson())
-    if isinstance(adapter, HyperelasticAdapter) and adapter.is_on:
-        p = material.per_particle()
-        return directional_moduli(2 * p["mu"].detach().double() * adapter.stiffness().detach().double(), directions.double())
+        if (stiffness := adapter.stiffness()) is not None:
+            mu = material.per_particle()["mu"].detach().double()
+            return directional_moduli(2 * mu * stiffness.detach().double(), directions.double())
     states = material_states(material.law, material.per_particle(), **body.law_options)
-    return directional_modulus(states, adapter if adapter is not None and adapter.is_on else None, directions)
+    return directional_modulus(states, adapter, directions)
 
 
 def true_modulus(name: str, variant: str, directions: Tensor) -> Tensor | None:
@@ -140,14 +140,9 @@ def redistribution(body: Body, directions: Tensor) -> Tensor | None:
         return torch.zeros(len(directions)).double()
     if adapter.replaces_law:
         return None
-    one = torch.eye(6).double()
-    if isinstance(adapter, HyperelasticAdapter):
-        adapter.follow(body.material.poisson())
-        jacobian = adapter.relative().detach().double() + one
-    else:
-        zero = torch.zeros(1, 6).double()
-        jacobian = stress_jacobian(adapter, zero, zero)[0]
-    return redistribution_response(jacobian, directions.double())
+    adapter.follow(body.material.poisson())
+    zero = torch.zeros(1, 6).double()
+    return redistribution_response(stress_jacobian(adapter, zero, zero)[0], directions.double())
 
 
 def directions(experiment: Experiment, records: Sequence[Record], stem: Path) -> tuple[str, list[Path]]:
@@ -266,7 +261,7 @@ def compression(experiment: Experiment, records: Sequence[Record], stem: Path) -
     variants = {"": "adapted", "prior/": "prior"}
     found: list[tuple[str, list[Pressed]]] = []
     for record, twin in loaded(records, tuple(variants)):
-        if hasattr(twin.body.adapter, "simulator") and not prefix(record):
+        if twin.body.adapter is not None and twin.body.adapter.own_dynamics and not prefix(record):
             continue  # no law that a specimen could be made of
         name = twin.config["cfg"]["scene"].get("name")
         if not found and name in OBJECTS:

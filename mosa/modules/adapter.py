@@ -78,6 +78,11 @@ class StressAdapter(Adapter):
         if self.operator.no_prior_stress:
             warm_start(self, states)
 
+    def in_double(self) -> StressAdapter:
+        held = super().in_double()
+        held.fused = "auto" if held.fused is True else held.fused  # the kernels run on CUDA only
+        return held
+
     def affine(self, operator: ProgressiveOperator, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Correction]:
         """(A - I (N, 6, 6), b (N, 6), parts) of d(w, s) = (A - I) s + b, the rest term included."""
         zero = torch.zeros_like(w[:1])

@@ -21,7 +21,6 @@ from mosa.modules.model import Model
 from mosa.modules.ready import Ready
 from mosa.modules.simulation_settings import SimulationSettings
 from mosa.modules.start import Start, World
-from mosa.modules.stiffness_modes import StiffnessModes
 from mosa.physics.contact.colliders import reach
 from mosa.physics.engine.adaptive_steps import StepControl
 from mosa.physics.engine.clock import Adaptive, Replay
@@ -66,10 +65,10 @@ class Body(nn.Module):
         self.splats: CarriedSplats | None = None
         self.density, self.settings, self.law_options = float(density), settings, law_options or {}
         self.material, self.heterogeneity, self.adapter = material, heterogeneity, adapter
-        if isinstance(heterogeneity, StiffnessModes):
+        if heterogeneity is not None:
             heterogeneity.settle(self.rest)
-        if (settle := getattr(adapter, "settle", None)) is not None:
-            settle(self.rest, self.volume)
+        if adapter is not None:
+            adapter.settle(self.rest, self.volume)
         # the calibrated backbones that every later figure is compared with; filled when their stage ends
         self.contact = ContactOffset(settings.dx, settings.contact_offset)
         backbone = nn.ModuleDict({"material": material, "contact": self.contact})
@@ -221,11 +220,12 @@ class Body(nn.Module):
             )  # fmt: skip
             state = self.initial_state(start, frame_dt / substeps, gravity)
         lift = model.contact() * up
-        if (own := getattr(adapter, "simulator", None)) is not None:  # no law on a grid: the adapter brings its dynamics
-            simulator, lift, timing = own(self.density, world, frame_dt), torch.zeros_like(lift), None
+        simulator = None if adapter is None else adapter.simulator(self.density, world, frame_dt)
+        if simulator is not None:  # no law on a grid: the adapter brings its dynamics
+            lift, timing = torch.zeros_like(lift), None
             state = self.initial_state(start, frame_dt / simulator.substeps, gravity)
         else:
-            simulator = self.simulator(material.law, substeps, frame_dt, world, getattr(adapter, "strain", None))
+            simulator = self.simulator(material.law, substeps, frame_dt, world, adapter.strain if adapter is not None else None)
         state = replace(state, x=state.x + lift)
         state = ParticleState(*(getattr(state, name).to(dtype) for name in ("x", "v", "C_affine", "F", "F_tot")))
         arguments = {

@@ -51,6 +51,12 @@ class HeterogeneityField(nn.Module):
         self.net = TwoHiddenLayers(3 + 6 * self.frequencies, 1, settings.hidden)
         zero_outputs(self.net[-1])
 
+    few_numbers = False
+    """Whether Gauss-Newton can learn its weights."""
+
+    def settle(self, rest: Tensor) -> None:
+        """Told once about the particles rest (N, 3) [m]; a network needs nothing of them."""
+
     def forward(self, X: Tensor) -> Tensor:
         """eta (N,) at rest positions X (N, 3) [m]."""
         x = 2 * (X - self.low) / (self.high - self.low) - 1

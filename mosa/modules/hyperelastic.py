@@ -18,9 +18,11 @@ import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError
-from mosa.modules.adapter_base import Adapter, OperatorStatistics
+from mosa.modules.adapter_base import Adapter
 from mosa.modules.microplane import MANDEL, isotropic_stiffness
+from mosa.modules.penalties import OperatorStatistics
 from mosa.modules.stiffening import ADAPTER_MARGIN, acoustic_stiffening
+from mosa.physics.constitutive.laws import Law
 from mosa.physics.constitutive.strain import STRAINS
 from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState
 
@@ -59,8 +61,10 @@ class HyperelasticAdapter(Adapter):
     """A constant anisotropic stiffness with an energy. `numbers`: (19,) coordinates of A in `anisotropic_basis`, 0 at the prior.
 
     strain: hencky | biot | green, the measure E. Errors: ConfigError for an unknown one. Fluids have no shear modulus that it could
-    be a multiple of: `mosa.config.fitting` leaves it out there.
+    be a multiple of: it is left out there.
     """
+
+    few_numbers = True
 
     def __init__(self, *, strain: str = "green") -> None:
         super().__init__()
@@ -71,11 +75,17 @@ class HyperelasticAdapter(Adapter):
         self._live: Tensor | None = None
 
     def __getstate__(self) -> dict:
-        return {**super().__getstate__(), "_live": None}
+        return {**super().__getstate__(), "_live": None if self._live is None else self._live.detach()}
 
     @property
     def steady(self) -> bool:
         return True
+
+    def unsuited(self, law: Law) -> str | None:
+        if "mu" in law.offsets and law.viscosity is None:
+            return None
+        return (f"{law.name} has no shear stiffness that could be anisotropic; the run learns its parameters and stiffness modes "
+                "alone (adapter=mosa corrects its stress by networks)")
 
     def share(self) -> Tensor:
         """beta () float64: how much of the prior's energy the law keeps, 1 at the prior, with its graph.
@@ -128,6 +138,9 @@ class HyperelasticAdapter(Adapter):
         C0 = isotropic_stiffness(poisson)
         scale = torch.tensor(MANDEL, dtype=torch.float64, device=C0.device)
         return (self.correction(poisson) @ torch.linalg.inv(C0)) * scale / scale[:, None]
+
+    def increment(self, w: Tensor, s: Tensor) -> Tensor:
+        return s.double() @ self.relative().T
 
     def forward(self, state: MaterialState) -> AdapterOperator:
         """G: C0 + S - beta C0 for every particle, (N, 6, 6) in Mandel scaling and units of 2 mu; h: (beta - 1, 0, ...), see

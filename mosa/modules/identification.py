@@ -21,10 +21,8 @@ from mosa.modules import residuals
 from mosa.modules.body import Body, ContactOffset, Ready, World
 from mosa.modules.criteria import Criterion
 from mosa.modules.gauss_newton import Block, GaussNewton, Posterior, Seat
-from mosa.modules.hyperelastic import HyperelasticAdapter
 from mosa.modules.material import FORMS, NU_MAX, RIVALS, STIFFNESS
 from mosa.modules.stages import Stage
-from mosa.modules.stiffness_modes import StiffnessModes
 from mosa.schema import FLAG, POSITIVE, WEIGHT, check_knobs, knob, number, whole
 
 STIFFNESS_STEPS = (0.3, 0.6, 1.0, 1.5, 2.2, 3.2, 4.5, 7.0)
@@ -73,7 +71,7 @@ class IdentificationSettings:
 
 def few_numbers(module: torch.nn.Module | None) -> bool:
     """Whether Gauss-Newton can learn a part of a body: an adapter or a heterogeneity field."""
-    return module is None or isinstance(module, (HyperelasticAdapter, StiffnessModes))
+    return module is None or module.few_numbers
 
 
 def blocks_of(body: Body, *, adapter: bool, heterogeneity: bool, settings: IdentificationSettings,

@@ -16,17 +16,17 @@ from mosa.checkpoints import VERSION
 from mosa.config import build_criterion, build_identification, build_stages, build_world
 from mosa.data.datamodule import Observations
 from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
-from mosa.modules.adapter_base import pool
 from mosa.modules.body import Body, Start, World
 from mosa.modules.criteria import Criterion
 from mosa.modules.gauss_newton import Posterior
 from mosa.modules.identification import Identification, IdentificationSettings, choose_law
 from mosa.modules.material import material_states
 from mosa.modules.observer import deformed_covariances, observe
+from mosa.modules.penalties import MISFIT, pool
 from mosa.modules.residuals import SAMPLES
 from mosa.modules.restorable import Restorable
 from mosa.modules.stages import Stage
-from mosa.modules.terms import MISFIT, Step, check_terms, evaluate_terms
+from mosa.modules.terms import Step, check_terms, evaluate_terms
 from mosa.progress import tqdm
 from mosa.reconstruction.pipeline import SecondLook
 from mosa.types import MotionCues, Rollout
@@ -73,7 +73,7 @@ class LitMosa(Restorable, L.LightningModule):
         settings: IdentificationSettings | None = None,
     ) -> None:
         super().__init__()
-        check_terms(weights)
+        check_terms(weights, body.adapter)
         self.automatic_optimization = False
         self.body, self.world, self.takes, self.background = body, world, list(takes), background
         self.stages = list(stages)

@@ -46,6 +46,9 @@ class StiffnessModes(nn.Module):
         self.register_buffer("scale", torch.ones(len(found)))
         self.coefficients = nn.Parameter(torch.zeros(len(found)))
 
+    few_numbers = True
+    """Whether Gauss-Newton can learn its coefficients."""
+
     def raw(self, X: Tensor) -> Tensor:
         """(N, K) products of cosines at X (N, 3) [m]."""
         x = (X - self.low) / (self.high - self.low)

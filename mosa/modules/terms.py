@@ -14,13 +14,11 @@ from torch import Tensor
 from mosa import losses
 from mosa.data.datamodule import Observations
 from mosa.errors import ConfigError
-from mosa.modules.adapter_base import OperatorStatistics
+from mosa.modules.adapter_protocol import AdapterProtocol
 from mosa.modules.body import Body, Start
 from mosa.modules.observer import Views, deformed_covariances, observe
+from mosa.modules.penalties import PENALTIES, OperatorStatistics
 from mosa.types import MotionCues, Rollout
-
-MISFIT = 0.01
-"""Misfit of the calibrated prior, over the object's size, at which the penalty of the operator has its stated weight."""
 
 
 @dataclass(frozen=True)
@@ -82,40 +80,36 @@ def heterogeneity(step: Step) -> Tensor | None:
     return losses.heterogeneity_loss(step.body.heterogeneity(step.body.rest)) if step.heterogeneous else None
 
 
-def operator(step: Step) -> Tensor | None:
-    """What the prior leaves unexplained is what there is to learn: the size that one expects of the operator grows with it, and
-    the pull of a loss that is a distance, not its square, does not fade as it should with a small misfit."""
-    if step.operator is None:
-        return None
-    return (MISFIT / step.misfit) ** 2 * (step.operator.mean_square + 1e-8).sqrt()
-
-
-def operator_variance(step: Step) -> Tensor | None:
-    return None if step.operator is None else step.operator.variance
-
-
 TERMS: dict[str, Term] = {
     "image": image, "mask": mask, "flow": flow, "rotation": rotation, "stretch": stretch, "position": position,
-    "heterogeneity": heterogeneity, "operator": operator, "operator_variance": operator_variance,
+    "heterogeneity": heterogeneity,
 }  # fmt: skip
-"""Name in the section `losses` -> term."""
+"""Name in the section `losses` -> term. The penalties of an adapter come with it (`mosa.modules.penalties`)."""
 
 
 def register_term(name: str, term: Term) -> None:
     """Make a term known by the name of its weight, `losses.<name>`, 0 where the configuration does not say.
 
     Errors: ConfigError if another term has the name."""
-    if TERMS.setdefault(name, term) is not term:
+    if name in PENALTIES or TERMS.setdefault(name, term) is not term:
         raise ConfigError(f"losses.{name}: there is such a term already; choose another name")
 
 
-def check_terms(weights: Mapping[str, float]) -> None:
+def term_names(adapter: AdapterProtocol | type[AdapterProtocol] | None) -> list[str]:
+    """The names that a weight may have beside this adapter. Those of `PENALTIES` are known without one: a run may leave it out."""
+    return [*TERMS, *(PENALTIES if adapter is None else {**PENALTIES, **adapter.penalties})]
+
+
+def check_terms(weights: Mapping[str, float], adapter: AdapterProtocol | None) -> None:
     """Errors: ConfigError naming weights of no term."""
-    if unknown := sorted(set(weights) - set(TERMS)):
-        raise ConfigError(f"losses: unknown terms {unknown}; known are {', '.join(TERMS)}")
+    if unknown := sorted(set(weights) - set(known := term_names(adapter))):
+        raise ConfigError(f"losses: unknown terms {unknown}; known are {', '.join(known)}")
 
 
 def evaluate_terms(weights: Mapping[str, float], step: Step) -> dict[str, Tensor]:
-    """Every term that has a weight, raw, in the order in which they are known."""
+    """Every term that has a weight, raw, in the order in which they are known; then the penalties of an adapter that is learned."""
     found = {name: term(step) for name, term in TERMS.items() if weights.get(name, 0.0) != 0}
+    if step.operator is not None:
+        found |= {name: penalty(step.operator, step.misfit) for name, penalty in step.body.adapter.penalties.items()
+                  if weights.get(name, 0.0) != 0}
     return {name: value for name, value in found.items() if value is not None}

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.modules.adapter_base import Adapter
 from mosa.physics.engine.adapter_interface import MaterialState
+
+if TYPE_CHECKING:  # which calls this
+    from mosa.modules.adapter import StressAdapter
 
 SMALLEST_STRAIN = 1e-3
 
@@ -24,7 +27,7 @@ def drawn_stretches(count: int, largest: float, generator: torch.Generator) -> T
 
 @torch.no_grad()
 def warm_start(
-    adapter: Adapter,
+    adapter: StressAdapter,
     states: Callable[[Tensor], MaterialState],
     *,
     strain: float = 0.3,
@@ -37,7 +40,7 @@ def warm_start(
     rest counts as much as that at large strain, with L_pre(0, 0) = 0. To be called after `switch_on`, before any training.
     Errors: ConfigError for an adapter that has the prior stress or no E_ref.
     """
-    if not getattr(getattr(adapter, "operator", None), "no_prior_stress", False):
+    if not adapter.operator.no_prior_stress:
         raise ConfigError("warm_start: expected an adapter with no_prior_stress=true; the others start from the prior as it is")
     adapter.check_on()
     generator = torch.Generator().manual_seed(seed)

@@ -200,7 +200,7 @@ def test_jacobian_against_differences():
     w, s = (0.1 * torch.randn(4, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(k)) for k in (1, 2))
     jacobian = anisotropy.stress_jacobian(adapter, w, s)
     assert not torch.allclose(jacobian, EYE6.expand(4, 6, 6), atol=1e-2)
-    double = anisotropy.in_double(adapter)
+    double = adapter.in_double()
     for k in range(6):
 
         def f(h: float, k: int = k) -> torch.Tensor:

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from mosa.errors import ConfigError
 from mosa.modules.adapter import StressAdapter
-from mosa.modules.adapter_base import pool, statistics
 from mosa.modules.direct import DirectAdapter
+from mosa.modules.penalties import pool, statistics
 
 OPTIONS = {
     "paper's form": {},

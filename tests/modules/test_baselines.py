@@ -121,8 +121,7 @@ def test_low_rank_starts_as_the_pretrained_network_and_learns_no_weight_of_it():
 def adapted(adapter, law="neo_hookean", **options) -> Body:
     body = small_body(adapter=False, law=law, E=E, nu=NU, **options)
     body.adapter = adapter.double()
-    if isinstance(adapter, InteractionNetwork):
-        adapter.settle(body.rest, body.volume)
+    adapter.settle(body.rest, body.volume)
     adapter.switch_on(E, NU)
     return body
 

@@ -9,7 +9,7 @@ from torch.func import functional_call
 
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.modules.adapter import StressAdapter
-from mosa.modules.adapter_base import pool
+from mosa.modules.penalties import pool
 from mosa.physics.engine import chain_schedule as chains_module
 from mosa.physics.engine import solver as solver_module
 from mosa.physics.engine.adapter_interface import AdapterOperator
