@@ -11,14 +11,13 @@ reconstruction; what is in are the grid, the time step, the starts of the search
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import fits
 import numpy as np
 import torch
 import yaml
@@ -31,7 +30,6 @@ from mosa.data.builtin.drop import GRAVITY, simulate
 from mosa.data.builtin.objects import object_named
 from mosa.data.builtin.shapes import SHAPES
 from mosa.data.builtin.surface import bind, extract_surface, fill
-from mosa.errors import MosaError
 from mosa.metrics import identification_errors
 from mosa.modules.body import Start
 from mosa.modules.identification import Identification
@@ -161,33 +159,14 @@ def table(records: list[dict]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("make", "fit", "table"))
-    parser.add_argument("inputs", nargs="+", help="make: names of stand-ins; fit: true motions; table: results")
-    parser.add_argument("--out", type=Path, default=Path("motions"), help="make: folder of the true motions")
-    parser.add_argument("--results", type=Path, default=Path("fits.jsonl"), help="fit: a line is added for each")
+    parser = fits.parser_of(__doc__, "names of stand-ins", "motions")
     parser.add_argument("--particles", type=int, default=1500, help="fit: of the learner, about")
     parser.add_argument("--noise", type=float, default=NOISE, help="fit: error of the cues over the body's height")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--stage", default="prior", help="fit: prior; prior_eta: under the criterion, with the second grid")
-    parser.add_argument("--set", nargs="*", default=[], help="fit: overrides of the law and its identification")
     options = parser.parse_args()
-    if options.what == "table":
-        print(table([json.loads(line) for name in options.inputs for line in Path(name).read_text().splitlines()]))
-        return
-    for each in options.inputs:
-        if options.what == "make":
-            make(each, options.out, options.seed)
-            continue
-        try:
-            record = fit(Path(each), options.particles, options.set, options.seed, options.noise, options.device, options.stage)
-        except MosaError as error:
-            print(f"{each}: {error}", flush=True)
-            continue
-        with options.results.open("a") as file:
-            file.write(json.dumps(record) + "\n")
-        print(table([record]), flush=True)
+    given = (options.particles, options.set, options.seed, options.noise, options.device, options.stage)
+    fits.run(options, lambda name: make(name, options.out, options.seed), lambda path: fit(path, *given), table)
 
 
 if __name__ == "__main__":

@@ -13,12 +13,11 @@ docs/identification.md has tables that were made so.
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import fits
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
@@ -28,7 +27,6 @@ from mosa.analysis.stiffness import angle_between, stiffest
 from mosa.assembly import assemble
 from mosa.config import build_body
 from mosa.data.builtin.floor import floor_rollout, hidden_of
-from mosa.errors import MosaError
 from mosa.evaluation import true_motion
 from mosa.modules.body import Start
 from mosa.modules.gauss_newton import Posterior
@@ -223,29 +221,11 @@ def table(records: list[dict]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("make", "fit", "table"))
-    parser.add_argument("inputs", nargs="+", help="make: overrides of one scene each, in quotes; fit: problems; table: results")
-    parser.add_argument("--out", type=Path, default=Path("problems"), help="make: folder of the problems")
-    parser.add_argument("--results", type=Path, default=Path("fits.jsonl"), help="fit: a line is added for each")
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--set", nargs="*", default=["prior=neo_hookean"], help="fit: overrides of the law and its identification")
+    parser = fits.parser_of(__doc__, "overrides of one scene each, in quotes", "problems")
+    parser.set_defaults(set=["prior=neo_hookean"])
     options = parser.parse_args()
-    if options.what == "table":
-        print(table([json.loads(line) for name in options.inputs for line in Path(name).read_text().splitlines()]))
-        return
-    for each in options.inputs:
-        if options.what == "make":
-            make(each.split(), options.out, options.device)
-            continue
-        try:
-            record = fit(Path(each), options.set, options.device)
-        except MosaError as error:
-            print(f"{each}: {error}", flush=True)
-            continue
-        with options.results.open("a") as file:
-            file.write(json.dumps(record) + "\n")
-        print(table([record]).splitlines()[-1], flush=True)
+    fits.run(options, lambda words: make(words.split(), options.out, options.device),
+             lambda path: fit(path, options.set, options.device), table)
 
 
 if __name__ == "__main__":

@@ -65,6 +65,11 @@ def test_the_commands_find_their_configuration_and_an_experiment_of_ones_own(bui
     assert configured(built, tmp_path, "eval", "ckpt_path=x.ckpt").ckpt_path == "x.ckpt"
 
 
+@pytest.mark.parametrize("name", ["splats", "capture", "environments"])
+def test_a_command_is_the_name_of_its_configuration_and_of_its_runs(built, tmp_path, name):
+    assert set(OmegaConf.load(ROOT / "conf" / f"{name}.yaml")) - {"defaults"} <= set(configured(built, tmp_path, name))
+
+
 def test_the_experiments_are_installed_with_the_paper_s_figures(built, tmp_path):
     result = call(built, tmp_path, "experiment")
     assert result.returncode == 0 and "table_generalisation" in result.stdout, result.stderr[-2000:]

@@ -1,28 +1,5 @@
 """From phone videos to a scene that trains:  mosa-capture videos=<folder> poses=<COLMAP model> output=<folder>"""
 
-import os
-import sys
-from pathlib import Path
+from mosa.commands.configured import command
 
-import hydra
-from omegaconf import DictConfig
-
-from mosa.commands import begin_log, configuration
-from mosa.jobs import attempt, check_arguments
-
-
-@hydra.main(version_base="1.3", config_path=configuration(), config_name="capture")
-def run(cfg: DictConfig) -> None:
-    def job(cfg: DictConfig) -> None:
-        from mosa.capture.making import make
-
-        make(cfg)
-
-    begin_log()
-    return attempt(job, cfg)
-
-
-def main() -> None:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    check_arguments(sys.argv[1:], Path(configuration()))
-    run()
+main = command(__name__, "mosa.capture.making:make")

@@ -4,29 +4,6 @@ With any of simulate.velocity, simulate.rotation, simulate.position, simulate.he
 learned law out from a new start instead.
 """
 
-import os
-import sys
-from pathlib import Path
+from mosa.commands.configured import command
 
-import hydra
-from omegaconf import DictConfig
-
-from mosa.commands import begin_log, configuration
-from mosa.jobs import attempt, check_arguments
-
-
-@hydra.main(version_base="1.3", config_path=configuration(), config_name="eval")
-def run(cfg: DictConfig) -> float | None:
-    def job(cfg: DictConfig) -> float | None:
-        from mosa.pipeline import evaluate_checkpoint
-
-        return evaluate_checkpoint(cfg)
-
-    begin_log()
-    return attempt(job, cfg)
-
-
-def main() -> None:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    check_arguments(sys.argv[1:], Path(configuration()))
-    run()
+main = command(__name__, "mosa.pipeline:evaluate_checkpoint")

@@ -1,28 +1,5 @@
 """A 3DGS file of an object becomes a body that falls, without any video:  mosa-splats ply=object.ply prior=corotated"""
 
-import os
-import sys
-from pathlib import Path
+from mosa.commands.configured import command
 
-import hydra
-from omegaconf import DictConfig
-
-from mosa.commands import begin_log, configuration
-from mosa.jobs import attempt, check_arguments
-
-
-@hydra.main(version_base="1.3", config_path=configuration(), config_name="splats")
-def run(cfg: DictConfig) -> None:
-    def job(cfg: DictConfig) -> None:
-        from mosa.splats.objects import drop
-
-        return drop(cfg)
-
-    begin_log()
-    return attempt(job, cfg)
-
-
-def main() -> None:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    check_arguments(sys.argv[1:], Path(configuration()))
-    run()
+main = command(__name__, "mosa.splats.objects:drop")

@@ -2,31 +2,16 @@
 
 import os
 import sys
-from pathlib import Path
 
-import hydra
-from omegaconf import DictConfig
+from mosa.commands.configured import command
+from mosa.jobs import Failures
 
-from mosa.commands import begin_log, configuration
-from mosa.jobs import Failures, attempt, check_arguments
-
-
-@hydra.main(version_base="1.3", config_path=configuration(), config_name="train")
-def run(cfg: DictConfig) -> float | None:
-    def job(cfg: DictConfig) -> float | None:
-        from mosa.pipeline import train  # what takes seconds to import, where a mistake in an override has been said
-
-        return train(cfg)
-
-    begin_log()
-    return attempt(job, cfg)
+train = command(__name__, "mosa.pipeline:train")
 
 
 def main() -> None:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # on small tensors and shared machines a second thread was measured 30x slower
     if os.environ.get("LOCAL_RANK", "0") != "0":  # a further process of a fit on several devices: the first speaks for all
         os.environ["TQDM_DISABLE"] = "1"
         sys.stdout = open(os.devnull, "w")  # until the process ends
-    check_arguments(sys.argv[1:], Path(configuration()))
-    run()
+    train()
     sys.exit(1 if Failures.count else 0)

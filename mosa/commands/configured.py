@@ -1,0 +1,40 @@
+"""A command that is configured by a file of conf/ and overrides on its command line, by Hydra."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
+
+from mosa.commands import begin_log, configuration
+from mosa.jobs import attempt, check_arguments
+
+
+def command(module: str, job: str) -> Callable[[], None]:
+    """What runs `job`, a "module:function" of the configuration conf/<name>.yaml, name being the last part of `module`.
+
+    The job's module is imported when it runs: that takes seconds, and a mistake in an override is said before.
+    """
+    where, _, function = job.partition(":")
+
+    def imported(cfg: DictConfig) -> float | None:
+        return getattr(importlib.import_module(where), function)(cfg)
+
+    def run(cfg: DictConfig) -> float | None:
+        begin_log()
+        return attempt(imported, cfg)
+
+    run.__module__ = module  # Hydra names the job, and with it the run's folder, after the module of its function
+    configured = hydra.main(version_base="1.3", config_path=configuration(), config_name=module.rpartition(".")[2])(run)
+
+    def main() -> None:
+        os.environ.setdefault("OMP_NUM_THREADS", "1")  # on small tensors and shared machines a second was measured 30x slower
+        check_arguments(sys.argv[1:], Path(configuration()))
+        configured()
+
+    return main
