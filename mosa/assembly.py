@@ -22,7 +22,8 @@ from mosa.modules.body import Body, Start, World
 from mosa.modules.carried_splats import CarriedSplats
 from mosa.modules.lit_mosa import LitMosa, Take
 from mosa.progress import tqdm
-from mosa.reconstruction.pipeline import SecondLook, follow, reconstruct, spacing_for, stored
+from mosa.reconstruction.moved import SecondLook
+from mosa.reconstruction.pipeline import follow, reconstruct, spacing_for, stored
 from mosa.reconstruction.resolution import grid_spacing
 from mosa.reconstruction.settings import ReconstructionSettings, build_settings
 from mosa.reconstruction.starts import first_contact, sequence_start

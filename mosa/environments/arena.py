@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from mosa.environments.tasks import LAST, Task, Trials, View
+from mosa.environments.task import LAST, Task, Trials, View
 from mosa.environments.truth import true_twin
 from mosa.episode import TwinState
 from mosa.errors import ConfigError, SimulationDiverged

@@ -18,7 +18,8 @@ from torch import Tensor
 
 from mosa.environments.arena import Arena, simulator_named
 from mosa.environments.pictures import picture
-from mosa.environments.tasks import TASKS, Task, task_named
+from mosa.environments.task import Task
+from mosa.environments.tasks import TASKS, task_named
 from mosa.errors import ConfigError
 
 try:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from mosa.environments.arena import Arena, play, play_all
-from mosa.environments.tasks import Task
+from mosa.environments.task import Task
 from mosa.errors import ConfigError, DataError
 
 METHODS = ("gradient", "cem", "sac", "ppo")

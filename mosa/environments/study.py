@@ -18,7 +18,8 @@ from mosa.analysis.tables import markdown
 from mosa.environments.arena import Arena, Simulator, play, play_all, simulator_named
 from mosa.environments.pictures import film, write_films
 from mosa.environments.policies import Found, LinearPolicy, Search, by_elites, by_gradient, by_reinforcement
-from mosa.environments.tasks import Task, task_named
+from mosa.environments.task import Task
+from mosa.environments.tasks import task_named
 from mosa.errors import ConfigError, DataError
 
 log = logging.getLogger(__name__)

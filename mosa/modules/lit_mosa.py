@@ -28,7 +28,7 @@ from mosa.modules.restorable import Restorable
 from mosa.modules.stages import Stage
 from mosa.modules.terms import Step, check_terms, evaluate_terms
 from mosa.progress import tqdm
-from mosa.reconstruction.pipeline import SecondLook
+from mosa.reconstruction.moved import SecondLook
 from mosa.types import MotionCues, Rollout
 
 log = logging.getLogger(__name__)

@@ -7,7 +7,7 @@ import functools
 import hashlib
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,23 +19,19 @@ from mosa.errors import ConfigError, DataError
 from mosa.progress import tqdm
 from mosa.reconstruction.cache import StageCache
 from mosa.reconstruction.carried import fit_carried
-from mosa.reconstruction.cues import gaussian_cues, neighbourhood, neighbourhood_cues
-from mosa.reconstruction.dynamic import Scaffold, fit_motion
 from mosa.reconstruction.filling import Particles, body_volume, fill
 from mosa.reconstruction.geometry import Geometry, find_geometry
-from mosa.reconstruction.hull import Volume, hull_bounds, hull_centroid, visual_hull
-from mosa.reconstruction.informed import informed_motion
+from mosa.reconstruction.hull import Volume, hull_bounds, visual_hull
 from mosa.reconstruction.initial import inherited_colors
-from mosa.reconstruction.modes import deformation_modes
+from mosa.reconstruction.moved import MovingParts, cues_of, first_motion
 from mosa.reconstruction.observed import Windows, object_windows
 from mosa.reconstruction.resolution import PER_CELL, particles_for
 from mosa.reconstruction.settings import ReconstructionSettings
 from mosa.reconstruction.static import fit_splats, start_splats
-from mosa.rendering.covariance import covariance_from, matrix_to_quaternion, quaternion_multiply, quaternion_to_matrix
+from mosa.rendering.covariance import covariance_from, matrix_to_quaternion, quaternion_multiply
 from mosa.rendering.rasterizer import rasterize
 from mosa.rendering.spherical_harmonics import constant_coefficients
-from mosa.threads import threaded
-from mosa.types import Appearance, MotionCues, Reconstruction, Scene, Splats
+from mosa.types import Appearance, Reconstruction, Scene, Splats
 
 log = logging.getLogger(__name__)
 
@@ -241,12 +237,13 @@ def reconstruct(
     volume = particles.pop("volume")
     splats = Splats(**particles)
 
+    static = Splats(**cache.stage("static", static_stage))
+    parts = MovingParts(scene, splats.to(device), static.to(device), settings)
+
     def motion_stage() -> dict[str, Tensor]:
-        static = Splats(**cache.stage("static", static_stage)).to(device)
-        return _motion(scene, splats.to(device), static, windows, background, settings, seed, bar, cache)
+        return first_motion(parts, windows, background, seed, bar, cache)
 
     motion = cache.stage("motion", motion_stage, (len(frames), len(splats.means)))
-    static = Splats(**cache.stage("static", static_stage))
 
     def carried_stage() -> dict[str, Tensor]:
         with bar("carried Gaussians", settings.carried.iterations) as steps:
@@ -260,18 +257,11 @@ def reconstruct(
         appearance = Appearance(static, constant_coefficients(static.colors))
     else:  # a folder of its own: nothing else depends on its settings
         apart = _open_cache(cache_dir, scene, _motion_settings(settings) | {"carried": asdict(settings.carried)}, seed, **more)
-        parts = apart.stage("carried", carried_stage)
-        colored = {name: parts.pop(name) for name in ("harmonics", "normals", "light")}
-        appearance = Appearance(Splats(**parts), **colored)
-    return Reconstruction(splats, spacing, volume, cues_of(motion, splats, settings), static, geometry.figures(spacing), appearance)
-
-
-def cues_of(motion: dict[str, Tensor], splats: Splats, settings: ReconstructionSettings) -> MotionCues:
-    """Cues of a reconstructed motion, relative to `splats`, where it starts."""
-    if settings.cue == "gaussian":
-        return gaussian_cues(motion["positions"], motion["covariances"], splats, motion["scales"], motion["rotations"])
-    around = neighbourhood(splats.means, neighbours=settings.neighbours)
-    return neighbourhood_cues(motion["positions"], motion["covariances"], around)
+        found = apart.stage("carried", carried_stage)
+        colored = {name: found.pop(name) for name in ("harmonics", "normals", "light")}
+        appearance = Appearance(Splats(**found), **colored)
+    return Reconstruction(splats, spacing, volume, cues_of(motion, splats, settings), static, geometry.figures(spacing), appearance,
+                          parts)
 
 
 def posed(splats: Splats, rotation: Tensor, center: Tensor, rest_center: Tensor) -> Splats:
@@ -316,12 +306,14 @@ def follow(
     def bar(name: str, total: int) -> tqdm:
         return tqdm(total=total, desc=f"reconstruction of {scene.sequence}: {name}", disable=not progress, leave=False)
 
+    parts = MovingParts(scene, splats.to(device), static.to(device), settings)
+
     def motion_stage() -> dict[str, Tensor]:
-        return _motion(scene, splats.to(device), static.to(device), windows, scene.background.to(device), settings, seed, bar,
-                       cache)
+        return first_motion(parts, windows, scene.background.to(device), seed, bar, cache)
 
     motion = cache.stage("motion", motion_stage, (len(frames), len(splats.means)))
-    return Reconstruction(splats, reconstruction.spacing, reconstruction.volume, cues_of(motion, splats, settings), static)
+    return Reconstruction(splats, reconstruction.spacing, reconstruction.volume, cues_of(motion, splats, settings), static,
+                          moving=parts)
 
 
 def scaffold_splats(particles: Particles, static: Splats, device: torch.device | str) -> Splats:
@@ -338,100 +330,3 @@ def scaffold_splats(particles: Particles, static: Splats, device: torch.device |
         torch.full((n,), 0.8, device=device),
         inherited_colors(positions, static),
     )
-
-
-def _moving_parts(
-    scene: Scene, splats: Splats, static: Splats, settings: ReconstructionSettings
-) -> tuple[Tensor, Scaffold, Scaffold, float]:
-    """What the motion of particles is fitted with: (T, 3) hulls' centres [m], the particles and what carries their images with
-    the modes at both, and the body's radius [m]."""
-    views, frames, dynamic = scene.training_cameras, scene.training_frames, settings.dynamic
-    cameras = scene.cameras.select(views)
-    centres = list(threaded(lambda t: hull_centroid(scene.mattes[views, t], cameras, scene.box), frames))
-    around = neighbourhood(splats.means, neighbours=settings.neighbours)
-    modes = deformation_modes(splats.means, around, count=dynamic.modes)
-    reach = float((splats.means - splats.means.mean(0)).norm(dim=1).max())
-    scaffold = carried = Scaffold(splats, modes, around)
-    if dynamic.carriers == "static":
-        carried = Scaffold(static, modes.at(static.means, splats.means))
-    return torch.stack(centres).to(splats.means), scaffold, carried, reach
-
-
-@dataclass(frozen=True)
-class SecondLook:
-    """The cues of a sequence once more, about what a simulation predicts (`informed`). Nothing is cached: the prediction is a run's
-    own.
-
-    reconstruction: of `scene`; seed: of the order in which views are drawn.
-    """
-
-    scene: Scene
-    reconstruction: Reconstruction
-    settings: ReconstructionSettings
-    seed: int = 0
-    device: torch.device | str = "cpu"
-    progress: bool = True
-
-    def about(self, predicted: Tensor) -> MotionCues:
-        """predicted: (T, N, 3) [m] of the particles in the training frames."""
-        found, scene, settings = self.reconstruction, self.scene, self.settings
-        splats, static = found.splats.to(self.device), found.static.to(self.device)
-        windows = object_windows(scene, scene.training_cameras, scene.training_frames, margin=settings.margin).to(self.device)
-        centres, scaffold, carried, reach = _moving_parts(scene, splats, static, settings)
-        seen, background = found.cues.positions.to(centres), scene.background.to(centres)
-        title = f"motion of {scene.sequence} about the prediction"
-        with tqdm(total=settings.informed.iterations, desc=title, disable=not self.progress, leave=False) as steps:
-            motion = informed_motion(scaffold, carried, windows, centres, background, predicted.to(seen), seen, settings.informed,
-                                     settings.dynamic, reach=reach, seed=self.seed, progress=steps.update)
-        if motion is None:
-            log.warning("reconstruction.informed: what the calibrated law predicts of %s is no guide to its images, and the first "
-                        "motion stays", scene.sequence)
-            return self.cues(seen)
-        with torch.no_grad():
-            frames = torch.arange(len(centres), device=centres.device)
-            return self.cues(motion(frames, splats, scaffold.modes, scaffold.around).positions)
-
-    def cues(self, positions: Tensor) -> MotionCues:
-        """Of positions (T, N, 3) [m] that `about` found, for instance those in a checkpoint."""
-        splats = self.reconstruction.splats.to(self.device)
-        around, positions = neighbourhood(splats.means, neighbours=self.settings.neighbours), positions.to(splats.means)
-        deformed = around.deformation(positions) @ (quaternion_to_matrix(splats.rotations) * splats.scales[:, None, :])
-        return neighbourhood_cues(positions, deformed @ deformed.mT, around)
-
-
-def _motion(
-    scene: Scene,
-    splats: Splats,
-    static: Splats,
-    windows: Windows,
-    background: Tensor,
-    settings: ReconstructionSettings,
-    seed: int,
-    bar: Callable[[str, int], tqdm],
-    cache: StageCache,
-) -> dict[str, Tensor]:
-    """Positions, covariances and, where free, shapes of the particles in every training frame."""
-    frames, dynamic = scene.training_frames, settings.dynamic
-    centres, scaffold, carried, reach = _moving_parts(scene, splats, static, settings)
-    modes, around = scaffold.modes, scaffold.around
-    total = dynamic.iterations + (dynamic.track_iterations * (len(frames) - 1) if dynamic.model == "modes" else 0)
-    with bar("motion", total) as steps:
-        motion = fit_motion(
-            scaffold, carried, windows, centres, background, dynamic, reach=reach, seed=seed, progress=steps.update
-        )
-    with torch.no_grad():
-        sample = motion(torch.arange(len(frames), device=splats.means.device), splats, modes, around)
-        rendered = rasterize(
-            sample.positions,
-            sample.covariances,
-            splats.opacities,
-            splats.colors[None],
-            windows.cameras,
-            windows.frame,
-            background,
-        )[0]
-    cache.strip("motion", windows, rendered, columns=12)
-    result = {"positions": sample.positions, "covariances": sample.covariances}
-    if sample.scales is not None:
-        result |= {"scales": sample.scales, "rotations": sample.rotations}
-    return {name: value.cpu() for name, value in result.items()}

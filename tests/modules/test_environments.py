@@ -18,7 +18,8 @@ from mosa.environments.arena import LOST, Arena, Simulator, play, play_all, simu
 from mosa.environments.pictures import film
 from mosa.environments.policies import LinearPolicy, Search, _side_by_side, by_elites, by_gradient, by_reinforcement
 from mosa.environments.study import Bench, Setting
-from mosa.environments.tasks import CLEARANCE, TASKS, View, task_named
+from mosa.environments.task import View
+from mosa.environments.tasks import CLEARANCE, TASKS, task_named
 from mosa.environments.truth import true_twin
 from mosa.errors import ConfigError, DataError, SimulationDiverged
 from mosa.modules.start import World

@@ -12,7 +12,8 @@ import torch
 import yaml
 
 from mosa.errors import ConfigError
-from mosa.reconstruction import pipeline
+from mosa.reconstruction import moved, pipeline
+from mosa.reconstruction.informed import InformedSettings
 from mosa.reconstruction.pipeline import follow, reconstruct, spacing_for
 from mosa.reconstruction.settings import build_settings
 
@@ -91,7 +92,7 @@ def test_free_fall_gives_the_velocity(squashed, found):
 
 def test_results_come_from_the_cache(squashed, found, spacing, cache, monkeypatch):
     monkeypatch.setattr(pipeline, "fit_splats", None)
-    monkeypatch.setattr(pipeline, "fit_motion", None)
+    monkeypatch.setattr(moved, "fit_motion", None)
     monkeypatch.setattr(pipeline, "fit_carried", None)
     again = reconstruct(squashed, settings=SETTINGS, spacing=spacing, cache_dir=cache, progress=False)
     assert torch.equal(again.cues.positions, found.cues.positions) and torch.equal(again.splats.colors, found.splats.colors)
@@ -106,10 +107,19 @@ def test_results_come_from_the_cache(squashed, found, spacing, cache, monkeypatc
     assert not pipeline.stored(squashed, lambda: 2 * spacing, SETTINGS, cache_dir=cache)
 
 
+def test_the_second_look_takes_what_the_first_motion_was_fitted_with(squashed, found, monkeypatch):
+    """Modes and hulls take as long as both fits where there are many particles."""
+    monkeypatch.setattr(moved, "deformation_modes", None)
+    monkeypatch.setattr(moved, "hull_centroid", None)
+    settings = replace(SETTINGS, informed=InformedSettings(iterations=1))
+    again = moved.SecondLook(squashed, found, settings, progress=False).about(found.cues.positions)
+    assert again.positions.shape == found.cues.positions.shape and bool(torch.isfinite(again.positions).all())
+
+
 def test_a_damaged_stage_is_computed_again_and_the_rest_kept(squashed, found, spacing, cache, monkeypatch):
     damaged = next((cache / "reconstruction").glob("*/geometry.pt"))
     damaged.write_bytes(b"half a file")
-    monkeypatch.setattr(pipeline, "fit_motion", None)
+    monkeypatch.setattr(moved, "fit_motion", None)
     again = reconstruct(squashed, settings=SETTINGS, spacing=spacing, cache_dir=cache, progress=False)
     assert torch.equal(again.cues.positions, found.cues.positions)
     assert damaged.stat().st_size > 1000
@@ -154,7 +164,7 @@ def test_presets_build(name):
 
 
 def test_wrong_keys_are_named():
-    with pytest.raises(ConfigError, match=r"reconstruction: unknown key 'pointz'"):
+    with pytest.raises(ConfigError, match=r"reconstruction\.pointz: unknown key"):
         build_settings(pointz=3)
     with pytest.raises(ConfigError, match=r"reconstruction\.dynamic\.mode: unknown key"):
         build_settings(dynamic={"mode": 3})

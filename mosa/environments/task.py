@@ -1,0 +1,142 @@
+"""What a task with an elastic body is: the trials that are drawn, what a policy sees and does, how far a trial ends from its aim.
+
+World axes: y up, the ground at y = 0. Plain tensors, no Gymnasium.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from mosa.errors import ConfigError
+from mosa.modules.start import World
+from mosa.types import Ground
+
+ROOM = 5.0
+"""Half width [m] of the world: a body that rolls away is a failure, not an error."""
+LAST = 5
+"""Control steps at the end over which a reward is averaged: the body may still quiver."""
+
+
+@dataclass(frozen=True)
+class Trials:
+    """B drawn trials. observed: (B, O) what a policy is told at the start; hidden: (B, H) what the hand or the floor does beyond
+    that, of which no policy knows. Units are the task's."""
+
+    observed: Tensor
+    hidden: Tensor
+
+    def __len__(self) -> int:
+        return len(self.observed)
+
+    def select(self, which: Sequence[int] | slice) -> Trials:
+        return Trials(self.observed[which], self.hidden[which])
+
+
+@dataclass(frozen=True)
+class View:
+    """Of B bodies. center, velocity: (B, 3) mass centre [m] and its velocity [m/s]; upright: (B, 3) unit, where the rest shape's up
+    axis points; lowest: (B,) height of the lowest particle [m]; tool: (B, 3) position of a driven solid [m], None without one."""
+
+    center: Tensor
+    velocity: Tensor
+    upright: Tensor
+    lowest: Tensor
+    tool: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A number of an observation, action or drawn trial. low, high: its range, in `unit`."""
+
+    name: str
+    unit: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Task(ABC):
+    """extents: (3,) of the body at rest [m], from which sizes follow; steps: control steps of an episode of `control_dt` [s]."""
+
+    extents: tuple[float, float, float]
+    steps: int = 50
+    control_dt: float = 0.02
+    name: ClassVar[str] = ""
+    tool: ClassVar[str | None] = None
+    """Name of the solid that actions drive; None: one decision at the start, after which nothing is acted on."""
+    ground_friction: ClassVar[float] = 0.3
+
+    @property
+    @abstractmethod
+    def actions(self) -> tuple[Quantity, ...]:
+        """What an action of numbers in [-1, 1] says, in this order; -1 is `low` and 1 is `high`."""
+
+    @property
+    @abstractmethod
+    def observations(self) -> tuple[Quantity, ...]:
+        """Of a policy's observation, in this order; a number may leave its range where a body flies away."""
+
+    @property
+    @abstractmethod
+    def drawn(self) -> tuple[tuple[Quantity, ...], tuple[Quantity, ...]]:
+        """What a trial draws, uniformly in these ranges: (what is observed, what is hidden)."""
+
+    @abstractmethod
+    def solids(self) -> list[Mapping[str, Any]]:
+        """Colliders beside the ground, as `colliders_from_config` takes them."""
+
+    @abstractmethod
+    def starts(self, trials: Trials, action: Tensor | None, rest: Tensor, gravity: float) -> list[dict]:
+        """Of `TwinWorlds.reset`, for each trial. action: (B, A) in [-1, 1] of a task of one decision; rest: (N, 3) [m] about the
+        centre; gravity [m/s^2]."""
+
+    @abstractmethod
+    def miss(self, trials: Trials, view: View) -> Tensor:
+        """(B,) how far from success, in tolerances squared; differentiable."""
+
+    @abstractmethod
+    def succeeded(self, trials: Trials, view: View) -> Tensor:
+        """(B,) bool, of the last moment."""
+
+    def observe(self, trials: Trials, view: View | None) -> Tensor:
+        """(B, O) of a policy. view: None before a start that the action decides."""
+        return trials.observed
+
+    def command(self, action: Tensor) -> Mapping[str, Tensor] | None:
+        """Velocities [m/s] of the tool, of actions (B, A)."""
+        return None
+
+    def starting_weights(self) -> tuple[Tensor, Tensor]:
+        """(A, O), (A,) of the policy that a search begins from; zeros: the aim without any knowledge of how the body bounces."""
+        return torch.zeros(len(self.actions), len(self.observations)), torch.zeros(len(self.actions))
+
+    def world(self, world: World) -> World:
+        """The same gravity over a ground at height 0 with friction, in a wide box, whatever the scene's own are."""
+        if float((world.up - torch.tensor([0.0, 1.0, 0.0]).to(world.up)).abs().max()) > 1e-6:
+            raise ConfigError(f"task {self.name}: expected a world with up = [0, 1, 0], found {world.up.tolist()}")
+        box = torch.tensor([[-ROOM, -1.0, -ROOM], [ROOM, ROOM, ROOM]]).to(world.box)
+        return replace(world, ground=Ground(0.0, "separate", self.ground_friction), box=box, planes=(), colliders=())
+
+    def draw(self, count: int, generator: torch.Generator) -> Trials:
+        """`count` trials."""
+        found = []
+        for quantities in self.drawn:
+            low, high = (torch.tensor([getattr(q, side) for q in quantities], dtype=torch.float64) for side in ("low", "high"))
+            part = torch.rand(count, len(quantities), generator=generator, dtype=torch.float64)
+            found.append((low + (high - low) * part).float())
+        return Trials(*found)
+
+    def physical(self, action: Tensor) -> Tensor:
+        """(B, A) in units, of actions in [-1, 1]."""
+        low, high = (torch.tensor([getattr(q, side) for q in self.actions]).to(action) for side in ("low", "high"))
+        return 0.5 * (low + high) + 0.5 * (high - low) * action
+
+    def loss(self, trials: Trials, view: View) -> Tensor:
+        """(B,) log(1 + miss): 0 where all is as wanted; a trial that is lost does not outweigh the others."""
+        return torch.log1p(self.miss(trials, view))
