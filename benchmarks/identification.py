@@ -27,12 +27,14 @@ from mosa.analysis.stiffness import angle_between, stiffest
 from mosa.assembly import assemble
 from mosa.config import build_body
 from mosa.data.builtin.floor import floor_rollout, hidden_of
+from mosa.errors import MosaError
 from mosa.evaluation import true_motion
 from mosa.modules.body import Start
 from mosa.modules.gauss_newton import Posterior
 from mosa.modules.identification import Identification, each_law
-from mosa.modules.lit_mosa import LitMosa, Take
+from mosa.modules.lit_mosa import LitMosa
 from mosa.modules.residuals import sampled
+from mosa.modules.takes import Take
 from mosa.prediction import DRAWS, LEAST_DRAWS, among_forms, determined, rival_motions, total_spread
 from mosa.types import MotionCues
 

@@ -20,7 +20,8 @@ from mosa.data.sequences import load_sequences, taught_names
 from mosa.evaluation import Sequence, sequences
 from mosa.modules.body import Body, Start, World
 from mosa.modules.carried_splats import CarriedSplats
-from mosa.modules.lit_mosa import LitMosa, Take
+from mosa.modules.lit_mosa import LitMosa
+from mosa.modules.takes import Take
 from mosa.progress import tqdm
 from mosa.reconstruction.moved import SecondLook
 from mosa.reconstruction.pipeline import follow, reconstruct, spacing_for, stored

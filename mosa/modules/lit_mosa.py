@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import lightning as L
@@ -14,9 +13,8 @@ from torch import Tensor
 from mosa import losses, parallel
 from mosa.checkpoints import VERSION
 from mosa.config import build_criterion, build_identification, build_stages, build_world
-from mosa.data.datamodule import Observations
 from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
-from mosa.modules.body import Body, Start, World
+from mosa.modules.body import Body, World
 from mosa.modules.criteria import Criterion
 from mosa.modules.gauss_newton import Posterior
 from mosa.modules.identification import Identification, IdentificationSettings, choose_law
@@ -26,26 +24,12 @@ from mosa.modules.penalties import MISFIT, pool
 from mosa.modules.residuals import SAMPLES
 from mosa.modules.restorable import Restorable
 from mosa.modules.stages import Stage
+from mosa.modules.takes import Take, seen_again, with_positions
 from mosa.modules.terms import Step, check_terms, evaluate_terms
 from mosa.progress import tqdm
-from mosa.reconstruction.moved import SecondLook
-from mosa.types import MotionCues, Rollout
+from mosa.types import Rollout
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Take:
-    """A sequence to learn from. start: where the body starts; observations: targets (datamodule.py); cues: the reconstruction's,
-    of the training frames, frame_dt [s] apart; first_contact: index of the first frame after it; again: finds the cues once more
-    about what a calibrated backbone predicts, None where the first ones stay."""
-
-    start: Start
-    observations: Observations
-    cues: MotionCues
-    frame_dt: float
-    first_contact: int
-    again: SecondLook | None = None
 
 
 SIDE_BY_SIDE = 10
@@ -134,7 +118,7 @@ class LitMosa(Restorable, L.LightningModule):
             self.settle_law()
         self.posterior = Posterior.read(saved["posterior"]) if saved.get("posterior") else None
         if saved.get("cues") is not None and self.takes:
-            self.restore_cues(saved["cues"])
+            self.takes, self.informed = with_positions(self.takes, saved["cues"]), True
         elif self.losses and self.stage is not None and not self.stage.calibrates and any(take.again for take in self.takes):
             raise ConfigError("ckpt_path: expected the motion that reconstruction.informed finds, as this stage began after it, "
                               "found none in the checkpoint: set reconstruction.informed.iterations=0, as the run had it")
@@ -371,29 +355,8 @@ class LitMosa(Restorable, L.LightningModule):
 
     def inform(self) -> None:
         """The cues of the takes once more, about what the calibrated backbone predicts."""
-        if self.informed or not any(take.again for take in self.takes):
-            return
-        model = self.body.model().only(heterogeneity=False, adapter=False)
-        for i, take in enumerate(self.takes):
-            if take.again is None:
-                continue
-            with torch.no_grad():
-                rollout = self.body.simulate(take.start, self.world, len(take.cues.positions), take.frame_dt, model=model)
-            cues = take.again.about(rollout.x)
-            moved = float((cues.positions - take.cues.positions).square().sum(-1).mean().sqrt())
-            log.info("motion of %s once more, about the calibrated backbone's: moved by %.2g mm (root mean square)",
-                     take.again.scene.sequence, 1e3 * moved)
-            self.takes[i] = replace(take, cues=cues)
-        self.informed = True
-
-    def restore_cues(self, positions: Sequence[Tensor]) -> None:
-        """The cues that `inform` found. positions: (T, N, 3) [m] of each take. Errors: ConfigError where they are of others."""
-        expected = [tuple(take.cues.positions.shape) for take in self.takes]
-        if [tuple(each.shape) for each in positions] != expected or not all(take.again for take in self.takes):
-            raise ConfigError(f"ckpt_path: expected cues of shapes {expected}, found {[tuple(each.shape) for each in positions]}: "
-                              "the checkpoint belongs to other sequences, or reconstruction.informed was switched off since")
-        self.takes = [replace(take, cues=take.again.cues(each)) for take, each in zip(self.takes, positions)]
-        self.informed = True
+        if not self.informed and any(take.again for take in self.takes):
+            self.takes, self.informed = [seen_again(take, self.body, self.world) for take in self.takes], True
 
     @torch.no_grad()
     def measure_misfit(self) -> float:
