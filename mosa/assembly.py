@@ -7,7 +7,6 @@
 
 from __future__ import annotations
 
-import os
 from functools import cached_property
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import torch
 from omegaconf import DictConfig
 
 from mosa.config import build_body, build_world, plain, run_config
+from mosa.data.builtin.takes import default_cache
 from mosa.data.datamodule import MultiViewDataModule, training_observations
 from mosa.data.sequences import load_sequences, taught_names
 from mosa.evaluation import Sequence, sequences
@@ -70,9 +70,7 @@ class Run:
     @property
     def cache(self) -> Path:
         """Folder of cached reconstructions: scene.cache, or mosa/ in the user's cache folder."""
-        if self.cfg.scene.get("cache"):
-            return Path(self.cfg.scene.cache)
-        return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "mosa"
+        return Path(self.cfg.scene.cache) if self.cfg.scene.get("cache") else default_cache()
 
     @property
     def reconstruction_settings(self) -> ReconstructionSettings:

@@ -85,7 +85,7 @@ class Live:
         self.spread: np.ndarray | None = None
         self.force = np.zeros(3)
         self._last, self._highs = self.drop_as, {}
-        self.target = self.home(self.drop_as)
+        self.target = self.home()
         self.begin(self.drop_as)
 
     def axes(self, drop: Drop) -> tuple[np.ndarray, np.ndarray]:
@@ -102,7 +102,7 @@ class Live:
             "angular_velocity": tuple(2 * math.pi * drop.spin * axis),
         }  # fmt: skip
 
-    def home(self, drop: Drop) -> np.ndarray:
+    def home(self) -> np.ndarray:
         """(3,) [m] where the ball waits: beside the body, clear of it however it is turned, above the ground."""
         # contact fades in over 1.4 cells, and a particle is felt 1.5 cells away
         away = self.reach + self.radius + max(self.radius, 3 * self.twin.body.settings.dx)
@@ -118,7 +118,7 @@ class Live:
             start, _ = start_in(twin.body, twin.world, twin.training_start, **given)
             x = self.arms @ start.rotation.double().cpu().numpy().T + start.center.double().cpu().numpy()
             if np.linalg.norm(x - self.target, axis=1).min() < self.radius + twin.body.settings.dx:
-                self.target = self.home(drop)
+                self.target = self.home()
             solids = [*twin.world.colliders, self.ball(self.target)]
             # the time step is to allow for the speed that the whole fall gives
             fall = math.sqrt(2 * drop.height / max(float(twin.world.gravity.norm()), 1e-3)) / self.dt
@@ -156,7 +156,7 @@ class Live:
 
     def reset(self) -> bool:
         """Back to the beginning of the last drop, the ball at home, paused."""
-        self.target = self.home(self._last)
+        self.target = self.home()
         return self.begin(self._last)
 
     def step(self) -> bool:

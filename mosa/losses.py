@@ -16,29 +16,27 @@ FLAT = 1e-3
 """Rotation term: det F below which a particle has no weight."""
 
 
-def weighted_mean(values: Tensor, weight: Tensor | None) -> Tensor:
+def weighted_mean(values: Tensor, weight: Tensor) -> Tensor:
     """Mean of `values`, weighted by `weight` of the same shape (0 where all weights are 0)."""
-    if weight is None:
-        return values.mean()
     return (weight * values).sum() / weight.sum().clamp(min=TINY)
 
 
-def image_loss(rendered: Tensor, real: Tensor, weight: Tensor | None = None) -> Tensor:
-    """L_img: mean L1 over views, frames, pixels and channels. Images (V, T, H, W, 3) in [0, 1]; weight (V, T, H, W)."""
-    return weighted_mean((rendered - real).abs().mean(-1), weight)
+def image_loss(rendered: Tensor, real: Tensor) -> Tensor:
+    """L_img: mean L1 over views, frames, pixels and channels. Images (V, T, H, W, 3) in [0, 1]."""
+    return (rendered - real).abs().mean(-1).mean()
 
 
-def mask_loss(alpha: Tensor, mattes: Tensor, weight: Tensor | None = None) -> Tensor:
-    """L_msk: mean L1 over views, frames and pixels of (V, T, H, W) in [0, 1]; weight: same shape or None."""
-    return weighted_mean((alpha - mattes).abs(), weight)
+def mask_loss(alpha: Tensor, mattes: Tensor) -> Tensor:
+    """L_msk: mean L1 over views, frames and pixels of (V, T, H, W) in [0, 1]."""
+    return (alpha - mattes).abs().mean()
 
 
-def flow_loss(simulated: Tensor, seen: Tensor, image_width: int, weight: Tensor | None = None) -> Tensor:
-    """L_flow: mean L1 of flow maps (V, T - 1, H, W, 2) [px], in image widths; weight: (V, T - 1, H, W) or None.
+def flow_loss(simulated: Tensor, seen: Tensor, image_width: int) -> Tensor:
+    """L_flow: mean L1 of flow maps (V, T - 1, H, W, 2) [px], in image widths.
 
     In pixels the term would drown the others and grow with the resolution. image_width: of the whole image, not of a crop.
     """
-    return weighted_mean((simulated - seen).abs().mean(-1), weight) / image_width
+    return (simulated - seen).abs().mean(-1).mean() / image_width
 
 
 def cofactors(F: Tensor) -> Tensor:

@@ -112,11 +112,6 @@ def chamfer_distances(a: Tensor, b: Tensor, *, samples: int = CHAMFER_SAMPLES, s
     return {"cd_sq_m2": float((ab**2).mean() + (ba**2).mean()), "cd_m": float(ab.mean() + ba.mean())}
 
 
-def chamfer_squared(a: Tensor, b: Tensor, *, samples: int = CHAMFER_SAMPLES, seed: int = 0) -> float:
-    """`cd_sq_m2` alone."""
-    return chamfer_distances(a, b, samples=samples, seed=seed)["cd_sq_m2"]
-
-
 def chamfer(a: Tensor, b: Tensor, *, samples: int = CHAMFER_SAMPLES, seed: int = 0) -> float:
     """`cd_m` alone."""
     return chamfer_distances(a, b, samples=samples, seed=seed)["cd_m"]

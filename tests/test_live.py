@@ -101,7 +101,7 @@ def test_a_ball_inside_of_the_body_goes_home():
     live.target = np.array([0.0, START + 0.04, 0.0])
     assert live.drop() and live.message == ""
     assert np.linalg.norm(live.positions.numpy() - live.hand_position, axis=1).min() > live.radius + DX
-    assert np.allclose(live.hand_position, live.home(live.drop_as))
+    assert np.allclose(live.hand_position, live.home())
 
 
 def test_a_motion_that_diverges_stops_with_a_message_and_the_next_drop_goes_on():
@@ -217,7 +217,7 @@ def test_the_page_drops_steps_pushes_and_outlives_a_divergence():
         shown.step()
         assert np.allclose(shown.ball.position, here + np.array([0.003, 0, 0])) and "on the ball" in shown.caption.content
         shown.reset()
-        assert live.time == 0 and np.allclose(shown.gizmo.position, live.home(live.drop_as))
+        assert live.time == 0 and np.allclose(shown.gizmo.position, live.home())
         shown.sliders["speed"].value = shown.sliders["speed"].max
         shown.drop()
         until = time.time() + 60

@@ -83,7 +83,7 @@ def test_chamfer_by_hand():
     a = torch.tensor([[0.0, 0, 0]])
     b = torch.tensor([[3.0, 0, 0], [0, 4, 0]])
     for first, second in ((a, b), (b, a)):
-        assert metrics.chamfer_squared(first, second) == pytest.approx(9 + (9 + 16) / 2)
+        assert metrics.chamfer_distances(first, second)["cd_sq_m2"] == pytest.approx(9 + (9 + 16) / 2)
         assert metrics.chamfer(first, second) == pytest.approx(3 + (3 + 4) / 2)
 
 
@@ -124,7 +124,7 @@ def test_floors_are_those_of_two_random_samplings():
     floors = metrics.sampling_floors(lattice, 3000, 3000, assignment=400)
     a, b = 0.2 * drawn(3000, 3, seed=1), 0.2 * drawn(3000, 3, seed=2)
     assert floors["cd_sq_m2"] == pytest.approx(1.5e-4, rel=0.08)
-    assert floors["cd_sq_m2"] == pytest.approx(metrics.chamfer_squared(a, b), rel=0.05)
+    assert floors["cd_sq_m2"] == pytest.approx(metrics.chamfer_distances(a, b)["cd_sq_m2"], rel=0.05)
     assert floors["cd_m"] == pytest.approx(metrics.chamfer(a, b), rel=0.03)
     assert floors["emd_m"] == pytest.approx(metrics.emd(a, b, samples=400), rel=0.15)
 
@@ -132,7 +132,7 @@ def test_floors_are_those_of_two_random_samplings():
 def test_floor_of_a_random_cloud():
     cloud = 0.2 * drawn(8000, 3, seed=5)
     assert metrics.sampling_floors(cloud, 2000, 3000, assignment=100)["cd_sq_m2"] == pytest.approx(
-        metrics.chamfer_squared(0.2 * drawn(2000, 3, seed=6), 0.2 * drawn(3000, 3, seed=7)), rel=0.12
+        metrics.chamfer_distances(0.2 * drawn(2000, 3, seed=6), 0.2 * drawn(3000, 3, seed=7))["cd_sq_m2"], rel=0.12
     )
 
 

@@ -152,17 +152,6 @@ def directional_modulus(states: States, adapter: AdapterProtocol | None, directi
     return (tension - compression) / (2 * strain)
 
 
-def modulus_ratio(states: States, adapter: AdapterProtocol | None, axis: Sequence[float], strain: float = 5e-3) -> float:
-    """E along `axis` over the mean of E across it (18 directions); 1 for an isotropic law."""
-    along = torch.tensor(axis, dtype=torch.float64)
-    along = along / along.norm()
-    helper = torch.eye(3, dtype=torch.float64)[int(along.abs().argmin())]
-    first = torch.linalg.cross(along, helper)
-    _, across = directions_in_plane(first.tolist(), torch.linalg.cross(along, first).tolist(), 19)
-    modulus = directional_modulus(states, adapter, torch.cat([along[None], across[:-1]]), strain)
-    return float(modulus[0] / modulus[1:].mean())
-
-
 def stiffest_axis(states: States, adapter: AdapterProtocol | None, count: int = 200, strain: float = 5e-3) -> tuple[Tensor, float]:
     """(unit vector (3,) of the largest E(n), E_max/E_min) over a half sphere of `count` directions: which way a learned law is
     stiff, to be compared with a known fibre."""

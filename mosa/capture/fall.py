@@ -177,7 +177,7 @@ class Problem:
         readouts = numbers[8 + V : 8 + 2 * V]
         return motion, offsets, readouts, numbers[8 + 2 * V :].reshape(V, 2)
 
-    def misses(self, numbers: np.ndarray, keep: np.ndarray | None = None) -> list[np.ndarray]:
+    def misses(self, numbers: np.ndarray) -> list[np.ndarray]:
         """Per phone (n, 2) [px]: seen minus expected."""
         motion, offsets, readouts, shifts = self.parts(numbers)
         found = []

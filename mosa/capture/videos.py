@@ -12,9 +12,6 @@ import numpy as np
 from mosa.capture.poses import VIDEOS
 from mosa.errors import ConfigError, DataError
 
-UNEVEN = 0.05
-"""Share of a frame by which frames' times may be off an even rate before it is said."""
-
 
 @dataclass(frozen=True)
 class Clip:

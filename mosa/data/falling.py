@@ -99,7 +99,7 @@ def check_fall(scene: Scene, label: str) -> None:
     g = float(scene.gravity.double().norm())
     if track is None:
         return
-    check_size(scene, track, label)
+    check_size(track, label)
     if g == 0:
         return
     check_order(scene, track, label)
@@ -107,7 +107,7 @@ def check_fall(scene: Scene, label: str) -> None:
     check_direction(scene, track, label, g)
 
 
-def check_size(scene: Scene, track: Track, label: str) -> None:
+def check_size(track: Track, label: str) -> None:
     """Lengths and speeds of things that are filmed."""
     keys = "the unit of the poses, scene.box and scene.fps"
     if not SIZES[0] < track.radius < SIZES[1]:

@@ -116,7 +116,7 @@ def one(bench: Bench, simulator: str, seed: int, folder: Path) -> dict[str, Any]
     record = _record(bench, simulator, seed)
     tested = dict.fromkeys([simulator, *(["truth"] if record["truth"] is not None else [])])
     for name in tested:
-        count = sum(record[_key(name, simulator)]["success"])
+        count = sum(record["truth" if name == "truth" else "own"]["success"])
         log.info("%s, trained in %s: %d of %d in %s", bench.setting.task, simulator, count, bench.setting.trials, name)
     _write(folder / "result.json", record)
     if record["policy"] is not None:
@@ -145,10 +145,6 @@ def table(bench: Bench, simulators: Sequence[str], seeds: Sequence[int], folder:
     if policies:
         films(bench, policies, "truth", folder)
     return page
-
-
-def _key(tested: str, trained: str) -> str:
-    return "truth" if tested == "truth" else "own"
 
 
 def _record(bench: Bench, simulator: str, seed: int) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -28,9 +27,6 @@ from mosa.modules.takes import Take, seen_again, with_positions
 from mosa.modules.terms import Step, check_terms, evaluate_terms
 from mosa.progress import tqdm
 from mosa.types import Rollout
-
-log = logging.getLogger(__name__)
-
 
 SIDE_BY_SIDE = 10
 """Worlds that take a GPU as long as one rollout: 32 of 4040 particles took 3.3 times as long (docs/performance.md)."""
