@@ -5,7 +5,8 @@
     python benchmarks/robustness.py --runs              # and whole processes: exit codes, a sweep of failures (minutes)
 
 Each attack ends in one clear message (a MosaError of one line), in a traceback, in a hang (over 60 s), or it runs. What runs is
-listed: those are the attacks that the program has no word against. The attacks are in robustness_attacks.py.
+listed: those are the attacks that the program has no word against. The attacks are in attacks_on_files.py, attacks_on_calls.py and
+attacks_on_data.py.
 """
 
 from __future__ import annotations
@@ -18,10 +19,16 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-from robustness_attacks import GROUPS
+import attacks_on_calls as calls
+import attacks_on_data as data
+import attacks_on_files as files
 
 from mosa.errors import MosaError
 
+GROUPS = {"checkpoints": files.checkpoints, "npz": files.npz, "overrides": calls.overrides, "colliders": calls.colliders,
+          "calls": calls.calls, "data": data.data, "meshes": data.meshes, "caches": files.caches, "poses": data.poses,
+          "resumed": files.resumed, "runs": calls.runs}  # fmt: skip
+"""Name -> pairs of what is done and a function that does it, in a folder."""
 PATIENCE = 60
 HEAD = "| group | tried | one clear message | traceback or hang | ran |\n|---|---|---|---|---|"
 

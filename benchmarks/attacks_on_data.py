@@ -1,4 +1,4 @@
-"""The attacks of robustness.py by group: pairs of what is done and a function that does it."""
+"""Attacks by captures: listings, images, poses, meshes and splats."""
 
 from __future__ import annotations
 
@@ -6,223 +6,21 @@ import copy
 import json
 import math
 import shutil
-import subprocess
-import sys
 import tempfile
-import zipfile
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
+from attacks import WORLD, Attack, cube
 
 from mosa.capture.poses import read_phones, scene_points
 from mosa.capture.world import read_world
-from mosa.checkpoints import RESUMED, check_resumed
-from mosa.config import build_body, build_world, rehearse
 from mosa.data.export import export_transforms
 from mosa.data.scene import load_scene
 from mosa.data.splats import load_ply
-from mosa.errors import MosaError
-from mosa.keys import EVALUATION, TRAINING
-from mosa.known import check_known
-from mosa.modules.body import Start
-from mosa.npz import read_npz, write_npz
 from mosa.physics.contact.mesh import field_of_mesh
-from mosa.reconstruction.cache import StageCache
-from mosa.schema import check
-from mosa.twin import Twin
-
-ROOT = Path(__file__).parents[1]
-Attack = tuple[str, Callable[[], object]]
-WORLD = {"gravity": [0, -9.8, 0], "box": [[-0.7, -0.1, -0.7], [0.7, 1.0, 0.7]], "ground": {"height": 0.0}}
-
-
-def put(tree, path: str, value):
-    """A copy of nested containers with a value at a dotted path; deleted where the value is ..."""
-    result = copy.deepcopy(tree)
-    *above, last = [int(key) if key.isdigit() else key for key in path.split(".")]
-    part = result
-    for key in above:
-        part = part[key]
-    if value is ...:
-        del part[last]
-    else:
-        part[last] = value
-    return result
-
-
-@cache
-def composed(*overrides: str) -> dict:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return OmegaConf.to_container(compose("train", overrides=["debug=default", *overrides]), resolve=True)
-
-
-@cache
-def stored() -> dict:
-    """A checkpoint's content, of a cube of 27 particles."""
-    cfg, axis, n = composed(), torch.tensor([0.0, 0.05, 0.1]), 27
-    tensors = {"rest": torch.cartesian_prod(axis, axis + 0.3, axis), "volume": torch.full((n,), 1.25e-4),
-               "colors": torch.full((n, 3), 0.25), "opacities": torch.full((n,), 0.9),
-               "covariances": 1e-4 * torch.eye(3).expand(n, 3, 3).clone()}  # fmt: skip
-    world = {"ground": {"height": 0.0}, "gravity": [0, -9.8, 0], "up": [0, 1, 0], "box": [[-1, -0.1, -1], [1, 1, 1]]}
-    start = Start(torch.eye(3), torch.tensor([0.05, 0.35, 0.05]), torch.zeros(3), torch.zeros(3)).written()
-    config = {"cfg": cfg, "world": world, "density": 1000.0, "dx": 0.1, "frame_dt": 1 / 60, "starts": {"train": start}}
-    state = {f"body.{k}": v for k, v in build_body(config, tensors).state_dict().items()}
-    return {"state_dict": state, "mosa": {"config": config, "start": start, "stage": 3, "losses": [], "steps_done": 1,
-                                          "particles": n}}  # fmt: skip
-
-
-class Touch:
-    """What a pickle would run."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self):
-        return Path.touch, (self.path,)
-
-
-def checkpoints(folder: Path) -> Iterator[Attack]:
-    target, config = folder / "touched", "mosa.config"
-
-    def load(content: dict):
-        torch.save(content, folder / "a.ckpt")
-        Twin.load(folder / "a.ckpt").simulate(frames=2)
-
-    bad = {"subprocess.Popen", "os.system", "builtins.eval", "mosa.rollout_file.save_parts", "mosa.modules.body.Body", 5, ("a",)}
-    changes = [(f"{config}.cfg.adapter", {"_target_": name, "args": ["touch", str(target)]}) for name in bad]
-    changes += [(f"{config}.cfg.{key}", "${oc.env:HOME}/x") for key in ("scene.cache", "scene.path", "prior.law", "seed")]
-    changes += [(f"{config}.{key}", ...) for key in ("cfg", "world", "density", "dx", "frame_dt", "cfg.prior", "cfg.adapter",
-                                                     "cfg.simulation", "cfg.heterogeneity", "world.gravity", "world.box")]
-    changes += [(key, ...) for key in ("mosa", "state_dict", "mosa.config", "mosa.start", "mosa.start.rotation")]
-    changes += [(f"{config}.{key}", value) for key in ("density", "dx", "frame_dt", "world.ground.height")
-                for value in (math.nan, math.inf, "a", True, [1])]
-    changes += [("mosa.losses", Touch(target)), ("mosa.losses", bytearray(9)), ("mosa.losses", {1, 2})]
-    for key, value in changes:
-        yield f"{key}={value if value is not ... else 'deleted'}", lambda k=key, v=value: load(put(stored(), k, v))
-    for name in [key for key in stored()["state_dict"] if key.count(".") == 1]:
-        for kind, change in {"gone": None, "NaN": lambda x: x * math.nan, "short": lambda x: x[:5], "a list": lambda x: [1],
-                             "expanded": lambda x: x.flatten()[:1].expand(10**10)}.items():
-            def attack(name=name, change=change):
-                state = dict(stored()["state_dict"])
-                state.pop(name) if change is None else state.update({name: change(state[name])})
-                load({**stored(), "state_dict": state})
-
-            yield f"{name} {kind}", attack
-    torch.save(stored(), folder / "good.ckpt")
-    content = (folder / "good.ckpt").read_bytes()
-    for share in np.linspace(0, 0.999, 20):
-        def cut(share=share):
-            (folder / "cut.ckpt").write_bytes(content[: int(share * len(content))])
-            Twin.load(folder / "cut.ckpt")
-
-        yield f"cut at {share:.0%}", cut
-    yield "what was named has run", lambda: None if target.exists() else refuse("nothing was executed or written")
-
-
-def refuse(message: str):
-    raise MosaError(message)
-
-
-def npz(folder: Path) -> Iterator[Attack]:
-    file = folder / "a.npz"
-    write_npz(file, {"train/x": np.random.default_rng(0).random((2, 50, 3))})
-    content = file.read_bytes()
-
-    def read(changed: bytes):
-        file.write_bytes(changed)
-        read_npz(file)
-
-    for share in np.linspace(0, 0.99, 15):
-        yield f"cut at {share:.0%}", lambda s=share: read(content[: int(s * len(content))])
-    for shape in ("(10**9, 3)", "(-1, 3)", "(2, 50, 4)", "(99999999999,)"):
-        def misshapen(shape=shape):
-            with tempfile.TemporaryFile() as plain:
-                np.lib.format.write_array(plain, np.zeros((2, 50, 3)))
-                plain.seek(0)
-                bytes_ = plain.read().replace(b"(2, 50, 3)", shape.encode())
-            with zipfile.ZipFile(file, "w") as archive:
-                archive.writestr("x.npy", bytes_)
-            read_npz(file)
-
-        yield f"header {shape}", misshapen
-    yield "objects", lambda: (np.savez(file, x=np.array([Touch(folder / "touched")], dtype=object)), read_npz(file))
-
-
-def overrides(_: Path) -> Iterator[Attack]:
-    def configured(config: dict):
-        check_known(config, ROOT / "conf", "train", TRAINING, EVALUATION)
-        check(config, TRAINING, EVALUATION)
-        rehearse(config)
-
-    wrong = {
-        "+": ["foo=1", "world.foo=1", "simulation.foo=1", "fit.foo=1", "rendering.foo=1", "trainer.max_epochs=1", "adapter.alfa=1",
-              "logger._target_=nonsense", "evaluation.foo=1", "prior.parameters.mu=5", "prior.foo=1", "reconstruction.foo=1",
-              "fit.joint.foo=1", "heterogeneity.foo=1", "losses.colour=1", "prior.options.foo=1"],
-        "": [f"{key}={value}" for key in ("seed", "fit.views", "fit.prior.iterations", "fit.prior.lr", "simulation.particles",
-                                          "simulation.stride", "simulation.courant", "adapter.alpha", "heterogeneity.amplitude",
-                                          "reconstruction.resolution", "reconstruction.points", "losses.image",
-                                          "prior.parameters.E",
-                                          "rendering.margin", "evaluation.samples", "logger.images_every")
-             for value in ("-1", "abc", ".nan", ".inf", "true", "[1]", "null")]
-            + [f"{key}=5" for key in ("fit.prior", "reconstruction.static", "prior.law", "adapter.name", "world.walls",
-                                      "scene.cache",
-                                      "world.colliders", "prior.parameters", "ckpt_path", "rendering.backend", "losses")]
-            + ["optimized_metric=nope", "world.walls={}", "simulation.stride=1000000", "reconstruction.resolution=100000",
-               "simulation.precision=16", "adapter.alpha=1", "prior.law=jelly", "fit.joint.start=foo"],
-    }  # fmt: skip
-    for plus, each in wrong.items():
-        for override in each:
-            yield plus + override, lambda o=plus + override: configured(composed(o))
-    for key in ("seed", "fit", "world", "simulation.stride", "fit.views", "scene", "losses", "trainer", "evaluation"):
-        yield f"~{key}", lambda k=key: configured(put(composed(), k, ...))
-
-
-def colliders(_: Path) -> Iterator[Attack]:
-    body = cube()
-    ball = {"type": "sphere", "radius": 0.05, "position": [0, -0.3, 0]}
-    for key, values in {
-        "radius": [0, -1, math.inf, math.nan, True, "a", [1], 1e300], "thickness": [math.inf, -1, "a", True],
-        "friction": [math.inf, -1, "a", 0.5], "mode": ["bouncy", ["slip"], 5], "type": ["cone", ["sphere"], None, 5],
-        "position": [[0, 0], "abc", [0, True, 0], [0, math.nan, 0], 5],
-        "rotation": [[0, 0, 0, 1], [1, 0, 0], "abc", [math.nan] * 4],
-        "motion": [5, {"velocity": "abc"}, {"velocity": [1, 2]}, {"speed": 1}, {"waypoints": []}, {"waypoints": [5, 6]},
-                   {"velocity": [math.inf, 0, 0]}, {"velocity": [1, 0, 0], "times": [1, 0]}, {"waypoints": [{"time": 0}] * 2}],
-        "size": [1], "name": [5], "path": ["x"],
-    }.items():  # fmt: skip
-        for value in values:
-            yield f"{key}={value}", lambda k=key, v=value: body.simulate(frames=2, colliders=[ball | {k: v}])
-    for item in ({"type": "box", "size": [1, 1]}, {"type": "box", "size": [9, 9, 9]}, {"type": "sphere", "radius": 5}, 5, "ball",
-                 {"type": "plane", "normal": [0, 1, 0], "position": [0, 9, 0]}, {"type": "mesh", "path": "none.obj"}):
-        yield f"{item}", lambda i=item: body.simulate(frames=2, colliders=[i])
-    for walls in ({}, {"friction": math.inf, "mode": "separate"}, {"mode": 5}, {"foo": 1}, {"friction": True}):
-        yield f"walls {walls}", lambda w=walls: build_world({"ground": None, "gravity": [0, -9.8, 0], "up": [0, 1, 0],
-                                                              "box": [[-1] * 3, [1] * 3], "walls": w})
-
-
-@cache
-def cube() -> Twin:
-    with tempfile.TemporaryDirectory() as folder:
-        torch.save(stored(), Path(folder) / "good.ckpt")
-        return Twin.load(Path(folder) / "good.ckpt")
-
-
-def calls(_: Path) -> Iterator[Attack]:
-    for key, values in {
-        "rotation": [np.diag([1.2, 1, 0.8]).tolist(), np.diag([1.0, 1, -1]).tolist(), [0, 0, 0, 1], "abc", [1, 2],
-                     [math.nan] * 4, 5],
-        "height": ["a", math.nan, math.inf, -1, True, [1]],
-        "velocity": ["abc", [1, 2], [math.inf, 0, 0], [True] * 3, {}, 5, [1e30] * 3],
-        "angular_velocity": ["abc", [1, 2], [math.nan, 0, 0], 5], "frames": [2.5, 0, -1, True, "3", 10**12, None, math.nan],
-        "variant": ["none", 5, ["prior"], None], "colliders": ["ball", 5, {"type": "sphere"}],
-    }.items():  # fmt: skip
-        for value in values:
-            yield f"{key}={value}", lambda k=key, v=value: cube().simulate(**{"frames": 2, k: v})
 
 
 @cache
@@ -403,8 +201,6 @@ def meshes(folder: Path) -> Iterator[Attack]:
                        "cut": head.format(n=9) + "0 0 0\n"}.items():
         yield f"ply {name}", lambda t=text: ((folder / "m.ply").write_text(t), field_of_mesh(folder / "m.ply"))
         yield f"splats {name}", lambda t=text: ((folder / "s.ply").write_text(t), load_ply(folder / "s.ply"))
-
-
 CUBE = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
 SIDES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
 
@@ -453,40 +249,6 @@ def more_meshes(folder: Path) -> Iterator[Attack]:
         yield f"splats {name}", lambda t=text: ((folder / "s.ply").write_text(t), load_ply(folder / "s.ply"))
 
 
-def caches(folder: Path) -> Iterator[Attack]:
-    good = {"means": torch.zeros(9, 3), "scales": torch.ones(9, 3), "rotations": torch.ones(9, 4), "opacities": torch.ones(9),
-            "colors": torch.ones(9, 3)}  # fmt: skip
-
-    def remade(stored: object):
-        cache = StageCache(folder, {"scene": "a"})
-        torch.save(stored, cache.folder / "static.pt")
-        found = cache.stage("static", lambda: good)
-        if not all(torch.equal(found[key], good[key]) for key in good):
-            raise AssertionError("a wrong cache was used")
-        refuse("made again")
-
-    for name, stored_ in {"no keys": {}, "a list": [1], "short": {**good, "means": torch.zeros(3, 3)}, "one gone": {
-            k: v for k, v in good.items() if k != "scales"}, "NaN": {**good, "means": torch.full((9, 3), math.nan)}}.items():
-        yield name, lambda s=stored_: remade(s)
-
-
-def runs(folder: Path) -> Iterator[Attack]:
-    """Whole processes: an exit code of 2 with one message counts as one."""
-    def train(*arguments: str, code: int = 2):
-        flags = [argument for argument in arguments if argument.startswith("-")]
-        keys = [f"hydra.run.dir={folder}/run", "debug=default", *(argument for argument in arguments if argument not in flags)]
-        found = subprocess.run([sys.executable, "train.py", *flags, *keys], cwd=ROOT, capture_output=True, text=True)
-        if found.returncode != code or "Traceback" in found.stderr:
-            raise AssertionError(f"{found.returncode}: {found.stderr[-300:]}")
-        refuse("one message")
-
-    (folder / "text.ckpt").write_text("hello")
-    for override in ("+foo=1", "adapter=null", "fit.prior=5", f"ckpt_path={folder}/text.ckpt", "simulation.dx=1e-6",
-                     "world.colliders=[{type: box, size: [9,9,9]}]", "simulation.particles=100000000"):
-        yield override, lambda o=override: train(o)
-    yield "a sweep of failures", lambda: train("-m", f"hydra.sweep.dir={folder}/sweep", "seed=-1,-2", code=1)
-
-
 def poses(folder: Path) -> Iterator[Attack]:
     """Poses of a capture, in COLMAP's text and as transforms.json, and the record of an earlier one."""
     sizes = {f"p{i}.mp4": (160, 120) for i in range(3)}
@@ -529,25 +291,3 @@ def poses(folder: Path) -> Iterator[Attack]:
     for key in good:
         for value in (0, -1, math.nan, "a", None, [1], np.diag([1, 1, -1]).tolist(), np.diag([2, 1, 1]).tolist()):
             yield f"like: {key}={value}", lambda k=key, v=value: record(k, v)
-
-
-def resumed(_: Path) -> Iterator[Attack]:
-    """Parts of a checkpoint that a fit goes on from."""
-    whole = {name: {} for name in RESUMED} | {"state_dict": {}}
-    own = {"stage": 2, "losses": [1.0], "steps_done": 3, "particles": 7}
-    state = {"iteration": 1, "factors": [1.0], "multiple": 0.0, "noise": None}
-    nan = torch.full((5, 7, 3), math.nan)
-    wrong = {"cues": (5, "a", {}, {"a": 1}, [5], ["a"], [nan], [nan[0]], [nan.long()]), "misfit": ("a", 0, -1, math.nan, None),
-             "stage": (-1, "a", None, True), "losses": (5, ["a"], [None], [math.nan], {}), "particles": (0, "a", None),
-             "steps_done": (-1, "a"), "compared": (5, ["a"], {"corotated": "a"}, {"corotated": 1.0}),
-             "identification": (5, {}, {"iteration": 1}, *(state | change for change in (
-                 {"iteration": "a"}, {"factors": ["a"]}, {"factors": [0.0]}, {"multiple": math.nan}, {"noise": 5}, {"noise": [5]},
-                 {"noise": [[5] * 3]}, {"grid": [[nan] * 3]})))}  # fmt: skip
-    for key, values in wrong.items():
-        for value in values:
-            yield f"{key}={value}", lambda k=key, v=value: check_resumed(whole | {"mosa": own | {k: v}}, "a.ckpt")
-
-
-GROUPS = {"checkpoints": checkpoints, "npz": npz, "overrides": overrides, "colliders": colliders, "calls": calls, "data": data,
-          "meshes": meshes, "caches": caches,
-          "poses": poses, "resumed": resumed, "runs": runs}
