@@ -37,7 +37,7 @@ def overrides(_: Path) -> Iterator[Attack]:
                                       "scene.cache",
                                       "world.colliders", "prior.parameters", "ckpt_path", "rendering.backend", "losses")]
             + ["optimized_metric=nope", "world.walls={}", "simulation.stride=1000000", "reconstruction.resolution=100000",
-               "simulation.precision=16", "adapter.alpha=1", "prior.law=jelly", "fit.joint.start=foo"],
+               "simulation.precision=16", "+adapter.alpha=1", "prior.law=jelly", "fit.joint.start=foo"],
     }  # fmt: skip
     for plus, each in wrong.items():
         for override in each:
