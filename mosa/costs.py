@@ -22,8 +22,10 @@ from mosa.data.agreement import lines_of_sight, misses
 from mosa.errors import ConfigError, MosaError
 from mosa.limits import machine_memory
 from mosa.modules.body import Body, Start, World
+from mosa.modules.identification import Identification
 from mosa.modules.lit_mosa import LitMosa
 from mosa.modules.material import RIVALS
+from mosa.modules.stages import Stage
 from mosa.physics.engine.budget import KEPT_ON_CPU
 from mosa.prediction import DRAWS
 from mosa.reconstruction.observed import object_windows
@@ -43,6 +45,8 @@ ADAPTER_COST, ADAPTER_BYTES = 1.8, 4.8e3
 """Of a step with networks over one without; per particle and evaluation of theirs."""
 STIFFNESS_COST = 1.5
 """Of a rollout with an adapter that is a stiffness over one without."""
+SIDE_BY_SIDE = 10
+"""Worlds that take a GPU as long as one rollout: 32 of 4040 particles took 3.3 times as long (docs/performance.md)."""
 KERNELS = 3.0
 """Seconds of a fit that no step takes: the trainer, and kernels that its last stage is the first to need."""
 MEASURED = 20_000
@@ -236,6 +240,15 @@ def before_data(cfg: Mapping[str, Any], most: int) -> str:
     return f"data: {len(names)} sequences, {made.count(False)} of them to be made, about {duration(seconds)}"
 
 
+def newton_rollouts(module: LitMosa, stage: Stage) -> float:
+    """About how many rollouts, one after another, a stage of Gauss-Newton takes at most."""
+    planned = Identification(module.body, module.takes, module.world, stage, module.criterion, module.settings, seats=0)
+    columns = sum(b.size for b in planned.newton.blocks)
+    together = SIDE_BY_SIDE if module.body.rest.is_cuda else planned.threads(columns)
+    each = columns / together + 5  # the residuals, the noise, one or two steps that are tried, the distance
+    return len(planned.pairs) * (stage.iterations * each + (24 if planned.calibrating else 0))
+
+
 def seconds_of_fit(module: LitMosa, speeds: Speeds, frames: int, processes: int = 1) -> float:
     """Of the stages of `module`, at most: rollouts of Gauss-Newton, steps of Adam with their pictures."""
     body = module.body
@@ -247,7 +260,7 @@ def seconds_of_fit(module: LitMosa, speeds: Speeds, frames: int, processes: int 
     for stage in module.stages:
         adapted = ADAPTER_COST if stage.learns_adapter and networks else 1.0
         stiff = STIFFNESS_COST if stage.learns_adapter and body.adapter is not None else 1.0
-        total += module.rollouts(stage) * rollout * stiff if stage.newton else stage.iterations * step * adapted
+        total += newton_rollouts(module, stage) * rollout * stiff if stage.newton else stage.iterations * step * adapted
     return total
 
 

@@ -28,9 +28,6 @@ from mosa.modules.terms import Step, check_terms, evaluate_terms
 from mosa.progress import tqdm
 from mosa.types import Rollout
 
-SIDE_BY_SIDE = 10
-"""Worlds that take a GPU as long as one rollout: 32 of 4040 particles took 3.3 times as long (docs/performance.md)."""
-
 
 class LitMosa(Restorable, L.LightningModule):
     """Fits a body to one or more sequences in stages: the loss is the mean over them.
@@ -245,14 +242,6 @@ class LitMosa(Restorable, L.LightningModule):
         prior = dict(self.config.get("cfg", {}).get("prior", {}))
         if prior:
             self.config["cfg"]["prior"] = prior | {"law": self.body.material.law, "candidates": []}
-
-    def rollouts(self, stage: Stage) -> float:
-        """About how many rollouts, one after another, a stage of Gauss-Newton takes at most."""
-        planned = Identification(self.body, self.takes, self.world, stage, self.criterion, self.settings, seats=0)
-        columns = sum(b.size for b in planned.newton.blocks)
-        together = SIDE_BY_SIDE if self.body.rest.is_cuda else planned.threads(columns)
-        each = columns / together + 5  # the residuals, the noise, one or two steps that are tried, the distance
-        return len(planned.pairs) * (stage.iterations * each + (24 if planned.calibrating else 0))
 
     def report_newton(self, found: dict[str, float]) -> None:
         """Scalars of one iteration: cost, step, what the evidence found, parameters."""
