@@ -62,8 +62,6 @@ class Adapter(nn.Module):
 
     replaces_law = False
     """Whether nothing of the prior is left in the answer: its stage then holds the prior's parameters, which would only drift."""
-    chained = True
-    """Whether evaluations may be captured into a CUDA graph together with the substeps between them."""
 
     @property
     def steady(self) -> bool:

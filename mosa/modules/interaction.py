@@ -48,7 +48,6 @@ class InteractionNetwork(Adapter):
     """
 
     replaces_law = True
-    chained = False
 
     def __init__(self, *, hidden: int = 32, nodes: int = 250, neighbours: int = 20, stiffer: float = 1.0) -> None:
         super().__init__()

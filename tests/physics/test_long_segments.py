@@ -19,7 +19,7 @@ def run(state, long, *, substeps=70, dt=2e-4, parameters=PARAMETERS, frames=3, *
     """(rollout, lengths of the segments that had buffers)."""
     options = {"ground": Ground(0.0), "dtype": torch.float64, "on_inversion": "ignore", **options}
     sim = Simulator("corotated", dx=0.04, substeps=substeps, frame_dt=substeps * dt, **options)
-    sim._long = long
+    sim.gathers = long
     volume = torch.full((len(state.x),), 8e-6, dtype=torch.float64)
     return sim.rollout(state, parameters, volume, 1000.0, frames), {work.substeps for work in sim.buffers}
 

@@ -338,7 +338,8 @@ def test_a_dropped_simulator_frees_its_buffers_at_once(kind, make_block):
     elif kind == "chained":
         adapter = Answering(zero)
     solids = [Collider(Sphere(0.05))] if kind == "colliders" else []
-    sim = simulator(colliders=solids, chained=kind == "chained")
+    sim = simulator(colliders=solids)
+    sim.gathers = kind == "chained"
     gc.collect()
     gc.disable()
     try:
@@ -371,13 +372,13 @@ def test_a_tape_of_many_more_nodes_than_particles_is_not_kept_beyond_its_room(ma
     state = make_block()
     state = ParticleState(*(t[[0, -1]].contiguous() for t in (state.x, 0 * state.v, state.C_affine, state.F, state.F_tot)))
     state.x[1] += 0.5
-    kept, forward = [], SegmentSolver.advance
+    kept, asked = [], SegmentSolver.has_room
 
-    def spied(self, *args, **more):
+    def spied(self, substeps):
         kept.append(self.budget.room)
-        return forward(self, *args, **more)
+        return asked(self, substeps)
 
-    monkeypatch.setattr(SegmentSolver, "advance", spied)
+    monkeypatch.setattr(SegmentSolver, "has_room", spied)
     gradients = []
     for room in (2**30, 2**20):
         monkeypatch.setattr("mosa.physics.engine.budget.KEPT_ON_CPU", room)
@@ -477,9 +478,9 @@ def test_a_gradient_can_be_taken_twice(kind, make_block):
     state, mu = make_block(), torch.full((), 4e4).double().requires_grad_()
     zero = AdapterOperator(torch.zeros(len(state.x), 6, 6).double(), torch.zeros(len(state.x), 6).double())
     adapter = Answering(zero) if kind == "chain" else None
-    rollout = simulator(chained=kind == "chain").rollout(
-        state, {"mu": mu, "lam": 5e4}, volume_of(state), DENSITY, 3, adapter=adapter, stride=5
-    )
+    sim = simulator()
+    sim.gathers = kind == "chain"
+    rollout = sim.rollout(state, {"mu": mu, "lam": 5e4}, volume_of(state), DENSITY, 3, adapter=adapter, stride=5)
     loss = rollout.x[-1].square().sum()
     first, second = (torch.autograd.grad(loss, mu, retain_graph=True)[0] for _ in range(2))
     assert torch.equal(first, second) and float(first.abs()) > 0

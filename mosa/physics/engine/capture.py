@@ -97,7 +97,7 @@ class Graphs:
     def __init__(self, strategy: Strategy, failing: str, attempts: int = ATTEMPTS) -> None:
         self.strategy, self.failing, self.attempts = strategy, failing, attempts
         self._replays: dict[Hashable, Body] = {}
-        self._warm: set[Hashable] = set()
+        self._warm: dict[Hashable, None] = {}  # in the order in which they ran
 
     def __len__(self) -> int:
         return len(self._replays)
@@ -111,11 +111,14 @@ class Graphs:
         self.strategy.run(body)
         if len(self._warm) > MAX_GRAPHS:
             self.forget()
-        self._warm.add(name)
+        self._warm[name] = None
 
     def waits(self, name: Hashable) -> bool:
         """Whether a pass has run and is no graph yet, but may be."""
         return self.attempts > 0 and name in self._warm and name not in self._replays
+
+    def waiting(self) -> list[Hashable]:
+        return [name for name in self._warm if self.waits(name)]
 
     def capture(self, name: Hashable, body: Body) -> bool:
         """Whether `body` is now a graph; a failure says nothing of its launches themselves."""

@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from mosa.errors import ConfigError
 from mosa.physics.constitutive.laws import law_named
@@ -26,7 +26,6 @@ from mosa.physics.contact.planes import Plane, ground_plane, pack_planes
 from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState, Several, ask
 from mosa.physics.engine.adaptive_steps import StepChooser, StepControl, check_counts
 from mosa.physics.engine.buffers import Buffers
-from mosa.physics.engine.chain_schedule import Chains
 from mosa.physics.engine.clock import Adaptive, Clock, Replay
 from mosa.physics.engine.inputs import (
     check_state,
@@ -42,9 +41,8 @@ from mosa.physics.engine.inputs import (
 from mosa.physics.engine.lanes import Lanes
 from mosa.physics.engine.material_operations import material_state
 from mosa.physics.engine.numerics import Numerics, State, flat
-from mosa.physics.engine.operation import wants_gradient
 from mosa.physics.engine.solver import SegmentSolver
-from mosa.physics.engine.stepping import Moment, Prepared, Stepper, mean_force, segments
+from mosa.physics.engine.stepping import Moment, Prepared, Stepper, mean_force
 from mosa.physics.launching import SCALARS
 from mosa.types import Ground, ParticleState, Rollout
 
@@ -62,9 +60,6 @@ class Simulator:
     init_affine: `spin` takes the state's C_affine, `zero` replaces it by 0. norm_eps: under the root of yield norms.
     yield_convention: paper | sqrt23. rebuild: write U S V^T back also where nothing yielded (PAC-NeRF does).
     on_inversion: warn | ignore | error for det F <= 0 where the law has a value there; it is an error where it has none.
-    chained: whether the evaluations of an adapter that is a torch module and the segments between them run as chains;
-    None: on CUDA, where a chain is one captured graph. Not with colliders or adaptive substeps, which are cut in segments.
-    Gradients through a chain reach the adapter's parameters, not other tensors that it may use.
     strain: hencky | biot | green: what adapters answer is a stiffness G in units of 2 mu, of the energy mu E : G : E that is added
     to 1 + h[0] times the prior's; None: an operator on the prior's stress.
     Errors: ConfigError naming the argument. Not safe for use by two threads: buffers are shared between rollouts.
@@ -91,7 +86,6 @@ class Simulator:
         yield_convention: str = "paper",
         rebuild: bool = False,
         on_inversion: str = "warn",
-        chained: bool | None = None,
         strain: str | None = None,
     ) -> None:
         self.law = law_named(law)
@@ -127,11 +121,10 @@ class Simulator:
             colliders=packed_colliders, strain=strain,
         )  # fmt: skip
         self.buffers = Buffers()
-        self._long = self.device.type == "cuda"  # a CPU gains nothing
-        self.chained = self.device.type == "cuda" if chained is None else chained
+        # each stretch of motion costs a look at the host, and on CUDA waits for it; a CPU gains nothing
+        self.gathers = self.device.type == "cuda"
         # no method: the cycle would keep a dropped simulator's buffers until the garbage collector looks
         self._ask = partial(ask, self.law, dtype)
-        self._chains = Chains(self.numerics, self._ask, self.buffers)
 
     def pack(
         self, parameters: dict[str, Tensor], particles: int, rotation: Tensor | None = None, worlds: int | None = None
@@ -169,8 +162,9 @@ class Simulator:
         [kg/m^3]: number or (N,).
         adapter: asked every `stride` substeps from the start of each frame; None: once, at the start of the rollout (an operator
         that does not depend on the state). collect: called with `adapter.statistics()`, a named tuple of tensors, of every
-        evaluation. progress: called with the number of each frame. An adapter that has `flow` is no part of a chain; before it is
-        asked, F becomes flow(F (N, 3, 3), time until it is asked again [s]): plastic flow that a network has learned.
+        evaluation. progress: called with the number of each frame. Before an adapter that has `flow` is asked, F becomes
+        flow(F (N, 3, 3), time until it is asked again [s]): plastic flow that a network has learned. On CUDA gradients reach the
+        parameters of an adapter that is a torch module, not other tensors that it may use.
         motions: of the colliders, instead of their own; start_time [s]: time of frame 0 in these motions.
         timing: substeps that are chosen for each frame, or those of an earlier rollout, instead of `substeps` in all (see `clock`).
         Frame 0 of the result holds the state as given. Errors: SimulationDiverged naming substep and particle; ConfigError.
@@ -184,7 +178,7 @@ class Simulator:
             return sample_frame(motions, *place, self.dtype, self.device, isinstance(timing, Replay))
 
         poses = along if clock.varies and self.colliders else self._poses(motions, frames, start_time)
-        return self._run(prepared, self._begun(state, started), frames, clock, poses, started, progress, self.chained)
+        return self._run(prepared, self._begun(state, started), frames, clock, poses, started, progress)
 
     def rollout_worlds(
         self,
@@ -269,10 +263,9 @@ class Simulator:
     def _run(
         self, prepared: Prepared, start: ParticleState, frames: int, clock: Clock,
         poses: tuple[Tensor, ...] | Callable[[Clock], tuple[Tensor, ...]], started: bool, progress: Callable[[int], None] | None,
-        chained: bool = False,
     ) -> Rollout:  # fmt: skip
         """The frames, of one body or of many worlds one after another. poses: of the colliders at all substeps or, where these
-        are not known beforehand, what tells those of the frame that is under way; chained: where the adapter can be."""
+        are not known beforehand, what tells those of the frame that is under way."""
         current = flat(start)
         recorded = {name: [getattr(current, name)] for name in RECORDED}
         if frames > 1:
@@ -280,27 +273,16 @@ class Simulator:
         if not started:
             current = prepared.first_advance(current, clock.dt)
         prepared.settle(current)
-        states = None
-        if chained and self._can_be_chained(prepared.adapter) and not clock.varies:
-            lengths = segments(self.substeps, prepared.stride)
-            states = self._chains.frames(
-                prepared.lanes.solvers[0], prepared.adapter, current, prepared.packed, frames - 1, lengths, prepared.collect
-            )
         known = () if callable(poses) else poses
-        wanted, total = wants_gradient((*current, *prepared.held.values(), *known)), (frames - 1) * self.substeps
-        if states is None:
-            prepared.give_memory(total, wanted)
-        prepared.choose_lengths(total, wanted, clock.varies)
+        prepared.begin(current, known, (frames - 1) * self.substeps, clock.varies, gives=True)
         reactions = []
         for frame in range(1, frames):
             if frame > 1:
                 clock.start(current)
-            if states is not None:
-                current, forces = next(states), None
-            else:
-                lengths, first = prepared.lengths(clock.count, clock.varies), clock.first
-                along = poses(clock) if callable(poses) else tuple(part[first : first + clock.count] for part in poses)
-                current, forces = prepared.frame(current, lengths, first, along, clock.steps)
+            lengths, first = prepared.lengths(clock.count, clock.varies), clock.first
+            along = poses(clock) if callable(poses) else tuple(part[first : first + clock.count] for part in poses)
+            alike = 0 if clock.varies or self.colliders else frames - 1 - frame
+            current, forces = prepared.frame(current, lengths, first, along, clock.steps, alike)
             if forces is not None:
                 reactions.append(mean_force(forces, clock.steps) if clock.varies else forces)
             for name, values in recorded.items():
@@ -308,9 +290,6 @@ class Simulator:
             if progress is not None:
                 progress(frame)
         return self._recorded(recorded, current, reactions, clock.taken)
-
-    def _can_be_chained(self, adapter: Callable | None) -> bool:
-        return isinstance(adapter, nn.Module) and getattr(adapter, "chained", True) and not self.colliders
 
     def _clock(
         self, timing: Adaptive | Replay | None, frames: int, prepared: Prepared, parameters: dict[str, Tensor],
@@ -351,7 +330,7 @@ class Simulator:
         if isinstance(adapter, Sequence):
             adapter = Several(adapter, count)
         lanes = Lanes(solvers, self.buffers)
-        return Prepared(self.numerics, self._ask, lanes, packed, adapter, stride, collect, self._long)
+        return Prepared(self.numerics, self._ask, lanes, packed, adapter, stride, collect, self.gathers)
 
     def _begun(self, state: ParticleState, started: bool) -> ParticleState:
         """The state that is advanced: F_tot is F itself where the law does not yield."""

@@ -11,14 +11,14 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mosa.errors import ConfigError
 from mosa.physics.contact.motion import Motion, Poses, Trajectory, sample_poses
 from mosa.physics.engine.adapter_interface import ANSWER, AdapterOperator, MaterialState
 from mosa.physics.engine.adaptive_steps import StepChooser
 from mosa.physics.engine.budget import room, substep_bytes
-from mosa.physics.engine.chain_schedule import SEGMENT
+from mosa.physics.engine.chain_schedule import SEGMENT, Chains
 from mosa.physics.engine.lanes import Lanes
 from mosa.physics.engine.material_operations import first_advance
 from mosa.physics.engine.numerics import Numerics, State, Steps, flat
@@ -36,7 +36,8 @@ LONGEST_KEPT = 96
 class Prepared:
     """The bodies of one rollout: the parameters of their law, packed, what an adapter answered last, and what advances them.
 
-    ask: (adapter, F, C_affine, packed, collect) -> its answer by name. long: whether segments may be long (CUDA)."""
+    ask: (adapter, F, C_affine, packed, collect) -> its answer by name. gathers: whether a stretch of motion has as many substeps as
+    it can: segments are long, and an adapter that is a torch module is asked inside, in a chain of segments."""
 
     numerics: Numerics
     ask: Callable[..., dict[str, Tensor | None]]
@@ -45,12 +46,15 @@ class Prepared:
     adapter: Callable[[MaterialState], AdapterOperator] | None
     stride: int | None
     collect: Callable[[Any], None] | None
-    long: bool
+    gathers: bool
     held: dict[str, Tensor | None] = None
     most_alone: int = SEGMENT
 
     def __post_init__(self) -> None:
-        self.held = {"parameters": self.packed, **dict.fromkeys(ANSWER)}
+        self.held, self.chains = {"parameters": self.packed, **dict.fromkeys(ANSWER)}, None
+        alone = len(self.lanes.solvers) == 1 and self.stride is not None and not hasattr(self.adapter, "flow")
+        if self.gathers and alone and isinstance(self.adapter, nn.Module):
+            self.chains = Chains(self.lanes, self.adapter, self.ask, self.packed, self.collect)
 
     def first_advance(self, state: State, dt: float) -> State:
         """The advance of F by dt [s] with which a motion begins."""
@@ -75,12 +79,18 @@ class Prepared:
             each = substep_bytes(self.numerics, len(self.packed))
             self.lanes.give(room(self.numerics.device, substeps * each, self.lanes.worlds))
 
-    def choose_lengths(self, substeps: int, wanted: bool, variable: bool) -> None:
-        """How long segments may be that nothing cuts, in a motion of `substeps` substeps."""
+    def begin(self, state: State, poses: tuple[Tensor, ...], substeps: int, variable: bool, gives: bool = False) -> None:
+        """Before a motion of `substeps` substeps: how long stretches may be that nothing cuts. gives: also memory, as above."""
+        weights = () if self.chains is None else self.chains.look()
+        wanted = wants_gradient((*state, *self.held.values(), *poses, *weights))
+        if gives:
+            self.give_memory(substeps, wanted)
         self.most_alone = SEGMENT
-        if self.long and not variable and not wanted:
+        if self.chains is not None:
+            self.chains.begin(state, substeps, self.stride, wanted)
+        elif self.gathers and not variable and not wanted:
             self.most_alone = LONGEST
-        elif self.long and not variable and self.lanes.room:
+        elif self.gathers and not variable and self.lanes.room:
             self.most_alone = max(SEGMENT, min(LONGEST_KEPT, substeps // 8))
 
     def lengths(self, count: int, variable: bool) -> list[int]:
@@ -90,10 +100,13 @@ class Prepared:
         return segments(count, None if self.adapter is None else self.stride, self.most_alone)
 
     def frame(
-        self, state: State, lengths: Sequence[int], first: int, poses: tuple[Tensor, ...], steps: Steps | None
+        self, state: State, lengths: Sequence[int], first: int, poses: tuple[Tensor, ...], steps: Steps | None, alike: int = 0
     ) -> tuple[State, Tensor | None]:
         """(state after the segments of a frame, reactions (substeps, W K, 6) or None). first: number of its first substep; poses:
-        of W worlds with K colliders at its substeps, () where there are none; steps: None for the numerics' dt."""
+        of W worlds with K colliders at its substeps, () where there are none; steps: None for the numerics' dt; alike: frames that
+        follow and are known to have these lengths and no poses."""
+        if self.chains is not None:
+            return self.chains.frame(state, lengths, first, poses, steps, alike)
         forces, done = [], 0
         flow = getattr(self.adapter, "flow", None)
         for length in lengths:
@@ -180,7 +193,7 @@ class Stepper:
             state = prepared.first_advance(state, dt)
         steps = Steps(0.5 * (moment.lag + dt), dt) if variable else None
         along = self._poses(moment, count, dt, poses)
-        prepared.choose_lengths(count, wants_gradient((*state, *prepared.held.values(), *along)), variable)
+        prepared.begin(state, along, count, variable)
         state, forces = prepared.frame(state, prepared.lengths(count, variable), moment.substeps, along, steps)
         if forces is not None:
             forces = mean_force(forces, steps) if variable else forces
