@@ -78,7 +78,7 @@ class Case:
     def together(self, velocity: torch.Tensor, mu: torch.Tensor, together: int | None = None):
         start = ParticleState(self.states.x, self.states.v + velocity[:, None], *self._rest())
         more = {"motions": self.motions, "gravity": self.gravity} if self.more else {}
-        return self.simulator.rollout_worlds(
+        return self.simulator.rollout(
             start, {"mu": mu, "lam": LAM}, self.volume, DENSITY, self.frames + 1, self.adapter, None, together=together, **more
         )
 

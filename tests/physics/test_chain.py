@@ -65,7 +65,7 @@ def rolled(chained, law, device, dtype, state, adapter, *, stride=2, substeps=11
         if not worlds:
             return sim.rollout(start, parameters, volume, 1000.0, frames, **common, collect=collected.append, timing=timing)
         starts = [replace(start, v=(1 - 0.1 * world) * start.v) for world in range(worlds)]
-        return sim.rollout_worlds(ParticleState.stack(starts), parameters, volume, 1000.0, frames, **common, together=worlds)
+        return sim.rollout(ParticleState.stack(starts), parameters, volume, 1000.0, frames, **common, together=worlds)
 
     def once():
         collected = []
