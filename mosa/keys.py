@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from mosa.modules.simulation_settings import SimulationSettings
 from mosa.modules.stages import Stage
+from mosa.physics.engine.law_options import LawOptions
 from mosa.reconstruction.carried import CarriedSettings
 from mosa.reconstruction.geometry import GeometrySettings
 from mosa.reconstruction.informed import InformedSettings
@@ -51,6 +52,7 @@ FIGURES = ("train", "test", "camera", "prior", "prior_eta", "id", "id_prior", "f
 TRAINING: dict[str, Kind] = {
     **{name: SECTION for name in SECTIONS},
     **kinds_of(SimulationSettings, "simulation"),
+    **kinds_of(LawOptions, "prior.options"),
     **kinds_of(Stage, "fit.*"),
     **kinds_of(GeometrySettings, "reconstruction.geometry"),
     **kinds_of(StaticSettings, "reconstruction.static"),
@@ -109,11 +111,6 @@ TRAINING: dict[str, Kind] = {
     "prior.frozen": or_null(NAMES),
     "prior.modulated": or_null(NAMES),
     "prior.options": or_null(SECTION),
-    "prior.options.yield_convention": one_of("paper", "sqrt23"),
-    "prior.options.norm_eps": WEIGHT,
-    "prior.options.rebuild": FLAG,
-    "prior.options.on_inversion": one_of("warn", "ignore", "error"),
-    "prior.options.init_affine": one_of("spin", "zero"),
     "rendering.margin": whole(0),
     "reconstruction.resolution": whole(8, 1024),  # a hull of that many voxels per side has 4 GB
     "reconstruction.splats": or_null(TEXT),

@@ -118,7 +118,7 @@ def learned_modulus(body: Body, directions: Tensor) -> Tensor:
     if isinstance(adapter, HyperelasticAdapter) and adapter.is_on:
         p = material.per_particle()
         return directional_moduli(2 * p["mu"].detach().double() * adapter.stiffness().detach().double(), directions.double())
-    states = material_states(material.law, material.per_particle(), **body.law_options)
+    states = material_states(material.law, material.per_particle(), body.law_options)
     return directional_modulus(states, adapter if adapter is not None and adapter.is_on else None, directions)
 
 

@@ -22,6 +22,7 @@ from mosa.physics.engine.adaptive_steps import StepControl
 from mosa.physics.engine.capture import ATTEMPTS
 from mosa.physics.engine.chain_schedule import SEGMENT, Chains, Plan, chain_length, grouped
 from mosa.physics.engine.clock import Adaptive, Replay
+from mosa.physics.engine.law_options import LawOptions
 from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState
 
@@ -204,7 +205,7 @@ def test_rollouts_with_and_without_gradients_take_turns(device, collects, make_b
     volume = torch.full((len(near.x),), 8e-6, dtype=torch.float64, device=device)
 
     def result(sim, state, cutoff, differentiated):
-        sim.mass_cutoff, collected = cutoff, []
+        sim.options, collected = LawOptions(mass_cutoff=cutoff), []
         state = ParticleState(*(getattr(state, name).to(device) for name in ("x", "v", "C_affine", "F", "F_tot")))
         with torch.set_grad_enabled(differentiated):
             x = sim.rollout(state, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 3, adapter=adapter, stride=2,
@@ -234,7 +235,7 @@ def test_two_rollouts_before_their_backward_passes(device, make_block):
         sim = simulator(chained, substeps=4, frame_dt=1.6e-3, device=device)
         for _ in range(3):
             losses = []
-            for sim.mass_cutoff in (1e-3, 1e-2):
+            for sim.options in (LawOptions(mass_cutoff=1e-3), LawOptions(mass_cutoff=1e-2)):
                 x = sim.rollout(state, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 3, adapter=adapter, stride=1).x
                 losses.append(1e4 * x.square().sum())
             found.append([g.cpu() for loss in losses for g in torch.autograd.grad(loss, weights)])

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from mosa.errors import ConfigError
 from mosa.physics.constitutive.laws import law_named
-from mosa.physics.constitutive.plasticity import yield_factor
+from mosa.physics.constitutive.plasticity import YIELD_CONVENTIONS
 from mosa.physics.constitutive.strain import STRAINS
 from mosa.physics.contact.colliders import Collider, pack_colliders, reach
 from mosa.physics.contact.motion import sample_frame, sample_poses
@@ -38,6 +38,7 @@ from mosa.physics.engine.inputs import (
     polar_rotation,
 )
 from mosa.physics.engine.lanes import Lanes
+from mosa.physics.engine.law_options import AS_USUAL, LawOptions
 from mosa.physics.engine.material_operations import material_state
 from mosa.physics.engine.numerics import Numerics, flat
 from mosa.physics.engine.solver import SegmentSolver
@@ -52,12 +53,8 @@ class Simulator:
     dx: grid spacing [m]; substeps per frame of frame_dt [s]; gravity (3,) [m/s^2]; ground: plane below `up` ((3,), against
     gravity by default), then `planes` in order, then the moving `colliders`; box: (2, 3) [m] corners a particle may not leave,
     None for no limit.
-    mass_cutoff: node mass [kg] above which a node has a velocity (None: 0 in float64, 1e-12 of a particle's in float32).
-    init_affine: `spin` takes the state's C_affine, `zero` replaces it by 0. norm_eps: under the root of yield norms.
-    yield_convention: paper | sqrt23. rebuild: write U S V^T back also where nothing yielded (PAC-NeRF does).
-    on_inversion: warn | ignore | error for det F <= 0 where the law has a value there; it is an error where it has none.
     strain: hencky | biot | green: what adapters answer is a stiffness G in units of 2 mu, of the energy mu E : G : E that is added
-    to 1 + h[0] times the prior's; None: an operator on the prior's stress.
+    to 1 + h[0] times the prior's; None: an operator on the prior's stress. options: how the law is taken.
     Errors: ConfigError naming the argument. Not safe for use by two threads: buffers are shared between rollouts.
     """
 
@@ -76,13 +73,8 @@ class Simulator:
         box: Tensor | None = None,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
-        mass_cutoff: float | None = None,
-        init_affine: str = "spin",
-        norm_eps: float = 0.0,
-        yield_convention: str = "paper",
-        rebuild: bool = False,
-        on_inversion: str = "warn",
         strain: str | None = None,
+        options: LawOptions = AS_USUAL,
     ) -> None:
         self.law = law_named(law)
         for name, value in (("dx", dx), ("frame_dt", frame_dt), ("substeps", substeps)):
@@ -94,14 +86,9 @@ class Simulator:
             raise ConfigError(f"strain: expected a law with a shear modulus mu, found {law!r}: stiffness is in units of 2 mu")
         if dtype not in SCALARS:
             raise ConfigError(f"dtype: expected torch.float32 or torch.float64, found {dtype}")
-        if init_affine not in ("spin", "zero"):
-            raise ConfigError(f"init_affine: expected spin or zero, found {init_affine!r}")
-        if on_inversion not in ("warn", "ignore", "error"):
-            raise ConfigError(f"on_inversion: expected warn, ignore or error, found {on_inversion!r}")
         self.substeps, self.frame_dt, self.dt = int(substeps), float(frame_dt), float(frame_dt) / int(substeps)
         self.dtype, self.device = dtype, torch.device(device)
-        self.init_affine, self.on_inversion, self.mass_cutoff = init_affine, on_inversion, mass_cutoff
-        self.yield_factor = yield_factor(yield_convention)
+        self.options = options
         gravity = torch.as_tensor(gravity, dtype=torch.float64).cpu()
         if up is None:
             up = -gravity / gravity.norm() if gravity.norm() > 0 else torch.tensor([0.0, 1.0, 0.0])
@@ -112,8 +99,8 @@ class Simulator:
         low, high = corners(box)
         self.numerics = Numerics(
             law=self.law, dtype=dtype, device=self.device, dx=float(dx), dt=self.dt, gravity=tuple(gravity.tolist()),
-            planes=values, modes=modes, plane_count=len(all_planes), low=low, high=high, norm_eps=float(norm_eps),
-            rebuild=rebuild, check_J=self.law.needs_positive_J or on_inversion == "error",
+            planes=values, modes=modes, plane_count=len(all_planes), low=low, high=high, norm_eps=float(options.norm_eps),
+            rebuild=options.rebuild, check_J=self.law.needs_positive_J or options.on_inversion == "error",
             colliders=packed_colliders, strain=strain,
         )  # fmt: skip
         self.buffers = Buffers()
@@ -132,8 +119,8 @@ class Simulator:
         one.
         """
         shape = (particles,) if worlds is None else (worlds, particles)
-        like = self.numerics.planes  # of its type and on its device
-        return pack_parameters(self.law, parameters, shape, like, rotation=rotation, yield_factor=self.yield_factor)
+        like, factor = self.numerics.planes, YIELD_CONVENTIONS[self.options.yield_convention]  # of its type and on its device
+        return pack_parameters(self.law, parameters, shape, like, rotation=rotation, yield_factor=factor)
 
     def rollout(
         self,
@@ -198,7 +185,7 @@ class Simulator:
         names = ("x", "v", "F", "F_tot") if self.law.plastic else ("x", "v", "F")
         columns = stepper.apart((torch.stack([getattr(each, name) for each in recorded]) for name in names), 1)
         inverted = int((_determinant(columns[2].detach()) <= 0).sum())
-        if inverted and self.on_inversion == "warn":
+        if inverted and self.options.on_inversion == "warn":
             warnings.warn(f"{inverted} particle states with det F <= 0 in {frames} frames", stacklevel=2)
         (forces,) = stepper.apart([torch.stack(reactions) if reactions else None], 2)
         return Rollout(
@@ -286,7 +273,7 @@ class Simulator:
         density, mean_mass = checked_density(density, volume)
         F = state.F if worlds is None else state.F.flatten(0, 1)
         packed = self.pack(parameters, n, polar_rotation(F) if self.law.reference is not None else None, worlds)
-        cutoff = self.mass_cutoff
+        cutoff = self.options.mass_cutoff
         if cutoff is None:
             cutoff = 0.0 if self.dtype == torch.float64 else 1e-12 * mean_mass
         if worlds is None:
@@ -304,7 +291,7 @@ class Simulator:
 
     def _begun(self, state: ParticleState, started: bool) -> ParticleState:
         """The state that is advanced: F_tot is F itself where the law does not yield."""
-        spins = started or self.init_affine == "spin"
+        spins = started or self.options.init_affine == "spin"
         C_affine = state.C_affine if spins else torch.zeros_like(state.C_affine)
         return replace(state, C_affine=C_affine, F_tot=state.F_tot if self.law.plastic else state.F)
 
