@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from mosa.modules.body import Body
     from mosa.shown_body import ShownBody
 
-APPEARANCES = ("splats", "particles")
-
-
 COLORED = ("harmonics", "normals", "light")
 
 
