@@ -64,11 +64,13 @@ def test_captures_that_fail_are_tried_a_few_times_in_a_row():
     assert Graphs(Counted(), "", attempts=0).attempts == 0 and not graphs.waits("pass")
 
 
-def test_there_are_never_many_more_graphs_than_allowed():
-    graphs = Graphs(Counted(), "")
-    for dt in range(3 * MAX_GRAPHS):
+@pytest.mark.parametrize("most", [MAX_GRAPHS, 5])
+def test_there_are_never_many_more_graphs_than_allowed(most):
+    graphs = Graphs(Counted(), "", most=most)
+    for dt in range(3 * most):
         play(graphs, dt), play(graphs, dt)
-        assert len(graphs) <= MAX_GRAPHS + 1
+        assert len(graphs) <= most + 1 and set(graphs.waiting()) <= {dt}
+    assert len(graphs) > 1
 
 
 def test_a_budget_is_spent_and_comes_back():

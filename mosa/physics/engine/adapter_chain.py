@@ -33,6 +33,9 @@ from mosa.physics.engine.workspace import Workspace
 from mosa.physics.grid.transfer_kernels import NO_EVENT
 from mosa.physics.launching import copies, same_memory, warp_stream
 
+MOST_GRAPHS = 24
+"""Of a chain, whose graphs have memory of their own for an evaluation: two or three for each time step."""
+
 
 class _Evaluation(NamedTuple):
     """leaves: F, C, parameters and weights as the graph's ends, [] without a graph."""
@@ -90,7 +93,7 @@ class Chain:
         self.statistics_seeds: tuple[Tensor, ...] = ()
         self._kind: type | None = None
         failing = f"{type(adapter).__name__} cannot be captured as a CUDA graph and runs uncaptured"
-        self._graphs = Graphs(TorchCapture(), failing, ATTEMPTS if numerics.device.type == "cuda" else 0)
+        self._graphs = Graphs(TorchCapture(), failing, ATTEMPTS if numerics.device.type == "cuda" else 0, MOST_GRAPHS)
         self._held: tuple = ()  # what graphs have by value,
         self._read: Sequence[Tensor] = ()  # and by address
         self.again = "graphs" if graphs else "states"

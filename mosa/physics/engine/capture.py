@@ -92,10 +92,10 @@ class Graphs:
     """The passes of one owner, which belong to its buffers and are dropped with them.
 
     failing: what the warning says, before the last error, when too many captures in a row have failed; attempts: so many, 0 for
-    none at all."""
+    none at all; most: graphs, and passes that wait to become one."""
 
-    def __init__(self, strategy: Strategy, failing: str, attempts: int = ATTEMPTS) -> None:
-        self.strategy, self.failing, self.attempts = strategy, failing, attempts
+    def __init__(self, strategy: Strategy, failing: str, attempts: int = ATTEMPTS, most: int = MAX_GRAPHS) -> None:
+        self.strategy, self.failing, self.attempts, self.most = strategy, failing, attempts, most
         self._replays: dict[Hashable, Body] = {}
         self._warm: dict[Hashable, None] = {}  # in the order in which they ran
 
@@ -109,7 +109,7 @@ class Graphs:
             replay()
             return
         self.strategy.run(body)
-        if len(self._warm) > MAX_GRAPHS:
+        if len(self._warm) > self.most:
             self.forget()
         self._warm[name] = None
 
