@@ -32,6 +32,7 @@ from mosa.modules.hyperelastic import NUMBERS, HyperelasticAdapter
 from mosa.modules.material import Material
 from mosa.physics.contact.colliders import Box, Collider, Sphere
 from mosa.physics.contact.motion import Motion
+from mosa.physics.engine.law_options import LawOptions
 from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState
 
@@ -59,7 +60,7 @@ class Case:
         solids = [Collider(Sphere(3 * DX), "separate", 0.2)] if more else []
         self.simulator = Simulator(
             "corotated", dx=DX, substeps=substeps, frame_dt=STEP, ground=GROUND, dtype=dtype, device=device, colliders=solids,
-            strain="green", up=(0, 1, 0), on_inversion="ignore",
+            strain="green", up=(0, 1, 0), options=LawOptions(on_inversion="ignore"),
         )  # fmt: skip
         state = ParticleState(*(t.to(device) for t in block(particles, DX, dtype)))
         self.states = ParticleState.stack([state] * worlds)
@@ -78,7 +79,7 @@ class Case:
     def together(self, velocity: torch.Tensor, mu: torch.Tensor, together: int | None = None):
         start = ParticleState(self.states.x, self.states.v + velocity[:, None], *self._rest())
         more = {"motions": self.motions, "gravity": self.gravity} if self.more else {}
-        return self.simulator.rollout_worlds(
+        return self.simulator.rollout(
             start, {"mu": mu, "lam": LAM}, self.volume, DENSITY, self.frames + 1, self.adapter, None, together=together, **more
         )
 

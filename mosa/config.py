@@ -26,13 +26,10 @@ from mosa.physics.constitutive.laws import law_named
 from mosa.physics.contact.colliders import colliders_from_config, domain_walls
 from mosa.physics.contact.motion import Motion
 from mosa.physics.contact.planes import Plane
+from mosa.physics.engine.law_options import LawOptions
 from mosa.reconstruction.settings import build_settings
 from mosa.schema import known_keys
 from mosa.types import Ground, Scene
-
-LAW_OPTIONS = ("yield_convention", "norm_eps", "rebuild", "on_inversion", "init_affine")
-"""Arguments of `Simulator` that say how a law is taken."""
-
 
 SIZES = ("particles", "particles_per_cell", "dx")
 """Keys of `simulation` that say how fine the body is: the reconstruction's."""
@@ -108,12 +105,10 @@ def build_simulation(config: Mapping[str, Any], dx: float) -> SimulationSettings
     return known_keys("simulation", SimulationSettings, {k: v for k, v in config.items() if k not in SIZES} | {"dx": dx})
 
 
-def build_prior(config: Mapping[str, Any]) -> tuple[Material, dict[str, Any]]:
-    """The prior's parameters, and the options of its law (`Simulator`). Errors: ConfigError naming the key."""
+def build_prior(config: Mapping[str, Any]) -> tuple[Material, LawOptions]:
+    """The prior's parameters, and how its law is taken. Errors: ConfigError naming the key."""
     keys = dict(config)
-    options = keys.pop("options", None) or {}
-    if unknown := [name for name in options if name not in LAW_OPTIONS]:
-        raise ConfigError(f"prior.options.{unknown[0]}: unknown key; expected one of {', '.join(LAW_OPTIONS)}")
+    options = known_keys("prior.options", LawOptions, keys.pop("options", None) or {})
     keys["frozen"], keys["candidates"] = keys.get("frozen") or (), keys.get("candidates") or ()
     return known_keys("prior", Material, keys), options
 

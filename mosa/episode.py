@@ -19,8 +19,8 @@ from mosa.modules.body import Body, Ready, Start, World
 from mosa.modules.identification import each_law
 from mosa.physics.contact.colliders import reach
 from mosa.physics.contact.motion import Poses, exponential, rotation_matrices, rotation_vector
+from mosa.physics.engine.clock import Moment
 from mosa.physics.engine.numerics import State, flat
-from mosa.physics.engine.stepping import Moment
 from mosa.types import ParticleState
 
 TWISTS, TARGETS = ("velocity", "angular_velocity"), ("position", "rotation")
@@ -116,7 +116,7 @@ class Episode:
     @property
     def substeps(self) -> int | None:
         """Of every step, None where they are chosen."""
-        return None if self._stepper.chooser is not None else self._stepper.count
+        return None if self._stepper.clock.varies else self._stepper.clock.count
 
     @property
     def state(self) -> TwinState:
@@ -178,7 +178,7 @@ class Episode:
             now = moment.state.worlds()
             fresh = ParticleState.stack([self._begin(b, again[b]) if b in again else now[b] for b in range(self.worlds)])
             if moment.substeps:  # F goes before its velocities by one advance
-                parts = self._stepper.prepared.first_advance(flat(fresh), self._stepper.dt)
+                parts = self._stepper.prepared.first_advance(flat(fresh), self._stepper.clock.dt)
                 fresh = ParticleState(*(t.unflatten(0, (self.worlds, -1)) for t in parts))
             state = ParticleState(*(_where(chosen, getattr(fresh, n), getattr(moment.state, n)) for n in State._fields))
             back = [_where(chosen, first, now) for first, now in zip(self._first, self._poses)]
@@ -199,7 +199,7 @@ class Episode:
         """(position, rotation) of all colliders on their own motions, `after` substeps after `moment`, where they are seen."""
         if not self.colliders:
             return torch.zeros(*self._leading(), 0, 3).double(), torch.zeros(*self._leading(), 0, 3, 3).double()
-        found = self._own(moment, 1, self._stepper.dt if dt is None else dt, after)
+        found = self._own(moment, 1, self._stepper.clock.dt if dt is None else dt, after)
         return found.position[0] - self._up(), found.rotation[0]
 
     def _own(self, moment: Moment, count: int, dt: float, after: int = 0) -> Poses:
@@ -253,7 +253,7 @@ class Episode:
     def _speed(self, commands: dict[int, dict], driven: Tensor) -> float:
         """Bound of the colliders' speeds in this step [m/s]. Errors: ConfigError for a collider that is faster than a fixed step
         allows."""
-        most = 0.5 * self._stepper.prepared.numerics.dx / self._stepper.dt if self.substeps is not None else float("inf")
+        most = 0.5 * self._stepper.prepared.numerics.dx / self._stepper.clock.dt if self.substeps is not None else float("inf")
         fastest = 0.0
         for k, collider in enumerate(self.colliders):
             far = reach(collider.shape)

@@ -276,7 +276,7 @@ def law_figures(body: Body) -> dict[str, float]:
         figures["id/stiffness_ratio"] = float(ratio)
         return figures | {f"id/stiffest_{name}": float(value) for name, value in zip("xyz", axis)}
     if "E" in material.physical():
-        states = material_states(material.law, material.per_particle(), **body.law_options)
+        states = material_states(material.law, material.per_particle(), body.law_options)
         try:
             axis, figures["id/stiffness_ratio"] = stiffest_axis(states, adapter)
         except SimulationDiverged:  # a law without a tensile modulus

@@ -12,6 +12,7 @@ from mosa.modules.heterogeneity import HeterogeneitySettings
 from mosa.modules.identification import IdentificationSettings
 from mosa.modules.simulation_settings import SimulationSettings
 from mosa.modules.stages import Stage
+from mosa.physics.engine.law_options import LawOptions
 from mosa.reconstruction.carried import CarriedSettings
 from mosa.reconstruction.dynamic import DynamicSettings
 from mosa.reconstruction.geometry import GeometrySettings
@@ -57,6 +58,7 @@ FIGURES = ("train", "test", "camera", "prior", "prior_eta", "id", "id_prior", "f
 TRAINING: dict[str, Kind] = {
     **{name: SECTION for name in SECTIONS},
     **kinds_of(SimulationSettings, "simulation"),
+    **kinds_of(LawOptions, "prior.options"),
     **kinds_of(Stage, "fit.*"),
     **kinds_of(GeometrySettings, "reconstruction.geometry"),
     **kinds_of(StaticSettings, "reconstruction.static"),
@@ -102,11 +104,6 @@ TRAINING: dict[str, Kind] = {
     "prior.frozen": or_null(NAMES),
     "prior.modulated": or_null(NAMES),
     "prior.options": or_null(SECTION),
-    "prior.options.yield_convention": one_of("paper", "sqrt23"),
-    "prior.options.norm_eps": WEIGHT,
-    "prior.options.rebuild": FLAG,
-    "prior.options.on_inversion": one_of("warn", "ignore", "error"),
-    "prior.options.init_affine": one_of("spin", "zero"),
     "rendering.margin": whole(0),
     "world.walls": or_null(SECTION),
     "world.colliders": or_null(ENTRIES),

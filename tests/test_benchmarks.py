@@ -68,13 +68,13 @@ def test_the_benchmark_of_worlds_checks_them_first(monkeypatch, capsys):
     worlds = importlib.import_module("worlds")
     worlds.check("cpu", particles=64, worlds=2)
     assert "differ by at most 0 cells" in capsys.readouterr().out
-    rollout_worlds = worlds.Simulator.rollout_worlds
+    rollout = worlds.Simulator.rollout
 
     def shifted(*arguments, **more):
-        found = rollout_worlds(*arguments, **more)
+        found = rollout(*arguments, **more)
         return replace(found, x=found.x + 1e-12 * found.x.shape[1])  # by the number of worlds
 
-    monkeypatch.setattr(worlds.Simulator, "rollout_worlds", shifted)
+    monkeypatch.setattr(worlds.Simulator, "rollout", shifted)
     with pytest.raises(SystemExit, match="worlds are not their single rollouts"):
         worlds.check("cpu", particles=64, worlds=2)
 

@@ -17,6 +17,7 @@ from mosa.modules.adapter_protocol import AdapterProtocol
 from mosa.physics.constitutive.elasticity import wave_modulus
 from mosa.physics.contact.colliders import Box, Collider
 from mosa.physics.contact.motion import Motion
+from mosa.physics.engine.law_options import AS_USUAL, LawOptions
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.engine.time_step import required_substeps
 from mosa.types import ParticleState
@@ -54,7 +55,7 @@ def turned_to(direction: Tensor) -> Tensor:
 def press(
     law: str, parameters: Mapping[str, Tensor], direction: Tensor, *, modulus: float, poisson: float, density: float = 1000.0,
     adapter: AdapterProtocol | None = None, stride: int = 8, stiffening: float = 1.85, cells: int = CELLS,
-    law_options: dict | None = None,
+    law_options: LawOptions = AS_USUAL,
 ) -> Pressed:  # fmt: skip
     """Compress a specimen along a material direction (3,), between frictionless plates, without gravity; float64 on the CPU.
 
@@ -80,7 +81,7 @@ def press(
     steady = adapter is None or adapter.steady
     simulator = Simulator(
         law, dx=dx, substeps=substeps if steady else -(-substeps // stride) * stride, frame_dt=duration / FRAMES, gravity=(0, 0, 0),
-        colliders=plates, dtype=torch.float64, strain=None if adapter is None else adapter.strain, **(law_options or {}),
+        colliders=plates, dtype=torch.float64, strain=None if adapter is None else adapter.strain, options=law_options,
     )  # fmt: skip
     F = Q.expand(n, 3, 3).contiguous()
     state = ParticleState(x, (x @ shear).contiguous(), shear.expand(n, 3, 3).contiguous(), F, F)

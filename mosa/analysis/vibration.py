@@ -11,6 +11,7 @@ from mosa.errors import SimulationDiverged
 from mosa.modules.adapter_protocol import AdapterProtocol
 from mosa.modules.material import Material
 from mosa.modules.stiffening import ADAPTER_MARGIN
+from mosa.physics.engine.law_options import AS_USUAL, LawOptions
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.engine.time_step import step_rate
 from mosa.types import ParticleState
@@ -40,7 +41,7 @@ def vibration_growth(
     *,
     density: float,
     stride: int,
-    law_options: dict | None = None,
+    law_options: LawOptions = AS_USUAL,
     periods: int = 10,
     cells: int = 4,
     amplitude: float = 0.02,
@@ -69,7 +70,7 @@ def vibration_growth(
     steady = adapter is None or adapter.steady
     substeps = needed if steady else -(-needed // stride) * stride
     simulator = Simulator(material.law, dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=(0, 0, 0), dtype=torch.float64,
-                          strain=None if adapter is None else adapter.strain, **(law_options or {}))
+                          strain=None if adapter is None else adapter.strain, options=law_options)
     parameters = {name: value.detach().double().cpu() for name, value in material.per_particle().items()}
     held = None if adapter is None else adapter.in_double()
     if held is not None:

@@ -118,7 +118,7 @@ def learned_modulus(body: Body, directions: Tensor) -> Tensor:
         if (stiffness := adapter.stiffness()) is not None:
             mu = material.per_particle()["mu"].detach().double()
             return directional_moduli(2 * mu * stiffness.detach().double(), directions.double())
-    states = material_states(material.law, material.per_particle(), **body.law_options)
+    states = material_states(material.law, material.per_particle(), body.law_options)
     return directional_modulus(states, adapter, directions)
 
 

@@ -25,7 +25,6 @@ class Adapter(nn.Module, AdapterProtocol):
     few_numbers = False
     replaces_law = False
     own_dynamics = False
-    chained = True
     penalties: Mapping[str, Penalty] = PENALTIES
     flow: Callable[[Tensor, float], Tensor] | None = None
 

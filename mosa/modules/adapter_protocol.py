@@ -37,8 +37,6 @@ class AdapterProtocol(Protocol):
     """Whether nothing of the prior is left in the answer: its stage then holds the prior's parameters, which would only drift."""
     own_dynamics: bool
     """Whether it moves the particles itself, without a law and a grid (`simulator`)."""
-    chained: bool
-    """Whether evaluations may be captured into a CUDA graph together with the substeps between them."""
     penalties: Mapping[str, Penalty]
     """Terms of the loss that it brings, by name; their weights are `losses.<name>`."""
     flow: Callable[[Tensor, float], Tensor] | None

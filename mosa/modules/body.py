@@ -24,6 +24,7 @@ from mosa.modules.start import Start, World
 from mosa.physics.contact.colliders import reach
 from mosa.physics.engine.adaptive_steps import StepControl
 from mosa.physics.engine.clock import Adaptive, Replay
+from mosa.physics.engine.law_options import AS_USUAL, LawOptions
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.engine.time_step import required_substeps
 from mosa.rotations import skew
@@ -55,7 +56,7 @@ class Body(nn.Module):
         heterogeneity: HeterogeneityField | None,
         adapter: nn.Module | None,
         settings: SimulationSettings,
-        law_options: dict | None = None,
+        law_options: LawOptions = AS_USUAL,
     ) -> None:
         super().__init__()
         for name, value in (
@@ -63,7 +64,7 @@ class Body(nn.Module):
         ):
             self.register_buffer(name, value.detach().clone())
         self.splats: CarriedSplats | None = None
-        self.density, self.settings, self.law_options = float(density), settings, law_options or {}
+        self.density, self.settings, self.law_options = float(density), settings, law_options
         self.material, self.heterogeneity, self.adapter = material, heterogeneity, adapter
         if heterogeneity is not None:
             heterogeneity.settle(self.rest)
@@ -245,7 +246,7 @@ class Body(nn.Module):
             self._simulator = Simulator(
                 law, dx=self.settings.dx, substeps=substeps, frame_dt=frame_dt, gravity=world.gravity, up=world.up,
                 ground=world.ground, planes=world.planes, colliders=world.colliders, box=world.box,
-                dtype=dtype, device=self.rest.device, strain=strain, **self.law_options,
+                dtype=dtype, device=self.rest.device, strain=strain, options=self.law_options,
             )
             self._simulator_key, self._simulator_world = key, world
         return self._simulator

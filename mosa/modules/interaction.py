@@ -49,7 +49,6 @@ class InteractionNetwork(Adapter):
 
     replaces_law = True
     own_dynamics = True
-    chained = False
 
     def __init__(self, *, hidden: int = 32, nodes: int = 250, neighbours: int = 20, stiffer: float = 1.0) -> None:
         super().__init__()
@@ -146,6 +145,8 @@ class Interactions:
         start_time: float = 0.0,
     ) -> Rollout:  # fmt: skip
         """As `Simulator.rollout`; what concerns a law or a grid is not read. Errors: SimulationDiverged naming the frame."""
+        if state.x.ndim == 3:
+            raise ConfigError("adapter=interaction: expected one body at a time, found many worlds")
         network = self.network
         x, v = state.x[network.nodes], state.v[network.nodes]
         C = state.C_affine
@@ -174,8 +175,6 @@ class Interactions:
 
     def stepper(self, *_, **__) -> None:
         raise ConfigError("adapter=interaction: expected a whole rollout (Twin.simulate); its nodes are not advanced step by step")
-
-    rollout_worlds = stepper
 
     def frame(self, x: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         """(x, v) (M, 3) of the nodes one frame later."""

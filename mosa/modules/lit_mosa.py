@@ -333,7 +333,7 @@ class LitMosa(Restorable, L.LightningModule):
         if stage.learns_adapter and adapter is not None:
             adapter.switch_on(material.reference_modulus(), material.poisson())
             parameters = {k: v.detach() for k, v in material.per_particle(1.0).items()}
-            adapter.prepare(material.law, material_states(material.law, parameters, **self.body.law_options))
+            adapter.prepare(material.law, material_states(material.law, parameters, self.body.law_options))
             if self.weights.get("operator", 0.0) != 0:
                 self.misfit = max(parallel.mean(self.measure_misfit()), 0.1 * MISFIT)
         parallel.synchronise(self.body)  # on a GPU ranks may come to slightly different numbers

@@ -14,6 +14,7 @@ from mosa.physics.constitutive.elasticity import lame, wave_modulus
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.constitutive.plasticity import friction_alpha
 from mosa.physics.engine.adapter_interface import MaterialState
+from mosa.physics.engine.law_options import AS_USUAL, LawOptions
 from mosa.physics.engine.simulator import Simulator
 from mosa.schema import is_number
 
@@ -253,11 +254,13 @@ class Material(nn.Module):
         return self.physical()[self.stiffness].detach()
 
 
-def material_states(law: str, parameters: Mapping[str, Tensor | float], **options) -> Callable[[Tensor], MaterialState]:
+def material_states(
+    law: str, parameters: Mapping[str, Tensor | float], options: LawOptions = AS_USUAL
+) -> Callable[[Tensor], MaterialState]:
     """Function of F (M, 3, 3) float64 to what an adapter reads there (in float64), under `law` with scalar `parameters`.
 
-    parameters: physical values by the law's own names (`Material.per_particle()`); options: of `Simulator`.
+    parameters: physical values by the law's own names (`Material.per_particle()`).
     """
-    simulator = Simulator(law, dx=1.0, substeps=1, frame_dt=1.0, dtype=torch.float64, **options)
+    simulator = Simulator(law, dx=1.0, substeps=1, frame_dt=1.0, dtype=torch.float64, options=options)
     values = {name: torch.as_tensor(value).detach().double().cpu() for name, value in parameters.items()}
     return lambda F: simulator.material_state(F, torch.zeros_like(F), values)

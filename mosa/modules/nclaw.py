@@ -84,7 +84,6 @@ class NeuralLaw(Adapter):
     """
 
     replaces_law = True
-    chained = False
 
     def __init__(self, *, hidden: int = 64, start: str = "prior", plastic: bool = False, plastic_rate: float = 2.0) -> None:
         super().__init__()

@@ -36,12 +36,9 @@ class Ready:
         self, frames: int, colliders: Sequence[Collider] = (), *, collect: Callable | None = None,
         progress: Callable[[int], None] | None = None, observed: Tensor | None = None, gain: float = 0.0,
     ) -> Rollout:  # fmt: skip
-        """As `Body.simulate`, from here on; of a stack, the worlds at once (`Simulator.rollout_worlds`), without `collect`."""
+        """As `Body.simulate`, from here on; of a stack, the worlds at once."""
         simulator, stacked = self.simulator, self.state.x.ndim == 3
-        if stacked:
-            roll = partial(simulator.rollout_worlds, **self.arguments, motions=self.motions(colliders))
-        else:
-            roll = partial(simulator.rollout, **self.arguments, collect=collect, motions=self.motions(colliders))
+        roll = partial(simulator.rollout, **self.arguments, collect=collect, motions=self.motions(colliders))
         lift = self.lift[:, None] if stacked else self.lift
         if observed is None:
             timing = {} if self.timing is None else {"timing": self.timing}
@@ -76,7 +73,7 @@ class Ready:
     @classmethod
     def stack(cls, parts: Sequence[Ready]) -> Ready:
         """B bodies of the same particles and law, each with its own numbers, `answered`, and start, as so many worlds: state
-        (B, N, ...), lift (B, 3), and arguments of `Simulator.rollout_worlds`. Errors: ConfigError where the time steps differ."""
+        (B, N, ...), lift (B, 3), and arguments of `Simulator.rollout`. Errors: ConfigError where the time steps differ."""
         first, n = parts[0], len(parts[0].arguments["volume"])
         counts = sorted({part.simulator.substeps for part in parts})
         if len(counts) > 1 or any(part.timing for part in parts):

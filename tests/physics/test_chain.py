@@ -1,6 +1,8 @@
 """A chain of segments against the same segments one by one: states, gradients and statistics; captured graphs on CUDA."""
 
+from contextlib import ExitStack
 from dataclasses import replace
+from unittest.mock import patch
 
 import pytest
 import torch
@@ -10,11 +12,17 @@ from torch.func import functional_call
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.modules.adapter import StressAdapter
 from mosa.modules.penalties import pool
+from mosa.physics.contact.colliders import Collider, Sphere
+from mosa.physics.contact.motion import Motion
+from mosa.physics.engine import budget
 from mosa.physics.engine import chain_schedule as chains_module
 from mosa.physics.engine import solver as solver_module
 from mosa.physics.engine.adapter_interface import AdapterOperator
+from mosa.physics.engine.adaptive_steps import StepControl
 from mosa.physics.engine.capture import ATTEMPTS
-from mosa.physics.engine.chain_schedule import SEGMENT, Plan, chain_length, grouped
+from mosa.physics.engine.chain_schedule import SEGMENT, Chains, Plan, chain_length, grouped
+from mosa.physics.engine.clock import Adaptive, Replay
+from mosa.physics.engine.law_options import LawOptions
 from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState
 
@@ -32,30 +40,53 @@ def adapter_of(device: str, dtype: torch.dtype, plastic: bool) -> StressAdapter:
     return adapter.to(device)
 
 
+def simulator(chained: bool, law: str = "corotated", **options) -> Simulator:
+    sim = Simulator(law, **{"dx": 0.04, "dtype": torch.float64, **options})
+    sim.gathers = chained
+    return sim
+
+
 def rolled(chained, law, device, dtype, state, adapter, *, stride=2, substeps=11, frames=4, penalised=True, source="tape",
-           **options):
-    """(frames x, F, F_tot, statistics of the evaluations) and gradients of a sum of them, all on the CPU in float64."""
+           worlds=0, timing=None, **options):
+    """(frames x, F, F_tot, statistics of the evaluations, reactions) and gradients of a sum of them, all on the CPU in float64.
+
+    source: of the states in the backward pass, tape | states | graphs; worlds: so many, which move at other speeds."""
     names = ("x", "v", "C_affine", "F", "F_tot")
     state = ParticleState(*(getattr(state, name).to(device=device, dtype=dtype) for name in names))
     mu = torch.full((), E / (2 * (1 + NU)), device=device, dtype=dtype, requires_grad=True)
     v0 = torch.zeros(3, device=device, dtype=dtype, requires_grad=True)
     parameters = {"mu": mu, "lam": 1e4, **({"yield_stress": 300.0} if law == "von_mises" else {})}
-    sim = Simulator(law, dx=0.04, substeps=substeps, frame_dt=4e-4 * substeps, ground=Ground(0.0), dtype=dtype, device=device,
-                    chained=chained, **options)
-    sim._chains.plan = lambda *_: Plan(SEGMENT, kept=source == "tape", graphs=source == "graphs")
+    sim = simulator(chained, law, substeps=substeps, frame_dt=4e-4 * substeps, ground=Ground(0.0), dtype=dtype, device=device,
+                    **options)
     volume = torch.full((len(state.x),), 8e-6, device=device, dtype=dtype)
     weights = [p for p in adapter.parameters() if p.requires_grad]
 
+    def rollout(collected):
+        start, common = replace(state, v=state.v + v0), {"adapter": adapter, "stride": stride}
+        if not worlds:
+            return sim.rollout(start, parameters, volume, 1000.0, frames, **common, collect=collected.append, timing=timing)
+        starts = [replace(start, v=(1 - 0.1 * world) * start.v) for world in range(worlds)]
+        return sim.rollout(ParticleState.stack(starts), parameters, volume, 1000.0, frames, **common, together=worlds)
+
     def once():
         collected = []
-        rollout = sim.rollout(replace(state, v=state.v + v0), parameters, volume, 1000.0, frames, adapter=adapter, stride=stride,
-                              collect=collected.append)
-        over_all = pool(collected)
-        loss = (rollout.x**2).sum() + (rollout.F_tot**2).sum() + (10 * over_all.mean_square + over_all.variance) * penalised
-        gradients = torch.autograd.grad(loss, [mu, v0, *weights], allow_unused=True)
-        values = [rollout.x, rollout.F, rollout.F_tot, over_all.mean, over_all.within, *[g for g in gradients if g is not None]]
+        with ExitStack() as stack:
+            for name in ("KEPT_ON_CPU", "KEPT_SHARE"):
+                stack.enter_context(patch.object(budget, name, getattr(budget, name) if source == "tape" else 0))
+            stack.enter_context(patch.object(Chains, "plan", lambda *_: Plan(SEGMENT, graphs=source == "graphs")))
+            found = rollout(collected)
+            loss, values = (found.x**2).sum() + (found.F_tot**2).sum(), [found.x, found.F, found.F_tot]
+            if collected:
+                over_all = pool(collected)
+                loss = loss + (10 * over_all.mean_square + over_all.variance) * penalised
+                values += [over_all.mean, over_all.within]
+            if found.reactions is not None:
+                loss, values = loss + found.reactions.square().sum(), [*values, found.reactions]
+            gradients = torch.autograd.grad(loss, [mu, v0, *weights], allow_unused=True)
+        values += [g for g in gradients if g is not None]
         return [t.detach().cpu().double() for t in values], len(collected)
 
+    once.chains = sim.buffers.chains
     return once
 
 
@@ -78,6 +109,48 @@ def test_a_chain_is_its_segments(device, law, plastic, penalised, source, make_b
         found, count = once()
         assert count == evaluations
         assert_same(found, expected, 1e-11 if device == "cpu" else 1e-9)
+
+
+BALL = Collider(Sphere(0.05), "separate", 0.3, Motion(position=(0.04, -0.03, 0.04), velocity=(0.0, 2.0, 0.0)))
+KINDS = {
+    "colliders": {"colliders": [BALL]}, "worlds": {"worlds": 3}, "worlds, colliders": {"worlds": 2, "colliders": [BALL]},
+    "replayed": {"timing": Replay([4, 11, 6])}, "replayed, colliders": {"timing": Replay([5, 9, 7], 0.0), "colliders": [BALL]},
+    "adaptive": {"timing": Adaptive(StepControl(maximum=40, minimum=4, multiple=2))},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("source", ["tape", "states"])
+def test_a_chain_knows_colliders_worlds_and_steps_that_vary(device, kind, source, make_block):
+    """On CUDA: eager, then captured, then replayed, a graph for each time step."""
+    adapter = adapter_of(device, torch.float64, False)
+    make = ("corotated", device, torch.float64, make_block(n=4, velocity=(0.3, -1.0, 0.2)), adapter)
+    expected, evaluations = rolled(False, *make, **KINDS[kind])()
+    once = rolled(True, *make, source=source, **KINDS[kind])
+    for _ in range(1 if device == "cpu" else 3):
+        found, count = once()
+        assert count == evaluations and once.chains
+        assert_same(found, expected, 1e-11 if device == "cpu" else 1e-9)
+    if "colliders" in kind:
+        assert float(expected[-len([*adapter.parameters()]) - 3].abs().max()) > 1e-3  # the ball is hit
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_steps_in_chains_are_the_frames_of_a_rollout(device, make_block):
+    adapter, state = adapter_of(device, torch.float64, False), make_block(n=4, velocity=(0.3, -1.0, 0.2))
+    state = ParticleState(*(getattr(state, name).to(device) for name in ("x", "v", "C_affine", "F", "F_tot")))
+    given = {"mu": 8e3, "lam": 1e4}, torch.full((len(state.x),), 8e-6, dtype=torch.float64, device=device), 1000.0
+    sim = simulator(True, substeps=11, frame_dt=4.4e-3, device=device)
+    mu = given[0]["mu"] = torch.tensor(8e3, dtype=torch.float64, device=device, requires_grad=True)
+    weights = [mu, *adapter.parameters()]
+    whole = sim.rollout(state, *given, 4, adapter=adapter, stride=2).x[-1]
+    stepper, moment = sim.stepper(state, *given, adapter, 2)
+    for _ in range(3):
+        moment = stepper.step(moment).moment
+    found, expected = ([x.detach(), *torch.autograd.grad(x.square().sum(), weights)] for x in (moment.state.x, whole))
+    assert sim.buffers.chains
+    assert_same(found, expected, 0.0 if device == "cpu" else 1e-9)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -126,13 +199,13 @@ def test_rollouts_with_and_without_gradients_take_turns(device, collects, make_b
     far = replace(near, v=near.v + torch.tensor([60.0, 40.0, -30.0], dtype=torch.float64) * near.x[:, :1])
     weights = list(adapter.parameters())
     sims = [
-        Simulator("corotated", dx=0.04, substeps=8, frame_dt=3.2e-3, dtype=torch.float64, device=device, chained=chained)
+        simulator(chained, substeps=8, frame_dt=3.2e-3, device=device)
         for chained in (False, True)
     ]
     volume = torch.full((len(near.x),), 8e-6, dtype=torch.float64, device=device)
 
     def result(sim, state, cutoff, differentiated):
-        sim.mass_cutoff, collected = cutoff, []
+        sim.options, collected = LawOptions(mass_cutoff=cutoff), []
         state = ParticleState(*(getattr(state, name).to(device) for name in ("x", "v", "C_affine", "F", "F_tot")))
         with torch.set_grad_enabled(differentiated):
             x = sim.rollout(state, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 3, adapter=adapter, stride=2,
@@ -159,10 +232,10 @@ def test_two_rollouts_before_their_backward_passes(device, make_block):
     volume = torch.full((len(state.x),), 8e-6, dtype=torch.float64, device=device)
     weights, found = list(adapter.parameters()), []
     for chained in (False, True):
-        sim = Simulator("corotated", dx=0.04, substeps=4, frame_dt=1.6e-3, dtype=torch.float64, device=device, chained=chained)
+        sim = simulator(chained, substeps=4, frame_dt=1.6e-3, device=device)
         for _ in range(3):
             losses = []
-            for sim.mass_cutoff in (1e-3, 1e-2):
+            for sim.options in (LawOptions(mass_cutoff=1e-3), LawOptions(mass_cutoff=1e-2)):
                 x = sim.rollout(state, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 3, adapter=adapter, stride=1).x
                 losses.append(1e4 * x.square().sum())
             found.append([g.cpu() for loss in losses for g in torch.autograd.grad(loss, weights)])
@@ -177,6 +250,7 @@ def test_two_rollouts_before_their_backward_passes(device, make_block):
 @pytest.mark.parametrize("pull, foreseen", [(9.8, True), (3000.0, False)])
 def test_frames_in_one_chain_are_the_frames_one_by_one(device, law, plastic, pull, foreseen, make_block, monkeypatch):
     """Without a gradient a chain goes over several frames. A pull that is not foreseen takes the body out of their window."""
+    monkeypatch.setattr(Chains, "plan", lambda *_: Plan(40, several=True))
     if not foreseen:
         for module in (solver_module, chains_module):
             monkeypatch.setattr(module, "fallen", lambda bounds, *_: bounds)
@@ -186,9 +260,7 @@ def test_frames_in_one_chain_are_the_frames_one_by_one(device, law, plastic, pul
     parameters = {"mu": 8e3, "lam": 1e4, **({"yield_stress": 300.0} if law == "von_mises" else {})}
     found = {}
     for chained in (False, True):
-        sim = Simulator(law, dx=0.04, substeps=11, frame_dt=4.4e-3, gravity=(0.0, -pull, 0.0), dtype=torch.float64, device=device,
-                        chained=chained)  # fmt: skip
-        sim._chains.plan = lambda *_: Plan(40, kept=False, several=True)
+        sim = simulator(chained, law, substeps=11, frame_dt=4.4e-3, gravity=(0.0, -pull, 0.0), device=device)
         for _ in range(3):  # on CUDA: eager, captured, replayed
             collected, frames = [], []
             with torch.no_grad():
@@ -204,29 +276,29 @@ def test_frames_in_one_chain_are_the_frames_one_by_one(device, law, plastic, pul
     assert {6, 12} in marks and (({6} in marks) == foreseen)
 
 
-def test_a_body_at_rest_falls_several_frames_in_one_chain(make_block):
+def test_a_body_at_rest_falls_several_frames_in_one_chain(make_block, monkeypatch):
     """Its window foresees what gravity does."""
     adapter, x = adapter_of("cpu", torch.float64, False), make_block(n=4, jitter=0.0).x
     still = torch.eye(3, dtype=torch.float64).expand(len(x), 3, 3).contiguous()
     state = ParticleState(x, torch.zeros_like(x), torch.zeros_like(still), still, still)
-    sim = Simulator("corotated", dx=0.02, substeps=40, frame_dt=1 / 24, dtype=torch.float64, chained=True)
-    sim._chains.plan = lambda *_: Plan(160, kept=False, several=True)
+    sim = simulator(True, dx=0.02, substeps=40, frame_dt=1 / 24)
+    monkeypatch.setattr(Chains, "plan", lambda *_: Plan(160, several=True))
     volume, calls = torch.full((len(state.x),), 8e-6, dtype=torch.float64), []
-    chain_of = sim._chains.chain
-    sim._chains.chain = lambda *args: calls.append(args[-1]) or chain_of(*args)
+    chain_of = Chains.chain
+    monkeypatch.setattr(Chains, "chain", lambda *args: calls.append(args[-1]) or chain_of(*args))
     with torch.no_grad():
         x = sim.rollout(state, {"mu": 8e2, "lam": 1e3}, volume, 1000.0, 5, adapter=adapter, stride=8).x
     assert calls[0] and len(calls) < 4 and x[-1].mean(0)[1] < x[0].mean(0)[1] - 0.12
 
 
-def test_an_error_after_some_frames_comes_where_it_would_one_by_one(make_block):
+def test_an_error_after_some_frames_comes_where_it_would_one_by_one(make_block, monkeypatch):
+    monkeypatch.setattr(Chains, "plan", lambda *_: Plan(60, several=True))
     adapter, state = adapter_of("cpu", torch.float64, False), make_block(n=4, velocity=(0.0, -2.0, 0.0))
     low, volume = state.x.min(0).values, torch.full((len(state.x),), 8e-6, dtype=torch.float64)
     box = torch.stack([low - torch.tensor([1.0, 0.03, 1.0], dtype=torch.float64), low + 2])
     seen = []
     for chained in (False, True):
-        sim = Simulator("corotated", dx=0.04, substeps=10, frame_dt=4e-3, dtype=torch.float64, box=box, chained=chained)
-        sim._chains.plan = lambda *_: Plan(60, kept=False, several=True)
+        sim = simulator(chained, substeps=10, frame_dt=4e-3, box=box)
         frames, collected = [], []
         with torch.no_grad(), pytest.raises(SimulationDiverged, match="outside the box") as error:
             sim.rollout(state, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 9, adapter=adapter, stride=5, progress=frames.append,
@@ -251,7 +323,7 @@ def test_gradients_are_of_the_weights_of_the_forward_pass(make_block):
     state = make_block(n=4, velocity=(0.3, -1.0, 0.2))
     volume, found = torch.full((len(state.x),), 8e-6, dtype=torch.float64), []
     for chained in (False, True):
-        sim = Simulator("corotated", dx=0.04, substeps=6, frame_dt=2.4e-3, dtype=torch.float64, chained=chained)
+        sim = simulator(chained, substeps=6, frame_dt=2.4e-3)
         adapter, mu = adapter_of("cpu", torch.float64, False), torch.tensor(8e3, dtype=torch.float64, requires_grad=True)
 
         def rolled_with(adapter, sim=sim, mu=mu):
@@ -294,7 +366,7 @@ def test_half_an_answer_is_refused(missing, make_block):
 
     state = make_block(n=3)
     for chained in (False, True):
-        sim = Simulator("von_mises", dx=0.04, substeps=4, frame_dt=1.6e-3, dtype=torch.float64, chained=chained)
+        sim = simulator(chained, "von_mises", substeps=4, frame_dt=1.6e-3)
         with pytest.raises(ConfigError, match=f"adapter output {missing}: .*found none"):
             sim.rollout(state, {"mu": 8e3, "lam": 1e4, "yield_stress": 300.0}, torch.full((27,), 8e-6, dtype=torch.float64),
                         1000.0, 2, adapter=Half())  # fmt: skip
@@ -302,7 +374,7 @@ def test_half_an_answer_is_refused(missing, make_block):
 
 def test_weights_that_are_freed_later_get_their_gradient(make_block):
     adapter, state = adapter_of("cpu", torch.float64, False), make_block(n=5)
-    sim = Simulator("corotated", dx=0.04, substeps=8, frame_dt=3.2e-3, ground=Ground(0.0), dtype=torch.float64, chained=True)
+    sim = simulator(True, substeps=8, frame_dt=3.2e-3, ground=Ground(0.0))
     volume = torch.full((len(state.x),), 8e-6, dtype=torch.float64)
 
     def end():
@@ -323,7 +395,7 @@ def test_a_window_that_grows_between_the_passes_does_not_change_the_gradient(mak
     volume = torch.full((len(near.x),), 8e-6, dtype=torch.float64)
     gradients = []
     for disturbed in (False, True):
-        sim = Simulator("corotated", dx=0.04, substeps=8, frame_dt=3.2e-3, dtype=torch.float64, chained=True)
+        sim = simulator(True, substeps=8, frame_dt=3.2e-3)
 
         def end(state, sim=sim):
             x = sim.rollout(state, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 3, adapter=adapter, stride=2).x
@@ -343,7 +415,7 @@ def test_a_window_that_grows_between_the_passes_does_not_change_the_gradient(mak
 def test_buffers_that_could_not_be_made_are_made_later(make_block, monkeypatch):
     """A GPU's memory may run out when the window grows: nothing is launched on what is too small or gone then."""
     adapter, state = adapter_of("cpu", torch.float64, False), make_block(n=4)
-    sim = Simulator("corotated", dx=0.04, substeps=4, frame_dt=1.6e-3, dtype=torch.float64, chained=True)
+    sim = simulator(True, substeps=4, frame_dt=1.6e-3)
 
     def run(stretch):
         volume = torch.full((len(state.x),), 8e-6, dtype=torch.float64)
@@ -369,15 +441,14 @@ def test_buffers_that_could_not_be_made_are_made_later(make_block, monkeypatch):
     assert torch.equal(run(1), expected) and chain.full.capacity == capacity and not len(chain._graphs)
 
 
-def test_a_chain_whose_widest_window_would_be_too_large_is_cut(make_block):
+def test_a_chain_whose_widest_window_would_be_too_large_is_cut(make_block, monkeypatch):
     """A body that bounces back faster than its window foresees, as one segment after the other."""
+    monkeypatch.setattr(Chains, "plan", lambda *_: Plan(192, several=True))
     adapter, state = adapter_of("cpu", torch.float64, False), make_block(n=4, velocity=(0.0, -45.0, 0.0), jitter=0.0)
     state = replace(state, x=0.5 * state.x)
     volume, found = torch.full((len(state.x),), 1e-6, dtype=torch.float64), []
     for chained in (False, True):
-        sim = Simulator("corotated", dx=0.02, substeps=192, frame_dt=192e-4, dtype=torch.float64, chained=chained,
-                        ground=Ground(0.0, "separate"))  # fmt: skip
-        sim._chains.plan = lambda *_: Plan(192, kept=False, several=True)
+        sim = simulator(chained, dx=0.02, substeps=192, frame_dt=192e-4, ground=Ground(0.0, "separate"))
         collected = []
         with torch.no_grad():
             rollout = sim.rollout(state, {"mu": 6e6, "lam": 6e6}, volume, 1000.0, 2, adapter=adapter, stride=16,

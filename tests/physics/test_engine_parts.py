@@ -11,7 +11,7 @@ import mosa.physics
 from mosa.physics.engine.adaptive_steps import StepControl
 from mosa.physics.engine.budget import Budget
 from mosa.physics.engine.capture import ATTEMPTS, MAX_GRAPHS, Graphs, Strategy
-from mosa.physics.engine.clock import Adaptive, Clock, Replay
+from mosa.physics.engine.clock import Adaptive, Clock, Moment, Replay
 from mosa.physics.engine.network_evaluation import from_weights, same_weights
 from mosa.physics.launching import same_memory
 
@@ -64,11 +64,13 @@ def test_captures_that_fail_are_tried_a_few_times_in_a_row():
     assert Graphs(Counted(), "", attempts=0).attempts == 0 and not graphs.waits("pass")
 
 
-def test_there_are_never_many_more_graphs_than_allowed():
-    graphs = Graphs(Counted(), "")
-    for dt in range(3 * MAX_GRAPHS):
+@pytest.mark.parametrize("most", [MAX_GRAPHS, 5])
+def test_there_are_never_many_more_graphs_than_allowed(most):
+    graphs = Graphs(Counted(), "", most=most)
+    for dt in range(3 * most):
         play(graphs, dt), play(graphs, dt)
-        assert len(graphs) <= MAX_GRAPHS + 1
+        assert len(graphs) <= most + 1 and set(graphs.waiting()) <= {dt}
+    assert len(graphs) > 1
 
 
 def test_a_budget_is_spent_and_comes_back():
@@ -82,20 +84,17 @@ def test_a_budget_is_spent_and_comes_back():
 
 def test_velocities_lie_between_the_positions_of_steps_that_vary():
     fixed = Clock(0.1, 5)
-    assert fixed.dt == 0.1 / 5 and not fixed.varies  # before the first frame too
-    fixed.start(None), fixed.start(None)
-    assert (fixed.count, fixed.first, fixed.steps, fixed.taken) == (5, 5, None, [5, 5])
+    assert fixed.frame(Moment(None, 5, 1), None) == (5, 5, 0.1 / 5, None) and not fixed.varies
     counts = [4, 10, 5]
-    clock = Clock(0.1, 5, lambda frame, state: counts[frame - 1], lag=0.0)
-    found = []
+    clock, moment, found = Clock(0.1, 5, lambda frame, *_: counts[frame - 1]), Moment(None), []
     for _ in counts:
-        clock.start(None)
-        found.append((clock.first, *clock.steps))
+        frame = clock.frame(moment, None)
+        found.append((frame.first, *frame.steps))
+        moment = Moment(None, moment.substeps + frame.count, moment.frames + 1, frame.dt)
     expected = [(0, 0.0125, 0.025), (4, 0.0175, 0.01), (14, 0.015, 0.02)]
     assert found == [pytest.approx(e) for e in expected]
-    late = Clock(0.1, 5, lambda frame, state: 4)
-    late.start(None)
-    assert late.steps.kick == late.steps.dt == 0.1 / 4
+    late = Clock(0.1, 5, lambda *_: 4).frame(Moment(None, lag=None), None)
+    assert late.steps.kick == late.steps.dt == late.dt == 0.1 / 4
     assert Adaptive(StepControl()).lag is None and Replay([3]).lag is None
 
 

@@ -8,6 +8,7 @@ import torch
 from mosa.errors import SimulationDiverged
 from mosa.physics.contact.colliders import Collider, Sphere
 from mosa.physics.contact.motion import Motion
+from mosa.physics.engine.law_options import LawOptions
 from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground
 
@@ -17,9 +18,9 @@ COLLIDER = Collider(Sphere(0.06), "separate", 0.3, Motion((0.15, 0.0, 0.1), velo
 
 def run(state, long, *, substeps=70, dt=2e-4, parameters=PARAMETERS, frames=3, **options):
     """(rollout, lengths of the segments that had buffers)."""
-    options = {"ground": Ground(0.0), "dtype": torch.float64, "on_inversion": "ignore", **options}
+    options = {"ground": Ground(0.0), "dtype": torch.float64, "options": LawOptions(on_inversion="ignore"), **options}
     sim = Simulator("corotated", dx=0.04, substeps=substeps, frame_dt=substeps * dt, **options)
-    sim._long = long
+    sim.gathers = long
     volume = torch.full((len(state.x),), 8e-6, dtype=torch.float64)
     return sim.rollout(state, parameters, volume, 1000.0, frames), {work.substeps for work in sim.buffers}
 

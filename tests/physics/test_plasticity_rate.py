@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from mosa.physics.engine.law_options import LawOptions
 from mosa.physics.engine.material_operations import first_advance
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.reference import deviator, hencky_material
@@ -14,7 +15,7 @@ RADIUS = (2 / 3) ** 0.5 * YIELD
 
 
 def mapped(law, F, viscosity, **options):
-    sim = Simulator(law, dx=0.1, substeps=1, frame_dt=DT, dtype=torch.float64, **options)
+    sim = Simulator(law, dx=0.1, substeps=1, frame_dt=DT, dtype=torch.float64, options=LawOptions(**options))
     parameters = {"mu": MU, "kappa": KAPPA, "yield_stress": YIELD, "viscosity": viscosity}
     return first_advance(sim.numerics, F, torch.zeros_like(F), sim.pack(parameters, len(F)))
 

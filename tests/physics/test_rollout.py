@@ -13,6 +13,7 @@ from mosa.errors import ConfigError, SimulationDiverged
 from mosa.physics.constitutive.elasticity import lame
 from mosa.physics.contact.colliders import Collider, Sphere
 from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState
+from mosa.physics.engine.law_options import LawOptions
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.engine.solver import SegmentSolver, grid_window, substep_bytes
 from mosa.physics.engine.workspace import Workspace
@@ -294,7 +295,7 @@ def test_acceleration_within_a_segment_widens_the_window(make_block, monkeypatch
     for stride in (32, 1):
         leaf = state.v.clone().requires_grad_()
         sim = Simulator("corotated", dx=DX, substeps=32, frame_dt=0.0128, gravity=(0, 0, 0), dtype=torch.float64,
-                        on_inversion="ignore")  # fmt: skip
+                        options=LawOptions(on_inversion="ignore"))  # fmt: skip
         n = len(state.x)
         operator = AdapterOperator(torch.zeros(n, 6, 6).double(), torch.zeros(n, 6).double())
         rollout = sim.rollout(replace(state, v=leaf), {"mu": 1.5e6, "lam": 1e6}, volume_of(state), DENSITY, 2,
@@ -338,7 +339,8 @@ def test_a_dropped_simulator_frees_its_buffers_at_once(kind, make_block):
     elif kind == "chained":
         adapter = Answering(zero)
     solids = [Collider(Sphere(0.05))] if kind == "colliders" else []
-    sim = simulator(colliders=solids, chained=kind == "chained")
+    sim = simulator(colliders=solids)
+    sim.gathers = kind == "chained"
     gc.collect()
     gc.disable()
     try:
@@ -371,13 +373,13 @@ def test_a_tape_of_many_more_nodes_than_particles_is_not_kept_beyond_its_room(ma
     state = make_block()
     state = ParticleState(*(t[[0, -1]].contiguous() for t in (state.x, 0 * state.v, state.C_affine, state.F, state.F_tot)))
     state.x[1] += 0.5
-    kept, forward = [], SegmentSolver.advance
+    kept, asked = [], SegmentSolver.has_room
 
-    def spied(self, *args, **more):
+    def spied(self, substeps):
         kept.append(self.budget.room)
-        return forward(self, *args, **more)
+        return asked(self, substeps)
 
-    monkeypatch.setattr(SegmentSolver, "advance", spied)
+    monkeypatch.setattr(SegmentSolver, "has_room", spied)
     gradients = []
     for room in (2**30, 2**20):
         monkeypatch.setattr("mosa.physics.engine.budget.KEPT_ON_CPU", room)
@@ -423,12 +425,12 @@ class TestErrors:
         with pytest.raises(SimulationDiverged, match="substep 0, particle 9: det F <= 0, which law neo_hookean"):
             self.run(state)
         with pytest.raises(SimulationDiverged, match="on_inversion=error"):
-            self.run(state, law="corotated", on_inversion="error")
+            self.run(state, law="corotated", options=LawOptions(on_inversion="error"))
         with pytest.warns(UserWarning, match="det F <= 0"):
             assert self.run(state, law="corotated").inverted >= 1
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            self.run(state, law="corotated", on_inversion="ignore")
+            self.run(state, law="corotated", options=LawOptions(on_inversion="ignore"))
 
     def test_too_large_a_step(self, make_block):
         with pytest.raises(SimulationDiverged, match="use more substeps"):
@@ -449,14 +451,18 @@ class TestErrors:
     @pytest.mark.parametrize(
         "options, match",
         [
-            ({"dtype": torch.float16}, "dtype"), ({"init_affine": "none"}, "init_affine"),
-            ({"on_inversion": "no"}, "on_inversion"),
+            ({"dtype": torch.float16}, "dtype"),
             ({"substeps": 0}, "substeps"), ({"box": torch.ones(2, 3)}, "box"), ({"law": "rubber"}, "law"),
         ],
     )  # fmt: skip
     def test_arguments(self, options, match, make_block):
         with pytest.raises(ConfigError, match=match):
             self.run(make_block(), **options)
+
+    @pytest.mark.parametrize("options", [{"init_affine": "none"}, {"on_inversion": "no"}, {"yield_convention": "other"}])
+    def test_options_of_the_law(self, options):
+        with pytest.raises(ConfigError, match=rf"prior\.options\.{next(iter(options))}: expected"):
+            LawOptions(**options)
 
     def test_shapes(self, make_block):
         state = make_block()
@@ -477,9 +483,9 @@ def test_a_gradient_can_be_taken_twice(kind, make_block):
     state, mu = make_block(), torch.full((), 4e4).double().requires_grad_()
     zero = AdapterOperator(torch.zeros(len(state.x), 6, 6).double(), torch.zeros(len(state.x), 6).double())
     adapter = Answering(zero) if kind == "chain" else None
-    rollout = simulator(chained=kind == "chain").rollout(
-        state, {"mu": mu, "lam": 5e4}, volume_of(state), DENSITY, 3, adapter=adapter, stride=5
-    )
+    sim = simulator()
+    sim.gathers = kind == "chain"
+    rollout = sim.rollout(state, {"mu": mu, "lam": 5e4}, volume_of(state), DENSITY, 3, adapter=adapter, stride=5)
     loss = rollout.x[-1].square().sum()
     first, second = (torch.autograd.grad(loss, mu, retain_graph=True)[0] for _ in range(2))
     assert torch.equal(first, second) and float(first.abs()) > 0

@@ -72,7 +72,7 @@ def batched(starts, law, together, sim=None):
     for own, velocity in zip(moving, push):
         own[0] = replace(own[0], velocity=velocity)
     answers = [AdapterOperator(*operator(b, strength)) for b in range(WORLDS)] if strength is not None else None
-    found = (sim or simulator(law)).rollout_worlds(
+    found = (sim or simulator(law)).rollout(
         replace(states, v=v), {"mu": mu, **others}, torch.full((64,), 8e-6).double(), 1000.0, FRAMES, motions=moving,
         gravity=GRAVITY, adapter=answers and [lambda _, a=a: a for a in answers], stride=None, together=together,
     )  # fmt: skip
@@ -111,8 +111,8 @@ def test_what_is_the_same_in_all_worlds_is_given_once(make_block):
         return AdapterOperator(G.repeat(len(state.w) // 64, 1, 1), torch.zeros(len(state.w), 6).double())
 
     options = {"adapter": adapter, "stride": 4, "motions": motions(0)}
-    both = sim.rollout_worlds(ParticleState.stack(starts), plain, volume, 1000.0, 3, **options)
-    again = sim.rollout_worlds(both.final, plain, volume, 1000.0, 2, started=True, start_time=2 * sim.frame_dt, **options)
+    both = sim.rollout(ParticleState.stack(starts), plain, volume, 1000.0, 3, **options)
+    again = sim.rollout(both.final, plain, volume, 1000.0, 2, started=True, start_time=2 * sim.frame_dt, **options)
     assert both.reactions.shape == (2, SUBSTEPS, 2, 2, 6) and set(asked) == {128}
     for b, start in enumerate(starts):
         own = sim.rollout(start, plain, volume, 1000.0, 4, **options)
@@ -135,7 +135,7 @@ def test_the_world_that_diverges_is_named(together, make_block):
     for change, message in ((0.0, r"^world 2: substep 0, particle 7: .*outside"), (4e3, r"^world 2: particles spread over")):
         states.v[2, 7, 1] = change
         with pytest.raises(SimulationDiverged, match=message):
-            simulator(box=box).rollout_worlds(states, law, torch.full((64,), 8e-6).double(), 1000.0, 3, together=together)
+            simulator(box=box).rollout(states, law, torch.full((64,), 8e-6).double(), 1000.0, 3, together=together)
 
 
 @pytest.mark.parametrize("change, message", [
@@ -151,9 +151,11 @@ def test_errors_say_what_was_expected(change, message, make_block):
     arguments = {"state": ParticleState.stack([make_block(), make_block(seed=1)]), "parameters": {"mu": 4e4, "lam": 5e4},
                  "volume": torch.full((64,), 8e-6).double(), "density": 1000.0, "frames": 2} | change  # fmt: skip
     with pytest.raises(ConfigError, match=message):
-        simulator().rollout_worlds(**arguments)
-    with pytest.raises(ConfigError, match=r"x: expected shape \(worlds, particles, 3\), found \(64, 3\)"):
-        simulator().rollout_worlds(**(arguments | {"state": make_block()}))
+        simulator().rollout(**arguments)
+    with pytest.raises(ConfigError, match=r"x: expected shape \(worlds, particles, 3\), found \(1, 2, 64, 3\)"):
+        simulator().rollout(**(arguments | {"state": ParticleState.stack([arguments["state"]])}))
+    with pytest.raises(ConfigError, match="gravity and together: expected None without worlds"):
+        simulator().rollout(**(arguments | {"state": make_block(), "together": 1}))
 
 
 @pytest.mark.gpu
@@ -169,7 +171,7 @@ def test_on_cuda_each_world_is_its_own_rollout(law, make_block):
     for _ in range(3):  # eager, captured, replayed
         v = states.v.clone().requires_grad_()
         mu = torch.tensor([[4e4 + 4e3 * b] for b in range(WORLDS)], dtype=torch.float64, device="cuda").requires_grad_()
-        found = sim.rollout_worlds(
+        found = sim.rollout(
             replace(states, v=v), {"mu": mu, **others}, torch.full((64,), 8e-6).double().cuda(), 1000.0, FRAMES,
             motions=[motions(b) for b in range(WORLDS)], gravity=GRAVITY, stride=None,
             adapter=answers and [lambda _, a=a: a for a in answers],

@@ -8,6 +8,7 @@ from bodies import DENSITY, LAM, MU, agitated, eyes, lattice, parameters_of, ran
 from torch import Tensor
 
 from mosa.physics.constitutive.laws import LawParameters, register_law
+from mosa.physics.engine.law_options import LawOptions
 from mosa.physics.engine.simulator import Simulator
 from mosa.types import ParticleState
 
@@ -35,7 +36,8 @@ def conservation(law: str, dtype: torch.dtype, *, adapted: bool = True, interval
     state = agitated(n, SPACING, (-0.5 * n * SPACING,) * 3, (0.3, -0.2, 0.1), dtype=dtype, strain=0.01, jitter=0.2)
     volume = uniform_volume(state, SPACING)
     mass = DENSITY * volume
-    sim = Simulator(law, dx=DX, substeps=substeps, frame_dt=substeps * DT, gravity=(0, 0, 0), dtype=dtype, on_inversion="ignore")
+    sim = Simulator(law, dx=DX, substeps=substeps, frame_dt=substeps * DT, gravity=(0, 0, 0), dtype=dtype,
+                    options=LawOptions(on_inversion="ignore"))  # fmt: skip
     adapter = random_adapter(size=0.1, dtype=dtype, plastic=sim.law.plastic) if adapted else None
     speed, arm = state.v.double().norm(dim=1), state.x.double().norm(dim=1)
     scales = float((mass * speed).sum()), float((mass * speed * arm).sum())

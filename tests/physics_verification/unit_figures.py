@@ -14,6 +14,7 @@ from mosa.errors import ConfigError
 from mosa.modules.adapter import StressAdapter
 from mosa.physics import reference
 from mosa.physics.constitutive.laws import law_named
+from mosa.physics.engine.law_options import LawOptions
 from mosa.physics.engine.material_operations import first_advance
 from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState
@@ -120,11 +121,11 @@ def twin(law: str) -> float | None:
 
 PROBES = {"neo_hookean": "probe_neo_hookean", "von_mises": "probe_von_mises_gic", "drucker_prager": "probe_drucker_prager"}
 TRAJECTORIES = {
-    "elastic_torus_sticky": ("neo_hookean", {"ground": Ground(0.0)}, 1e-12),
-    "elastic_cube_slip": ("neo_hookean", {"ground": Ground(0.0, "slip")}, 1e-12),
-    "elastic_cube_spin_freefall": ("neo_hookean", {}, 1e-12),
-    "plasticine_cube_sticky_gic": ("von_mises", {"ground": Ground(0.0)}, 1e-7),
-    "sand_cube_sticky": ("drucker_prager", {"ground": Ground(0.0), "rebuild": True}, 1e-7),
+    "elastic_torus_sticky": ("neo_hookean", Ground(0.0), 1e-12),
+    "elastic_cube_slip": ("neo_hookean", Ground(0.0, "slip"), 1e-12),
+    "elastic_cube_spin_freefall": ("neo_hookean", None, 1e-12),
+    "plasticine_cube_sticky_gic": ("von_mises", Ground(0.0), 1e-7),
+    "sand_cube_sticky": ("drucker_prager", Ground(0.0), 1e-7),
 }
 
 
@@ -139,8 +140,8 @@ def probe(folder: Path, law: str) -> torch.Tensor:
     """Relative errors (216,) of one advance and one stress of the probe's isolated particles."""
     data = oracle(folder, PROBES[law])
     p = {k: data[k] for k in law_named(law).parameters}
-    sim = Simulator(law, dx=0.04, substeps=1, frame_dt=float(data["dt"]), gravity=(0, 0, 0), dtype=torch.float64, norm_eps=1e-8,
-                    rebuild=law == "drucker_prager", on_inversion="ignore")  # fmt: skip
+    sim = Simulator(law, dx=0.04, substeps=1, frame_dt=float(data["dt"]), gravity=(0, 0, 0), dtype=torch.float64,
+                    options=LawOptions(norm_eps=1e-8, rebuild=law == "drucker_prager", on_inversion="ignore"))  # fmt: skip
     C = data["C_in"].contiguous()
     F = first_advance(sim.numerics, data["F_in"].contiguous(), C, sim.pack(p, len(C)))
     tau = stress(law, F, C, parameters=p)
@@ -149,12 +150,13 @@ def probe(folder: Path, law: str) -> torch.Tensor:
 
 def trajectory(folder: Path, name: str) -> float:
     """Largest distance [m] to a trajectory of the oracle over 8 frames (800 substeps), float64."""
-    law, options, _ = TRAJECTORIES[name]
+    law, ground, _ = TRAJECTORIES[name]
     data = oracle(folder, name)
     p, n, dx = {k: data[k] for k in law_named(law).parameters}, data["x"].shape[1], float(data["dx"])
     sim = Simulator(law, dx=dx, frame_dt=1 / 24, substeps=100, gravity=data.get("gravity", torch.tensor([0.0, -9.8, 0.0])),
-                    up=(0.0, 1.0, 0.0), dtype=torch.float64, mass_cutoff=1e-8 * dx**3, init_affine="zero",
-                    norm_eps=0.0 if law == "neo_hookean" else 1e-8, on_inversion="ignore", **options)  # fmt: skip
+                    up=(0.0, 1.0, 0.0), dtype=torch.float64, ground=ground, options=LawOptions(
+                        mass_cutoff=1e-8 * dx**3, init_affine="zero", norm_eps=0.0 if law == "neo_hookean" else 1e-8,
+                        on_inversion="ignore", rebuild=law == "drucker_prager"))  # fmt: skip
     F = eyes(n)
     start = ParticleState(data["x0"].contiguous(), data["v0"].contiguous(), torch.zeros(n, 3, 3).double(), F, F)
     with torch.no_grad():

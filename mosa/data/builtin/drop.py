@@ -61,7 +61,7 @@ def simulate(
     )
     simulator = Simulator(
         material.law, dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=GRAVITY, ground=Ground(0.0), up=(0.0, 1.0, 0.0),
-        **material.options,
+        options=material.options,
     )
     velocity = np.array([0.0, -drop.speed, 0.0])
     n = len(particles)

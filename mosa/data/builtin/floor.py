@@ -59,7 +59,7 @@ def floor_rollout(body, scene: Scene, world) -> Tensor:
         planes=world.planes,
         colliders=world.colliders,
         device=device,
-        **hidden.options,
+        options=hidden.options,
     )
     n, gravity, up = len(rest), world.gravity.float().cpu(), world.up.float().cpu()
     lift = body.contact().detach().float().cpu() * up

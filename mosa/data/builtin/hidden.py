@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
 from mosa.physics.constitutive.elasticity import lame
+from mosa.physics.engine.law_options import LawOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,9 +27,8 @@ class Hidden:
     density: float = 1000.0
 
     @property
-    def options(self) -> dict[str, Any]:
-        """Of `Simulator`."""
-        return {}
+    def options(self) -> LawOptions:
+        return LawOptions()
 
     def viscosity(self) -> float:
         """Viscosity that bounds the time step [Pa s]."""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from mosa.physics.constitutive.elasticity import wave_modulus
 from mosa.physics.constitutive.laws import law_named
+from mosa.physics.engine.law_options import LawOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,9 +24,8 @@ class PublishedMaterial:
     density: float = 1000.0
 
     @property
-    def options(self) -> dict[str, Any]:
-        """Of `Simulator`."""
-        return {"yield_convention": self.convention}
+    def options(self) -> LawOptions:
+        return LawOptions(yield_convention=self.convention)
 
     @property
     def known(self) -> dict[str, float]:

@@ -14,7 +14,6 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from mosa.errors import ConfigError
 from mosa.physics.constitutive.elasticity import stvk
 from mosa.physics.constitutive.energies import stvk_energy
 from mosa.physics.constitutive.kinematics import contract
@@ -36,13 +35,6 @@ def friction_alpha(angle: Tensor) -> Tensor:
     """
     s = torch.sin(torch.deg2rad(angle))
     return (2.0 / 3.0) ** 0.5 * 2 * s / (3 - s)
-
-
-def yield_factor(convention: str) -> float:
-    """Factor on yield_stress of a convention. Errors: ConfigError naming the known ones."""
-    if convention not in YIELD_CONVENTIONS:
-        raise ConfigError(f"yield_convention: expected one of {', '.join(YIELD_CONVENTIONS)}, found {convention!r}")
-    return YIELD_CONVENTIONS[convention]
 
 
 @wp.func

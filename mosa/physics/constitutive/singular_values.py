@@ -9,7 +9,7 @@ import warp as wp
 from torch import Tensor
 
 from mosa.physics.constitutive.kinematics import svd
-from mosa.physics.launching import launch
+from mosa.physics.launching import launch, warp_stream
 
 _MATRIX = {torch.float32: wp.mat33f, torch.float64: wp.mat33d}
 _VECTOR = {torch.float32: wp.vec3f, torch.float64: wp.vec3d}
@@ -40,9 +40,7 @@ def singular_value_decomposition(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     U, V, S = torch.empty_like(flat), torch.empty_like(flat), flat.new_empty(len(flat), 3)
     if len(flat):
         matrix, vector = _MATRIX[F.dtype], _VECTOR[F.dtype]
-        stream = wp.ScopedDevice("cpu") if F.device.type == "cpu" else wp.ScopedStream(
-            wp.stream_from_torch(torch.cuda.current_stream(F.device)))
-        with stream:
+        with warp_stream(F.device):
             arrays = [wp.from_torch(t, dtype=vector if t is S else matrix) for t in (flat, U, S, V)]
             launch(_KERNELS[F.dtype], len(flat), arrays, arrays[0].device)
     return U.reshape(F.shape), S.reshape(F.shape[:-1]), V.reshape(F.shape)

@@ -217,44 +217,26 @@ class Trajectory:
 
 
 def sample_frame(
-    motions: Sequence[Motion | Trajectory], frame: int, frames: int, counts: Sequence[int], frame_dt: float, start: float,
+    motions: Sequence[Motion | Trajectory], frame: int, frames: int, first: int, count: int, frame_dt: float, start: float,
     dtype: torch.dtype, device: torch.device, replayed: bool,
 ) -> Poses:  # fmt: skip
     """Poses at the substeps of frame interval `frame` (from 0) of `frames`, where every interval has its own count.
 
-    counts: substeps of the intervals up to this one; replayed: whether they were given beforehand. A trajectory fits given
-    counts alone. Errors: ConfigError.
+    first, count: of its substeps; replayed: whether counts were given beforehand. A trajectory fits given counts alone.
+    Errors: ConfigError.
     """
-    count, done = counts[frame], sum(counts[:frame])
-    dt, parts = frame_dt / count, []
+    dt, sampled = frame_dt / count, []
     for motion in motions:
         if isinstance(motion, Motion):
-            parts.append(motion.timed(frames, frame_dt))
-            continue
-        if not replayed or start != 0:
+            sampled.append(motion.timed(frames, frame_dt).sample(1, count, dt, start + frame * frame_dt))
+        elif replayed and start == 0:
+            sampled.append(motion.sample(1, count, dt, first=first))
+        else:
             raise ConfigError(
                 "trajectory: it gives poses substep by substep: expected given `counts` and start_time 0, found adaptive substeps "
                 f"or start_time {start}; use a Motion with times or waypoints, or replay with counts"
             )
-        if len(motion.position) < done + count:
-            raise ConfigError(f"trajectory: expected poses of at least {done + count} substeps, found {len(motion.position)}")
-        cut = slice(done, done + count)
-        piece = Trajectory(motion.position[cut], motion.rotation[cut], motion.velocity[cut], motion.angular_velocity[cut])
-        # seen from the frame's own start
-        parts.append(_Shifted(piece, start + frame * frame_dt))
-    return sample_poses(parts, 1, count, dt, start + frame * frame_dt, dtype, device)
-
-
-class _Shifted(NamedTuple):
-    """A trajectory whose first substep is at time `origin` [s]."""
-
-    trajectory: Trajectory
-    origin: float
-
-    def sample(
-        self, frames: int, substeps: int, dt: float, start: float = 0.0, first: int = 0
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        return self.trajectory.sample(frames, substeps, dt, start - self.origin, first)
+    return _poses(sampled, dtype, device)
 
 
 def sample_poses(
@@ -266,7 +248,10 @@ def sample_poses(
 
     Errors: ConfigError naming a collider whose motion is not finite (a NaN would silently touch nothing).
     """
-    sampled = [motion.sample(frames, substeps, dt, start, first) for motion in motions]
+    return _poses([motion.sample(frames, substeps, dt, start, first) for motion in motions], dtype, device)
+
+
+def _poses(sampled: Sequence[Sequence[Tensor]], dtype: torch.dtype, device: torch.device) -> Poses:
     for i, parts in enumerate(sampled):
         for name, part in zip(Poses._fields, parts):
             if not bool(torch.isfinite(part.detach()).all()):

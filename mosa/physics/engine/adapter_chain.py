@@ -1,12 +1,14 @@
-"""Segments with an adapter's evaluations between them, as one torch operation and, on CUDA, one captured graph per pass.
+"""Segments with an adapter's evaluations between them, as one stretch of motion and, on CUDA, one captured graph per pass.
 
 An adapter of the state is asked every few substeps. Done one by one, each answer costs some sixty launches and two transfers to
-the host, which take longer than the arithmetic of 100 000 particles. A chain of K segments looks at the host once. Its backward
-pass goes back through the states of all substeps: the adapter is asked again at the start of a segment, this time with a graph,
-and what the segment's adjoint leaves on its answer goes through that graph to the state and to the adapter's weights. Between the
-passes all states are kept where there is memory for them (`kept`), else only the chain's start, from which they are made again.
-That asks the adapter too: where there is memory for the graphs of all the chain's evaluations (`graphs`), they are kept beside the
-states and nothing is asked a third time.
+the host, which on CUDA take longer than the arithmetic of 100 000 particles. A chain of K segments looks at the host once. On a
+CPU there is nothing to save: the adapter is asked between the segments, and autograd adds the gradients up, in another order.
+
+The backward pass goes back through the states of all substeps: the adapter is asked again at the start of a segment, this time
+with a graph, and what the segment's adjoint leaves on its answer goes through that graph to the state and to the adapter's
+weights. Between the passes all states are kept where there is memory for them, else only the chain's start, from which they are
+made again. That asks the adapter too: where there is memory for the graphs of all the chain's evaluations (`graphs`), they are
+kept beside the states and nothing is asked a third time.
 """
 
 from __future__ import annotations
@@ -22,16 +24,17 @@ from torch.func import functional_call
 
 from mosa.physics.engine.adapter_interface import ANSWER
 from mosa.physics.engine.capture import ATTEMPTS, Graphs, TorchCapture
+from mosa.physics.engine.lanes import Lanes
 from mosa.physics.engine.network_evaluation import at_hand, same_weights
-from mosa.physics.engine.numerics import Numerics, State
-from mosa.physics.engine.operation import Kept, Stretch, advance
+from mosa.physics.engine.numerics import Numerics, State, Steps
+from mosa.physics.engine.operation import Stretch, advance
 from mosa.physics.engine.solver import WIDENED, SegmentSolver
 from mosa.physics.engine.workspace import Workspace
 from mosa.physics.grid.transfer_kernels import NO_EVENT
 from mosa.physics.launching import copies, same_memory, warp_stream
 
-MARGIN = 4
-"""Nodes of a window beyond what the speeds at the start ask for."""
+MOST_GRAPHS = 24
+"""Of a chain, whose graphs have memory of their own for an evaluation: two or three for each time step."""
 
 
 class _Evaluation(NamedTuple):
@@ -62,7 +65,7 @@ def learned_of(adapter: nn.Module) -> Learned:
 
 
 class Chain:
-    """Buffers and captured graphs of K segments of `lengths` substeps for N particles and one adapter.
+    """Buffers and captured graphs of K segments of `lengths` substeps for N particles of `worlds` worlds and one adapter.
 
     marks: numbers of segments after which the state is wanted too, besides the last; only without a gradient.
     ask: (adapter, F, C_affine, packed parameters, into=None) -> its answer by name (`ANSWER`, None where it has none),
@@ -73,93 +76,40 @@ class Chain:
     """
 
     def __init__(
-        self, numerics: Numerics, adapter: nn.Module, ask: Callable[..., dict[str, Tensor | None]], particles: int,
-        lengths: Sequence[int], *, marks: Sequence[int] = (), plastic_adapted: bool, collects: bool, graphs: bool = False,
+        self, numerics: Numerics, adapter: nn.Module, ask: Callable[..., dict[str, Tensor | None]], particles: int, worlds: int,
+        lengths: Sequence[int], *, learned: Learned, marks: Sequence[int], plastic_adapted: bool, collects: bool, graphs: bool,
     ) -> None:  # fmt: skip
         self.numerics, self.adapter, self.ask, self.lengths, self.collects = numerics, adapter, ask, tuple(lengths), collects
         self.marks, self.marked = frozenset(marks), []
         self.substeps = sum(lengths)
-        self.learned = learned_of(adapter)
-        self._shape = {"particles": particles, "substeps": self.substeps, "adapted": True, "plastic_adapted": plastic_adapted}
+        self.learned = learned
+        self._shape = {
+            "particles": particles, "substeps": self.substeps, "adapted": True, "plastic_adapted": plastic_adapted,
+            "pointed": True, "worlds": worlds,
+        }  # fmt: skip
         self.light: Workspace | None = None
         self.full: Workspace | None = None
         self.statistics: dict[bool, tuple[Tensor, ...]] = {}  # in light and in full buffers: each graph has its own
         self.statistics_seeds: tuple[Tensor, ...] = ()
         self._kind: type | None = None
         failing = f"{type(adapter).__name__} cannot be captured as a CUDA graph and runs uncaptured"
-        self._graphs = Graphs(TorchCapture(), failing, ATTEMPTS if numerics.device.type == "cuda" else 0)
+        self._graphs = Graphs(TorchCapture(), failing, ATTEMPTS if numerics.device.type == "cuda" else 0, MOST_GRAPHS)
         self._held: tuple = ()  # what graphs have by value,
         self._read: Sequence[Tensor] = ()  # and by address
-        self._passes: dict[tuple, Callable[[Chain], None]] = {}  # no methods: see `Simulator`
         self.again = "graphs" if graphs else "states"
-        for full in (False, True):
-            self._passes["forward", full] = partial(Chain._forward, full=full)
-        for source in ("tape", self.again):
-            for penalised in (False, True):
-                self._passes["adjoint", source, penalised] = partial(Chain._adjoint, source=source, penalised=penalised)
 
-    @torch.no_grad()
-    def advance(
-        self, solver: SegmentSolver, learned: Learned, state: State, packed: Tensor, first: int, kept: bool = False,
-        full: bool = False,
-    ) -> tuple[list[State], tuple[Tensor, ...], tuple[tuple, tuple], list[Tensor]]:  # fmt: skip
-        """(states at the marks and after the chain, statistics (K, ...) each, grid window used, what `adjoint` takes as `tape`).
-
-        learned: of the adapter as it is now; kept: leave all substeps on the tape, else nothing; full: in the buffers of the
-        backward pass, which kept needs and any rollout with one has anyway. Errors: as `SegmentSolver.advance`; LeftWindow of
-        chains that can be cut, with marks or of more than `WIDENED` substeps in several segments."""
-        dt, total = self.numerics.dt, self.substeps
-
-        def run(window: tuple) -> Workspace:
-            work = self._full() if full else self._light()
-            self._load(work, window, solver, learned, state, packed)
-            self._capture()
-            self._play(("forward", full))
-            return work
-
-        # shorter chains need less than the widest window, which is larger than any may be
-        cut = bool(self.marks) or (total > WIDENED and len(self.lengths) > 1)
-        margins = (MARGIN,) if cut else (MARGIN, 3 + total // 2)
-        work, final, window = solver.within(run, state, total * dt, margins, True, first, dt)
-        states = [*(State.whole(copies(state)) for state in self.marked), final]
-        return states, tuple(copies(self.statistics[full])), window, work.tape() if kept else []
-
-    def adjoint(
-        self, solver: SegmentSolver, learned: Learned, state: State, packed: Tensor, window: tuple,
-        seeds: Sequence[Tensor | None], tape: Sequence[Tensor],
-    ) -> tuple[list[Tensor], Tensor, list[Tensor]]:  # fmt: skip
-        """Gradients of (state, parameters, weights). learned: with the names and weights of `advance`; seeds: adjoints of what it
-        returned: state, then statistics."""
-        work = self._full()
-        if not self.statistics_seeds:
-            self.statistics_seeds = tuple(torch.zeros_like(t) for t in self.statistics[True])
-        self._load(work, window, solver, learned, state, packed)  # another rollout may have gone forward since
-        if tape:
-            work.rewind(tape)
-        slots, slot = work.adjoint_slots(), self.substeps % 2
-        states = len(slots)
-        for target, seed in zip([*(t[slot] for t in slots), *self.statistics_seeds], seeds, strict=True):
-            target.zero_() if seed is None else target.copy_(seed)
-        penalised = any(seed is not None for seed in seeds[states:])
-        self._play(("adjoint", "tape" if tape else self.again, penalised))
-        found = copies([*(t[0] for t in slots), work.adj_held["parameters"], *self.adj_weights])
-        return found[:states], found[states], found[states + 1 :]
+    def workspace(self, full: bool) -> Workspace:
+        """full: of the backward pass, which are made when they are first needed."""
+        if not full:
+            self.light = self.light or Workspace(self.numerics, **self._shape, with_adjoint=False)
+        elif self.full is None:
+            self.full = Workspace(self.numerics, **self._shape, with_adjoint=True)
+            self.adj_weights = [torch.zeros_like(w) for w in self.learned.weights]
+        return self.full if full else self.light
 
     def named(self, statistics: Sequence[Tensor]) -> list:
         """One named tuple per evaluation, of tensors (K, ...)."""
         return [self._kind(*parts) for parts in zip(*statistics, strict=True)] if self._kind is not None else []
-
-    def _light(self) -> Workspace:
-        if self.light is None:
-            self.light = Workspace(self.numerics, **self._shape, with_adjoint=False, pointed=True)
-        return self.light
-
-    def _full(self) -> Workspace:
-        """The buffers of the backward pass, made when they are first needed."""
-        if self.full is None:
-            self.full = Workspace(self.numerics, **self._shape, with_adjoint=True, pointed=True)
-            self.adj_weights = [torch.zeros_like(w) for w in self.learned.weights]
-        return self.full
 
     def _ask(
         self, F: Tensor, C: Tensor, packed: Tensor, collects: bool, weights: Sequence[Tensor] | None = None,
@@ -198,7 +148,7 @@ class Chain:
 
     @same_weights()
     def _forward(self, full: bool) -> None:
-        work, collected, marked = self._full() if full else self._light(), [], []
+        work, collected, marked = self.workspace(full), [], []
         for count, evaluation in enumerate(self._segments(work, partial(self._answer, work, self.collects)), 1):
             collected.append(evaluation.statistics)
             if count in self.marks:
@@ -248,81 +198,97 @@ class Chain:
             if sums:
                 torch._foreach_add_(*zip(*sums))
 
-    def _load(
-        self, work: Workspace, window: tuple, solver: SegmentSolver, learned: Learned, state: State,
-        packed: Tensor,
-    ) -> None:  # fmt: skip
-        """Place the chain's start in `work`. Forget captured graphs where what they have by value or address is another one."""
-        work.set_window(*window)
+    def follow(self, work: Workspace, learned: Learned) -> None:
+        """Before passes in `work`, which is loaded. Forget captured graphs where what they have by value or address is another one.
+
+        learned: of the adapter as it is now."""
         for each in (self.light, self.full):
-            if each is not None:  # this rollout uses one, the other may have had the cutoff of an earlier one
-                each.cutoff = solver.cutoff
-        work.load(state, {"parameters": packed}, solver.volume, solver.mass, solver.cutoff)
+            if each is not None:  # this pass uses one, the other may have had those of an earlier one
+                each.cutoff, each.steps = work.cutoff, work.steps
         self.learned = learned
         # not their sizes: buffers may come back to an earlier one
         buffers = tuple(each.allocations if each is not None else 0 for each in (self.light, self.full))
-        held, read = (buffers, solver.cutoff), (*learned.tensors, *learned.weights)
+        held, read = (buffers, work.cutoff), (*learned.tensors, *learned.weights)
         if held != self._held or not same_memory(self._read, read):
             self._held, self._read, self.marked = held, [t.detach() for t in read], []  # aliases, which belong to no graph
             self._graphs.drop()
 
-    def _play(self, name: tuple) -> None:
-        self._graphs.play(name, partial(self._passes[name], self))
+    def play(self, steps: Steps, name: str, *arguments) -> None:
+        """One of the passes, whose graphs have the times of their substeps by value."""
+        self._graphs.play((steps, name, *arguments), self._pass(name, arguments))
 
-    def _capture(self) -> None:
-        """Capture every pass that has run once. Here for both: the backward pass runs in a thread of autograd's own."""
-        for name in filter(self._graphs.waits, self._passes):
-            if not self._graphs.capture(name, partial(self._passes[name], self)):
+    def capture(self, steps: Steps) -> None:
+        """Capture every pass that has run once. Before the forward pass for both: the backward pass runs in a thread of autograd's
+        own."""
+        for key in self._graphs.waiting():
+            if key[0] == steps and not self._graphs.capture(key, self._pass(key[1], key[2:])):
                 torch.cuda.synchronize()
                 return
+
+    def _pass(self, name: str, arguments: Sequence) -> Callable[[], None]:
+        return partial({"forward": self._forward, "adjoint": self._adjoint}[name], *arguments)
 
 
 @dataclass
 class ChainOfSegments(Stretch):
-    """Segments with an adapter's evaluations between them. others: packed parameters, the adapter's weights. It leaves the
-    statistics of each evaluation.
+    """Segments with an adapter's evaluations between them. What acts: packed parameters, the adapter's weights. Its statistics are
+    those of each evaluation, (K, ...).
 
-    learned: of the adapter as it is now; first: number of the first substep, for messages; kept: keep the states of all substeps
-    for the backward pass."""
+    learned: of the adapter as it is now. marked: afterwards, the states at the chain's marks."""
 
     chain: Chain
-    solver: SegmentSolver
     learned: Learned
-    first: int
-    kept: bool
+
+    margin = 4
+    foresees = True
 
     @property
-    def plastic(self) -> bool:
-        return self.solver.numerics.law.plastic
+    def substeps(self) -> int:
+        return self.chain.substeps
 
-    def forward(self, state: State, others: Sequence[Tensor], differentiated: bool) -> tuple[State, Sequence[Tensor], Kept]:
-        packed, kept = others[0].detach(), differentiated and self.kept
-        (final,), statistics, window, tape = self.chain.advance(
-            self.solver, self.learned, state, packed, self.first, kept, full=differentiated
-        )
-        return final, statistics, Kept(window, tape)
+    @property
+    def cut(self) -> bool:
+        # shorter chains need less than the widest window, which is larger than any may be
+        return bool(self.chain.marks) or (self.substeps > WIDENED and len(self.chain.lengths) > 1)
 
-    def backward(
-        self, state: State, others: Sequence[Tensor], kept: Kept, seeds: Sequence[Tensor | None],
-        other_seeds: Sequence[Tensor | None],
-    ) -> tuple[list[Tensor], list[Tensor]]:  # fmt: skip
-        packed, *weights = others
-        learned = Learned(self.learned.names, tuple(weights), tensors_of(self.chain.adapter))
-        found, adj_packed, adj_weights = self.chain.adjoint(
-            self.solver, learned, state, packed, kept.windows, (*seeds, *other_seeds), kept.take()
-        )
-        return found, [adj_packed, *adj_weights]
+    def full(self, differentiated: bool, kept: bool) -> bool:
+        return differentiated  # a rollout with a backward pass has these buffers anyway
+
+    def buffers(self, solver: SegmentSolver, acting: Sequence[Tensor], full: bool) -> tuple[Workspace, dict]:
+        return self.chain.workspace(full), {"parameters": acting[0].detach()}
+
+    def advance(self, work: Workspace, acting: Sequence[Tensor]) -> None:
+        self.chain.follow(work, self.learned)
+        self.chain.capture(work.steps)
+        self.chain.play(work.steps, "forward", work.with_adjoint)
+
+    def statistics(self, work: Workspace) -> Sequence[Tensor]:
+        self.marked = [State.whole(copies(state)) for state in self.chain.marked]
+        return self.chain.statistics[work.with_adjoint]
+
+    def statistics_seeds(self) -> Sequence[Tensor]:
+        chain = self.chain
+        if not chain.statistics_seeds:
+            chain.statistics_seeds = tuple(torch.zeros_like(t) for t in chain.statistics[True])
+        return chain.statistics_seeds
+
+    def adjoint(self, work: Workspace, acting: Sequence[Tensor], again: bool, penalised: bool) -> None:
+        weights, tensors = tuple(acting[1:]), tensors_of(self.chain.adapter)
+        self.chain.follow(work, Learned(self.learned.names, weights, tensors))  # another rollout may have gone forward since
+        self.chain.play(work.steps, "adjoint", self.chain.again if again else "tape", penalised)
+
+    def adjoint_of(self, work: Workspace, acting: Sequence[Tensor]) -> list[Tensor | None]:
+        return [work.adj_held["parameters"], *self.chain.adj_weights]
 
 
 def advance_chain(
-    chain: Chain, solver: SegmentSolver, learned: Learned, state: State, packed: Tensor, first: int, kept: bool = False
-) -> tuple[list[State], list]:
-    """([the states at the chain's marks and after it], statistics of each evaluation), differentiable in state, parameters and the
-    adapter's weights, where there are no marks. Arguments: as `ChainOfSegments`. Errors: SimulationDiverged; LeftWindow."""
-    if chain.marks:
-        state = State(*(t.detach().contiguous() for t in state))
-        states, statistics, *_ = chain.advance(solver, learned, state, packed.detach(), first)
-        return states, chain.named(statistics)
-    stretch = ChainOfSegments(chain, solver, learned, first, kept)
-    final, statistics = advance(stretch, state, (packed, *learned.weights))
-    return [final], chain.named(statistics)
+    lanes: Lanes, chain: Chain, learned: Learned, state: State, packed: Tensor, first: int, poses: tuple[Tensor, ...] = (),
+    steps: Steps | None = None,
+) -> tuple[list[State], tuple[Tensor, ...], list]:  # fmt: skip
+    """([the states at the chain's marks and after it], reactions, statistics of each evaluation), differentiable in state,
+    parameters, poses and the adapter's weights, where there are no marks. Arguments: as `ChainOfSegments` and `advance_segment`.
+    Errors: SimulationDiverged; LeftWindow."""
+    stretch = ChainOfSegments(lanes, first, steps or Steps(lanes.numerics.dt, lanes.numerics.dt), chain, learned)
+    final, left = advance(stretch, state, (packed, *learned.weights, *poses))
+    reactions = 2 if poses else 0
+    return [*stretch.marked, final], left[:reactions], chain.named(left[reactions:])

@@ -92,12 +92,12 @@ class Graphs:
     """The passes of one owner, which belong to its buffers and are dropped with them.
 
     failing: what the warning says, before the last error, when too many captures in a row have failed; attempts: so many, 0 for
-    none at all."""
+    none at all; most: graphs, and passes that wait to become one."""
 
-    def __init__(self, strategy: Strategy, failing: str, attempts: int = ATTEMPTS) -> None:
-        self.strategy, self.failing, self.attempts = strategy, failing, attempts
+    def __init__(self, strategy: Strategy, failing: str, attempts: int = ATTEMPTS, most: int = MAX_GRAPHS) -> None:
+        self.strategy, self.failing, self.attempts, self.most = strategy, failing, attempts, most
         self._replays: dict[Hashable, Body] = {}
-        self._warm: set[Hashable] = set()
+        self._warm: dict[Hashable, None] = {}  # in the order in which they ran
 
     def __len__(self) -> int:
         return len(self._replays)
@@ -109,13 +109,16 @@ class Graphs:
             replay()
             return
         self.strategy.run(body)
-        if len(self._warm) > MAX_GRAPHS:
+        if len(self._warm) > self.most:
             self.forget()
-        self._warm.add(name)
+        self._warm[name] = None
 
     def waits(self, name: Hashable) -> bool:
         """Whether a pass has run and is no graph yet, but may be."""
         return self.attempts > 0 and name in self._warm and name not in self._replays
+
+    def waiting(self) -> list[Hashable]:
+        return [name for name in self._warm if self.waits(name)]
 
     def capture(self, name: Hashable, body: Body) -> bool:
         """Whether `body` is now a graph; a failure says nothing of its launches themselves."""

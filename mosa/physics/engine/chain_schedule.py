@@ -1,24 +1,23 @@
-"""Which chains a rollout is cut into, by the memory there is, and the chains of a simulator."""
+"""Which chains a motion is cut into, by the memory there is."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from itertools import accumulate, pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from mosa.errors import SimulationDiverged
-from mosa.physics.engine.adapter_chain import MARGIN, Chain, Learned, advance_chain, learned_of
+from mosa.physics.engine.adapter_chain import Chain, ChainOfSegments, advance_chain, learned_of
 from mosa.physics.engine.budget import free_memory, room, substep_bytes
-from mosa.physics.engine.buffers import Buffers
+from mosa.physics.engine.lanes import Lanes
 from mosa.physics.engine.network_evaluation import at_hand
-from mosa.physics.engine.numerics import Numerics, State
-from mosa.physics.engine.operation import wants_gradient
-from mosa.physics.engine.solver import LeftWindow, SegmentSolver
+from mosa.physics.engine.numerics import State, Steps
+from mosa.physics.engine.solver import LeftWindow
 from mosa.physics.grid.window import MAX_NODES, SMALL, fallen, window_of
 
 SEGMENT = 32
@@ -31,134 +30,151 @@ MAX_CHAINS = 8
 
 
 class Plan(NamedTuple):
-    """Most substeps of a chain; kept: all states stay between the passes; graphs: if not, keep those of a chain's evaluations;
-    several: a chain may go over several frames, without a gradient."""
+    """Most substeps of a chain; graphs: where its states are made again, keep the graphs of its evaluations; several: a chain may
+    go over several frames, without a gradient."""
 
     limit: int
-    kept: bool
     graphs: bool = False
     several: bool = False
 
 
 class Chains:
-    """The chains of one simulator, among its buffers. ask: as `Chain`."""
+    """What asks an adapter inside of the stretches of one motion. The chains are its simulator's, among the buffers.
 
-    def __init__(self, numerics: Numerics, ask: Callable[..., dict[str, Tensor | None]], buffers: Buffers) -> None:
-        self.numerics, self.ask, self.chains = numerics, ask, buffers.chains
-        self._probes: dict[tuple[nn.Module, int], tuple[bool, int]] = {}
+    ask: as `Chain`; collect: as `Simulator.rollout`."""
 
-    def plan(
-        self, adapter: nn.Module, learned: Learned, state: State, packed: Tensor, substeps: int, stride: int
-    ) -> Plan:
-        """How to run a rollout of `substeps` substeps, by memory."""
+    def __init__(
+        self, lanes: Lanes, adapter: nn.Module, ask: Callable[..., dict[str, Tensor | None]], packed: Tensor,
+        collect: Callable[[Any], None] | None,
+    ) -> None:  # fmt: skip
+        self.lanes, self.adapter, self.ask, self.packed, self.collect = lanes, adapter, ask, packed, collect
+        self.numerics, self._ahead = lanes.numerics, []
+
+    def look(self) -> tuple[Tensor, ...]:
+        """The adapter's weights that are learned, as they are from now on."""
+        self.learned = learned_of(self.adapter)
+        return self.learned.weights
+
+    def begin(self, state: State, substeps: int, stride: int, wanted: bool) -> None:
+        """Before a motion of `substeps` substeps from `state`, after `look`. wanted: whether a gradient is."""
+        self._plan = self.plan(state, substeps, stride, wanted)
+        self._most = self._plan.limit if self._plan.several else 1
+
+    def plan(self, state: State, substeps: int, stride: int, wanted: bool) -> Plan:
+        """How to run a motion, by memory."""
         device = self.numerics.device
         if device.type != "cuda":
-            return Plan(SEGMENT, kept=True)
-        if not wants_gradient((*state, packed, *learned.weights)):
-            return Plan(WITHOUT_GRADIENT, kept=False, several=True)
-        each = substep_bytes(self.numerics, len(packed))
-        if room(device, substeps * each) > 0:
-            return Plan(SEGMENT, kept=True)
-        start = sum(t.numel() * t.element_size() for t in state[: 5 if self.numerics.law.plastic else 4])
-        graph = self._probe(adapter, state, packed)[1] // stride
+            return Plan(SEGMENT)
+        if not wanted:
+            return Plan(WITHOUT_GRADIENT, several=True)
+        if self.lanes.room:
+            return Plan(SEGMENT)
+        each = substep_bytes(self.numerics, len(self.packed))
+        start = sum(t.nbytes for t in state[: 5 if self.numerics.law.plastic else 4])
+        graph = self._probe(state)[1] // stride
         limit, needed = chain_length(substeps, start, each + graph)
         graphs = needed <= CHAIN_SHARE * free_memory(device)
-        return Plan(limit if graphs else chain_length(substeps, start, each)[0], kept=False, graphs=graphs)
+        return Plan(limit if graphs else chain_length(substeps, start, each)[0], graphs)
 
-    def frames(
-        self, solver: SegmentSolver, adapter: nn.Module, state: State, packed: Tensor, frames: int,
-        lengths: Sequence[int], collect: Callable | None,
-    ) -> Iterator[State]:  # fmt: skip
-        """The states after each of `frames` frames, each of segments of `lengths` substeps. collect: as `Simulator.rollout`.
+    def frame(
+        self, state: State, lengths: Sequence[int], first: int, poses: tuple[Tensor, ...], steps: Steps | None, alike: int
+    ) -> tuple[State, Tensor | None]:
+        """As `Prepared.frame`. Where a chain goes over several frames, the others are at hand when they are asked for; if it fails,
+        what can be had one by one still is, and a frame's chain that fails is cut."""
+        while not self._ahead:
+            count = self._together(state, min(self._most, 1 + alike), sum(lengths))
+            if count == 1:
+                return self._one(state, lengths, first, poses, steps)
+            try:
+                marks = tuple(len(lengths) * k for k in range(1, count))
+                self._ahead, _ = self._advanced(tuple(lengths) * count, state, first, (), steps, marks)
+            except (LeftWindow, SimulationDiverged) as error:
+                self._most = count // 2 if isinstance(error, LeftWindow) else 1
+        return self._ahead.pop(0), None
 
-        Where a chain goes over several frames, they arrive together; if it fails, what can be had one by one still does, and a
-        frame's chain that fails is cut. Errors: SimulationDiverged."""
-        learned, substeps, done = learned_of(adapter), sum(lengths), 0
-        plan = self.plan(adapter, learned, state, packed, frames * substeps, max(lengths))
-        most = plan.limit // substeps if plan.several else 1
-
-        def advanced(group: tuple[int, ...], first: int, marks: tuple[int, ...] = ()) -> list[State]:
-            chain = self.chain(adapter, learned, group, state, packed, collect is not None, plan.graphs, marks)
-            states, statistics = advance_chain(chain, solver, learned, state, packed, first, plan.kept)
-            for each in statistics:
-                collect(each)
-            return states
-
-        while done < frames:
-            count, first = self._together(solver, state, min(most, frames - done), substeps), done * substeps
-            if count > 1:
-                try:
-                    states = advanced(tuple(lengths) * count, first, tuple(len(lengths) * k for k in range(1, count)))
-                except (LeftWindow, SimulationDiverged) as error:
-                    most = count // 2 if isinstance(error, LeftWindow) else 1
-                    continue
-                yield from states
-                state = states[-1]
-            else:
-                groups = grouped(lengths, plan.limit)
-                while groups:
-                    try:
-                        state = advanced(groups[0], first)[-1]
-                    except (LeftWindow, SimulationDiverged):
-                        shorter = grouped(groups[0], SEGMENT)
-                        if len(shorter) == 1:
-                            raise
-                        groups[:1] = shorter
-                        continue
-                    first += sum(groups.pop(0))
-                yield state
+    def _one(
+        self, state: State, lengths: Sequence[int], first: int, poses: tuple[Tensor, ...], steps: Steps | None
+    ) -> tuple[State, Tensor | None]:
+        groups, done, forces = grouped(lengths, self._plan.limit), 0, []
+        while groups:
+            count = sum(groups[0])
+            along = tuple(part[done : done + count] for part in poses)
+            try:
+                (state,), reaction = self._advanced(groups[0], state, first + done, along, steps)
+            except (LeftWindow, SimulationDiverged):
+                shorter = grouped(groups[0], SEGMENT)
+                if len(shorter) == 1:
+                    raise
+                groups[:1] = shorter
+                continue
+            forces += [torch.cat(reaction, -1)] if reaction else []
+            steps = None if steps is None else Steps(steps.dt, steps.dt)
             done += count
+            del groups[0]
+        return state, torch.cat(forces) if forces else None
 
-    def _together(self, solver: SegmentSolver, state: State, count: int, substeps: int) -> int:
-        """How many frames, `count` at most, the next chain goes over: as many as keep its window not much larger than one frame's,
-        and as there is room for the states of."""
-        bounds, size = solver.bounds(state), sum(t.nbytes for t in state)
-        if count <= 1 or not np.isfinite(bounds).all():
+    def _advanced(
+        self, group: tuple[int, ...], state: State, first: int, poses: tuple[Tensor, ...], steps: Steps | None,
+        marks: tuple[int, ...] = (),
+    ) -> tuple[list[State], tuple[Tensor, ...]]:  # fmt: skip
+        chain = self.chain(group, state, marks)
+        states, reaction, statistics = advance_chain(self.lanes, chain, self.learned, state, self.packed, first, poses, steps)
+        for each in statistics:
+            self.collect(each)
+        return states, reaction
+
+    def _together(self, state: State, count: int, substeps: int) -> int:
+        """How many frames, `count` at most, the next chain goes over: as many as the plan allows, as keep its window not much
+        larger than one frame's, and as there is room for the states of."""
+        count = min(count, max(1, self._plan.limit // substeps))
+        if count == 1:
+            return 1
+        (solver,), size = self.lanes.solvers, sum(t.nbytes for t in state)
+        bounds = solver.bounds(state)
+        if not np.isfinite(bounds).all():
             return 1
 
         def nodes(count: int) -> int:
             time = count * substeps * self.numerics.dt
-            reach = fallen(bounds, self.numerics.gravity, time)
-            return int(window_of(reach, self.numerics.dx, time, MARGIN)[1].prod())
+            reach = fallen(bounds, solver.gravities, time)
+            return int(window_of(reach, self.numerics.dx, time, ChainOfSegments.margin)[1].prod(-1).sum())
 
         # a state is in the graph and in the answer
         while count > 1 and (nodes(count) > min(nodes(1) + SMALL, MAX_NODES) or not room(self.numerics.device, 2 * count * size)):
             count //= 2
         return count
 
-    def chain(
-        self, adapter: nn.Module, learned: Learned, lengths: tuple[int, ...], state: State, packed: Tensor,
-        collects: bool, graphs: bool = False, marks: tuple[int, ...] = (),
-    ) -> Chain:  # fmt: skip
-        key = (adapter, len(packed), lengths, marks, collects, graphs, learned.names)
-        chain = self.chains.pop(key, None)
+    def chain(self, lengths: tuple[int, ...], state: State, marks: tuple[int, ...] = ()) -> Chain:
+        chains, n, worlds, collects = self.lanes.buffers.chains, len(self.packed), self.lanes.worlds, self.collect is not None
+        key = (self.adapter, n, worlds, lengths, marks, collects, self._plan.graphs, self.learned.names)
+        chain = chains.pop(key, None)
         if chain is None:
-            while len(self.chains) >= MAX_CHAINS:
-                self.chains.pop(next(iter(self.chains)))
+            while len(chains) >= MAX_CHAINS:
+                chains.pop(next(iter(chains)))
             chain = Chain(
-                self.numerics, adapter, self.ask, len(packed), lengths, marks=marks, collects=collects, graphs=graphs,
-                plastic_adapted=self._probe(adapter, state, packed)[0],
+                self.numerics, self.adapter, self.ask, n, worlds, lengths, learned=self.learned, marks=marks, collects=collects,
+                graphs=self._plan.graphs, plastic_adapted=self._probe(state)[0],
             )  # fmt: skip
-        self.chains[key] = chain  # last: the first is the one that was not used for longest
+        chains[key] = chain  # last: the first is the one that was not used for longest
         return chain
 
-    def _probe(self, adapter: nn.Module, state: State, packed: Tensor) -> tuple[bool, int]:
+    def _probe(self, state: State) -> tuple[bool, int]:
         """(whether the adapter corrects the yield function, bytes that an evaluation's graph holds), from one evaluation."""
-        device = self.numerics.device
-        key = (adapter, len(packed))
-        if key not in self._probes:
-            if len(self._probes) >= MAX_CHAINS:
-                self._probes.clear()
+        device, probes = self.numerics.device, self.lanes.buffers.probes
+        key = (self.adapter, len(self.packed))
+        if key not in probes:
+            if len(probes) >= MAX_CHAINS:
+                probes.clear()
             with torch.enable_grad(), at_hand():
-                leaves = [t.detach().requires_grad_() for t in (state.F, state.C_affine, packed)]
-                answer, held = self.ask(adapter, *leaves), 0
+                leaves = [t.detach().requires_grad_() for t in (state.F, state.C_affine, self.packed)]
+                answer, held = self.ask(self.adapter, *leaves), 0
                 if device.type == "cuda":  # the second one's: an adapter may hold its last graph, and frees it with the next
                     held = torch.cuda.memory_allocated(device)
-                    second = self.ask(adapter, *leaves)
+                    second = self.ask(self.adapter, *leaves)
                     held = torch.cuda.memory_allocated(device) - held
                     del second
-            self._probes[key] = answer["plastic_G"] is not None, held
-        return self._probes[key]
+            probes[key] = answer["plastic_G"] is not None, held
+        return probes[key]
 
 
 def chain_length(substeps: int, start: int, each: int) -> tuple[int, float]:

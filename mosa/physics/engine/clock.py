@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from mosa.physics.engine.adaptive_steps import StepControl
 from mosa.physics.engine.numerics import State, Steps
+from mosa.types import ParticleState
 
 
 @dataclass(frozen=True)
@@ -30,45 +32,47 @@ class Replay:
     lag: float | None = None
 
 
+class Moment(NamedTuple):
+    """Where a motion is that is advanced frame by frame. state: (N, ...) or, of B worlds, (B, N, ...); substeps: done since its
+    start, in how many frames; lag [s]: the last substep's dt, before the first as in `Adaptive`, where counts vary."""
+
+    state: ParticleState
+    substeps: int = 0
+    frames: int = 0
+    lag: float | None = 0.0
+
+
+class Frame(NamedTuple):
+    """The substeps of one frame. first: number of the first one; dt [s]; steps: their times where counts vary, else None."""
+
+    first: int
+    count: int
+    dt: float
+    steps: Steps | None
+
+
+@dataclass(frozen=True)
 class Clock:
-    """Goes through the frames of one motion. taken: substeps of its frames, the last that of the frame which is under way.
+    """frame_dt [s]; count: substeps of every frame; choose: (number of a frame, the state before it, bound of the colliders' speeds
+    in it [m/s] or None) -> its substeps, where they vary."""
 
-    choose: (frame, the state before it) -> its substeps, where they vary; else `count` of each."""
-
-    def __init__(
-        self, frame_dt: float, count: int, choose: Callable[[int, State], int] | None = None, lag: float | None = None
-    ) -> None:
-        self.frame_dt, self._count, self._choose, self._lag = frame_dt, count, choose, lag
-        self.taken: list[int] = []
+    frame_dt: float
+    count: int
+    choose: Callable[[int, State, float | None], int] | None = None
 
     @property
     def varies(self) -> bool:
-        return self._choose is not None
-
-    def start(self, state: State) -> None:
-        """The next frame, from `state`."""
-        if self.taken:
-            self._lag = self.dt
-        self.taken.append(self._count if self._choose is None else self._choose(len(self.taken) + 1, state))
-
-    @property
-    def count(self) -> int:
-        """Substeps of the frame that is under way."""
-        return self.taken[-1]
-
-    @property
-    def first(self) -> int:
-        """Number of its first substep."""
-        return sum(self.taken[:-1])
+        return self.choose is not None
 
     @property
     def dt(self) -> float:
-        """[s] of its substeps, before the first frame those of any."""
-        return self.frame_dt / (self.taken[-1] if self.taken else self._count)
+        """[s] of a substep where their count is fixed."""
+        return self.frame_dt / self.count
 
-    @property
-    def steps(self) -> Steps | None:
-        """Times of its substeps where they vary, None for the numerics' own."""
-        if self._choose is None:
-            return None
-        return Steps(self.dt if self._lag is None else 0.5 * (self._lag + self.dt), self.dt)
+    def frame(self, moment: Moment, state: State, speed: float | None = None) -> Frame:
+        """The next one after `moment`, whose particles are `state`. speed: as `choose`."""
+        if self.choose is None:
+            return Frame(moment.substeps, self.count, self.dt, None)
+        count = self.choose(moment.frames + 1, state, speed)
+        dt = self.frame_dt / count
+        return Frame(moment.substeps, count, dt, Steps(dt if moment.lag is None else 0.5 * (moment.lag + dt), dt))

@@ -112,25 +112,19 @@ def gravity_of_worlds(
     return tuple(map(tuple, gravity.tolist()))
 
 
-def checked_motions(
-    motions: Sequence[Motion | Trajectory] | None, colliders: Sequence[Collider]
-) -> Sequence[Motion | Trajectory]:
-    """One for each collider, by default its own. Errors: ConfigError."""
-    motions = [collider.motion for collider in colliders] if motions is None else motions
-    if len(motions) != len(colliders):
-        raise ConfigError(f"motions: expected one for each of {len(colliders)} colliders, found {len(motions)}")
-    return motions
-
-
 def motions_of_worlds(
-    motions: Sequence | None, colliders: Sequence[Collider], worlds: int
+    motions: Sequence | None, colliders: Sequence[Collider], worlds: int | None
 ) -> list[Sequence[Motion | Trajectory]]:
-    """Of the colliders in every world: those of one for all, or a sequence for each. Errors: ConfigError."""
-    if motions is None or not any(isinstance(own, Sequence) for own in motions):
-        return [checked_motions(motions, colliders)] * worlds
-    if len(motions) != worlds:
+    """Of the colliders in every world: those of one for all, by default their own, or a sequence for each. Errors: ConfigError."""
+    motions = [collider.motion for collider in colliders] if motions is None else motions
+    if worlds is None or not any(isinstance(own, Sequence) for own in motions):
+        motions = [motions] * (worlds or 1)
+    elif len(motions) != worlds:
         raise ConfigError(f"motions: expected one sequence for each of {worlds} worlds, found {len(motions)}")
-    return [checked_motions(own, colliders) for own in motions]
+    for own in motions:
+        if len(own) != len(colliders):
+            raise ConfigError(f"motions: expected one for each of {len(colliders)} colliders, found {len(own)}")
+    return list(motions)
 
 
 def corners(box: Tensor | None) -> tuple[tuple[float, ...], tuple[float, ...]]:

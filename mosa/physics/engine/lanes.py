@@ -22,7 +22,7 @@ class Lanes:
     """
 
     def __init__(self, solvers: Sequence[SegmentSolver], buffers: Buffers) -> None:
-        self.solvers, self._buffers = list(solvers), buffers
+        self.solvers, self.buffers = list(solvers), buffers
         self.numerics = self.solvers[0].numerics
 
     @property
@@ -63,16 +63,16 @@ class Lanes:
 
         def run(index: int):
             solver = self.solvers[index]
-            with self._buffers.workspaces() as solver.workspaces, torch.no_grad():
+            with self.buffers.workspaces() as solver.workspaces, torch.no_grad():
                 return function(solver, *(argument[index] for argument in arguments))
 
         count = len(self.solvers)
         if self.solvers[0].volume.is_cuda:  # in turns: while one captures a graph no other may touch the stream
             return [run(index) for index in range(count)]
-        if kind in self._buffers.ran:
+        if kind in self.buffers.ran:
             return list(threaded(run, range(count)))
         first = run(0)
-        self._buffers.ran.add(kind)
+        self.buffers.ran.add(kind)
         return [first, *threaded(run, range(1, count))]
 
 

@@ -1,4 +1,4 @@
-"""A stretch of motion as one differentiable torch operation, whatever it consists of.
+"""A stretch of motion as one differentiable torch operation, whatever acts on the particles beside the law.
 
 Between the passes a stretch keeps what its backward pass reads, where there is room for it, and else only its inputs.
 """
@@ -7,12 +7,19 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from mosa.physics.engine.numerics import State
+from mosa.physics.contact.motion import Poses
+from mosa.physics.engine.lanes import Lanes
+from mosa.physics.engine.numerics import State, Steps
+from mosa.physics.engine.solver import SegmentSolver
+from mosa.physics.engine.workspace import Workspace
+from mosa.physics.launching import copies
 
 STATES = len(State._fields)
 
@@ -30,27 +37,131 @@ class Kept:
         return tape
 
 
+@dataclass
 class Stretch(ABC):
-    """Some substeps that are advanced, and differentiated, as a whole. plastic: whether the law yields, so that F_tot is a state of
-    its own.
+    """Some substeps that are advanced, and differentiated, as a whole.
 
-    Besides the state a stretch depends on other tensors (an operator that is held, poses, weights; None for one there is not), and
-    besides the state it leaves others (reactions, statistics)."""
+    Besides the state a stretch depends on other tensors: what acts, as a kind of stretch has it (None for one there is not), then,
+    where there are colliders, their poses at its substeps, as `contact.motion.Poses`. Besides the state it leaves the colliders'
+    force [N] and torque about each collider's origin [N m], (S, W K, 3) each, then the `statistics` of its kind.
 
-    plastic: bool
+    first: number of its first substep, for messages; steps: times of the substeps."""
+
+    lanes: Lanes
+    first: int
+    steps: Steps
+
+    margin: ClassVar[int]
+    """Nodes of a window beyond what the speeds at the start ask for."""
+    substeps: ClassVar[int]
+    cut: ClassVar[bool]
+    """Whether the caller makes shorter ones of it where a particle leaves its window; else the window is widened."""
+    foresees: ClassVar[bool]
+    """Whether the window has room for what gravity adds to the speeds."""
 
     @abstractmethod
+    def buffers(self, solver: SegmentSolver, acting: Sequence[Tensor | None], full: bool) -> tuple[Workspace, dict]:
+        """(the workspace, what is copied into it by name). full: with buffers for the adjoint."""
+
+    @abstractmethod
+    def advance(self, work: Workspace, acting: Sequence[Tensor | None]) -> None:
+        """All substeps, in a workspace that is loaded."""
+
+    @abstractmethod
+    def adjoint(self, work: Workspace, acting: Sequence[Tensor | None], again: bool, penalised: bool) -> None:
+        """Of all substeps, in a workspace that is loaded and seeded. again: the states are not there; penalised: `statistics_seeds`
+        are not all zero."""
+
+    @abstractmethod
+    def adjoint_of(self, work: Workspace, acting: Sequence[Tensor | None]) -> list[Tensor | None]:
+        """Where `adjoint` leaves the gradients of what acts."""
+
+    def full(self, differentiated: bool, kept: bool) -> bool:
+        """Whether the forward pass runs in the buffers of the backward pass, which it has to where its states are kept."""
+        return kept
+
+    def statistics(self, work: Workspace) -> Sequence[Tensor]:
+        return ()
+
+    def statistics_seeds(self) -> Sequence[Tensor]:
+        return ()
+
+    @property
+    def plastic(self) -> bool:
+        """Whether the law yields, so that F_tot is a state of its own."""
+        return self.lanes.numerics.law.plastic
+
+    def _parts(self, state: State, others: Sequence[Tensor | None]) -> tuple[list, list, list]:
+        """(states, what acts, poses) of each solver."""
+        split, posed = self.lanes.split, len(Poses._fields) if self.lanes.numerics.colliders is not None else 0
+        acting = len(others) - posed
+        return [State(*part) for part in split(state)], split(others[:acting]), split(others[acting:], 1)
+
+    def _kind(self, name: str, others: Sequence[Tensor | None]) -> tuple:
+        """Of a pass: those of one kind run the same kernels."""
+        return (name, type(self), *(t is None for t in others))
+
+    def _loaded(
+        self, solver: SegmentSolver, state: State, acting: Sequence[Tensor | None], poses: Sequence[Tensor],
+        windows: tuple[np.ndarray, np.ndarray], full: bool,
+    ) -> Workspace:  # fmt: skip
+        work, held = self.buffers(solver, acting, full)
+        work.set_window(*windows)
+        work.load(state, held, solver.volume, solver.mass, solver.cutoff, poses, self.steps, solver.gravities)
+        return work
+
     def forward(
         self, state: State, others: Sequence[Tensor | None], differentiated: bool
-    ) -> tuple[State, Sequence[Tensor], Any]:
-        """(the state after it, what else it leaves, what `backward` gets as `kept`). differentiated: whether that follows."""
+    ) -> tuple[State, list[Tensor], list[Kept]]:
+        """(the state after it, what else it leaves, what `backward` gets as `kept`). differentiated: whether that follows.
+        Errors: SimulationDiverged naming substep and particle; LeftWindow where it is cut."""
+        time, dt = self.substeps * self.steps.dt, self.steps.dt
 
-    @abstractmethod
+        def run(solver: SegmentSolver, state: State, acting: tuple, poses: tuple):
+            kept = differentiated and solver.has_room(self.substeps)
+            full = self.full(differentiated, kept)
+
+            def launched(windows: tuple[np.ndarray, np.ndarray]) -> Workspace:
+                work = self._loaded(solver, state, acting, poses, windows, full)
+                self.advance(work, acting)
+                return work
+
+            margins = (self.margin,) if self.cut else (self.margin, 3 + self.substeps // 2)
+            work, final, windows = solver.within(launched, state, time, margins, self.foresees, self.first, dt)
+            left = [*([] if work.colliders is None else work.colliders.reaction), *self.statistics(work)]
+            return final, copies(left), Kept(windows, solver.budget.keep(work.tape()) if kept else [])
+
+        finals, left, kept = zip(*self.lanes.each(self._kind("advance", others), run, *self._parts(state, others)))
+        states = [final if self.plastic else final[:-1] for final in finals]
+        return State.whole(self.lanes.join(states)), self.lanes.join(left, 1), kept
+
     def backward(
-        self, state: State, others: Sequence[Tensor | None], kept: Any, seeds: Sequence[Tensor | None],
+        self, state: State, others: Sequence[Tensor | None], kept: Sequence[Kept], seeds: Sequence[Tensor | None],
         other_seeds: Sequence[Tensor | None],
-    ) -> tuple[Sequence[Tensor], Sequence[Tensor | None]]:  # fmt: skip
+    ) -> tuple[list[Tensor], list[Tensor | None]]:  # fmt: skip
         """Gradients of (state, others), of as many states as there are seeds: without F_tot where the law does not yield."""
+
+        def run(solver: SegmentSolver, kept: Kept, state: State, acting: tuple, poses: tuple, seeds: tuple, other_seeds: tuple):
+            work = self._loaded(solver, state, acting, poses, kept.windows, True)
+            tape = kept.take()
+            solver.budget.used(tape)
+            if tape:
+                work.rewind(tape)
+            slot, slots, statistics = self.substeps % 2, work.adjoint_slots(), self.statistics_seeds()
+            reaction, of_poses = ([], []) if work.colliders is None else (work.colliders.adj_reaction, work.colliders.adj_poses)
+            targets = [*(target[slot] for target in slots), *reaction, *statistics]
+            for target, seed in zip(targets, (*seeds, *other_seeds), strict=True):
+                target.zero_() if seed is None else target.copy_(seed)
+            penalised = any(seed is not None for seed in other_seeds[len(reaction) :])
+            self.adjoint(work, acting, not tape, penalised)
+            of_acting = self.adjoint_of(work, acting)
+            found = iter(copies([*(target[0] for target in slots), *(t for t in of_acting if t is not None), *of_poses]))
+            return [next(found) for _ in slots], [None if t is None else next(found) for t in of_acting], list(found)
+
+        parts, lanes = self._parts(state, others), self.lanes
+        found = lanes.each(self._kind("adjoint", others), run, kept, *parts, lanes.split(seeds), lanes.split(other_seeds, 1))
+        of_state, of_acting, of_poses = zip(*found)
+        return lanes.join(of_state), [*lanes.join(of_acting), *lanes.join(of_poses, 1)]
 
 
 class _Advance(torch.autograd.Function):
@@ -81,7 +192,7 @@ def wants_gradient(tensors: Iterable[Tensor | None]) -> bool:
 
 
 def advance(stretch: Stretch, state: State, others: Sequence[Tensor | None]) -> tuple[State, tuple[Tensor, ...]]:
-    """(the state after the stretch, what else it leaves), differentiable in state and others."""
+    """(the state after the stretch, what else it leaves), differentiable in state and others. Errors: as `Stretch.forward`."""
     if not wants_gradient((*state, *others)):
         final, more, _ = stretch.forward(_detached(state), others, False)
         return final, tuple(more)

@@ -14,24 +14,22 @@ from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from mosa.errors import ConfigError
 from mosa.physics.constitutive.laws import law_named
-from mosa.physics.constitutive.plasticity import yield_factor
+from mosa.physics.constitutive.plasticity import YIELD_CONVENTIONS
 from mosa.physics.constitutive.strain import STRAINS
 from mosa.physics.contact.colliders import Collider, pack_colliders, reach
-from mosa.physics.contact.motion import Motion, Trajectory, sample_frame, sample_poses
+from mosa.physics.contact.motion import sample_frame, sample_poses
 from mosa.physics.contact.planes import Plane, ground_plane, pack_planes
 from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState, Several, ask
-from mosa.physics.engine.adaptive_steps import StepChooser, StepControl, check_counts
+from mosa.physics.engine.adaptive_steps import StepChooser, check_counts
 from mosa.physics.engine.buffers import Buffers
-from mosa.physics.engine.chain_schedule import Chains
-from mosa.physics.engine.clock import Adaptive, Clock, Replay
+from mosa.physics.engine.clock import Adaptive, Clock, Frame, Moment, Replay
 from mosa.physics.engine.inputs import (
     check_state,
     checked_density,
-    checked_motions,
     corners,
     count_of_worlds,
     gravity_of_worlds,
@@ -40,16 +38,13 @@ from mosa.physics.engine.inputs import (
     polar_rotation,
 )
 from mosa.physics.engine.lanes import Lanes
+from mosa.physics.engine.law_options import AS_USUAL, LawOptions
 from mosa.physics.engine.material_operations import material_state
-from mosa.physics.engine.numerics import Numerics, State, flat
-from mosa.physics.engine.operation import wants_gradient
+from mosa.physics.engine.numerics import Numerics, flat
 from mosa.physics.engine.solver import SegmentSolver
-from mosa.physics.engine.stepping import Moment, Prepared, Stepper, mean_force, segments
+from mosa.physics.engine.stepping import Prepared, Stepper
 from mosa.physics.launching import SCALARS
 from mosa.types import Ground, ParticleState, Rollout
-
-RECORDED = ("x", "v", "F", "F_tot")
-"""What a `Rollout` holds of every frame."""
 
 
 class Simulator:
@@ -58,15 +53,8 @@ class Simulator:
     dx: grid spacing [m]; substeps per frame of frame_dt [s]; gravity (3,) [m/s^2]; ground: plane below `up` ((3,), against
     gravity by default), then `planes` in order, then the moving `colliders`; box: (2, 3) [m] corners a particle may not leave,
     None for no limit.
-    mass_cutoff: node mass [kg] above which a node has a velocity (None: 0 in float64, 1e-12 of a particle's in float32).
-    init_affine: `spin` takes the state's C_affine, `zero` replaces it by 0. norm_eps: under the root of yield norms.
-    yield_convention: paper | sqrt23. rebuild: write U S V^T back also where nothing yielded (PAC-NeRF does).
-    on_inversion: warn | ignore | error for det F <= 0 where the law has a value there; it is an error where it has none.
-    chained: whether the evaluations of an adapter that is a torch module and the segments between them run as chains;
-    None: on CUDA, where a chain is one captured graph. Not with colliders or adaptive substeps, which are cut in segments.
-    Gradients through a chain reach the adapter's parameters, not other tensors that it may use.
     strain: hencky | biot | green: what adapters answer is a stiffness G in units of 2 mu, of the energy mu E : G : E that is added
-    to 1 + h[0] times the prior's; None: an operator on the prior's stress.
+    to 1 + h[0] times the prior's; None: an operator on the prior's stress. options: how the law is taken.
     Errors: ConfigError naming the argument. Not safe for use by two threads: buffers are shared between rollouts.
     """
 
@@ -85,14 +73,8 @@ class Simulator:
         box: Tensor | None = None,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
-        mass_cutoff: float | None = None,
-        init_affine: str = "spin",
-        norm_eps: float = 0.0,
-        yield_convention: str = "paper",
-        rebuild: bool = False,
-        on_inversion: str = "warn",
-        chained: bool | None = None,
         strain: str | None = None,
+        options: LawOptions = AS_USUAL,
     ) -> None:
         self.law = law_named(law)
         for name, value in (("dx", dx), ("frame_dt", frame_dt), ("substeps", substeps)):
@@ -104,14 +86,9 @@ class Simulator:
             raise ConfigError(f"strain: expected a law with a shear modulus mu, found {law!r}: stiffness is in units of 2 mu")
         if dtype not in SCALARS:
             raise ConfigError(f"dtype: expected torch.float32 or torch.float64, found {dtype}")
-        if init_affine not in ("spin", "zero"):
-            raise ConfigError(f"init_affine: expected spin or zero, found {init_affine!r}")
-        if on_inversion not in ("warn", "ignore", "error"):
-            raise ConfigError(f"on_inversion: expected warn, ignore or error, found {on_inversion!r}")
         self.substeps, self.frame_dt, self.dt = int(substeps), float(frame_dt), float(frame_dt) / int(substeps)
         self.dtype, self.device = dtype, torch.device(device)
-        self.init_affine, self.on_inversion, self.mass_cutoff = init_affine, on_inversion, mass_cutoff
-        self.yield_factor = yield_factor(yield_convention)
+        self.options = options
         gravity = torch.as_tensor(gravity, dtype=torch.float64).cpu()
         if up is None:
             up = -gravity / gravity.norm() if gravity.norm() > 0 else torch.tensor([0.0, 1.0, 0.0])
@@ -122,16 +99,15 @@ class Simulator:
         low, high = corners(box)
         self.numerics = Numerics(
             law=self.law, dtype=dtype, device=self.device, dx=float(dx), dt=self.dt, gravity=tuple(gravity.tolist()),
-            planes=values, modes=modes, plane_count=len(all_planes), low=low, high=high, norm_eps=float(norm_eps),
-            rebuild=rebuild, check_J=self.law.needs_positive_J or on_inversion == "error",
+            planes=values, modes=modes, plane_count=len(all_planes), low=low, high=high, norm_eps=float(options.norm_eps),
+            rebuild=options.rebuild, check_J=self.law.needs_positive_J or options.on_inversion == "error",
             colliders=packed_colliders, strain=strain,
         )  # fmt: skip
         self.buffers = Buffers()
-        self._long = self.device.type == "cuda"  # a CPU gains nothing
-        self.chained = self.device.type == "cuda" if chained is None else chained
+        # each stretch of motion costs a look at the host, and on CUDA waits for it; a CPU gains nothing
+        self.gathers = self.device.type == "cuda"
         # no method: the cycle would keep a dropped simulator's buffers until the garbage collector looks
         self._ask = partial(ask, self.law, dtype)
-        self._chains = Chains(self.numerics, self._ask, self.buffers)
 
     def pack(
         self, parameters: dict[str, Tensor], particles: int, rotation: Tensor | None = None, worlds: int | None = None
@@ -143,8 +119,8 @@ class Simulator:
         one.
         """
         shape = (particles,) if worlds is None else (worlds, particles)
-        like = self.numerics.planes  # of its type and on its device
-        return pack_parameters(self.law, parameters, shape, like, rotation=rotation, yield_factor=self.yield_factor)
+        like, factor = self.numerics.planes, YIELD_CONVENTIONS[self.options.yield_convention]  # of its type and on its device
+        return pack_parameters(self.law, parameters, shape, like, rotation=rotation, yield_factor=factor)
 
     def rollout(
         self,
@@ -153,79 +129,70 @@ class Simulator:
         volume: Tensor,
         density: float | Tensor,
         frames: int,
-        adapter: Callable[[MaterialState], AdapterOperator] | None = None,
-        stride: int | None = 1,
-        progress: Callable[[int], None] | None = None,
-        started: bool = False,
-        motions: Sequence[Motion | Trajectory] | None = None,
-        start_time: float = 0.0,
-        timing: Adaptive | Replay | None = None,
-        collect: Callable[[Any], None] | None = None,
-    ) -> Rollout:
-        """`frames` frames, the start being frame 0 (so frames - 1 intervals are simulated).
-
-        state: particles at frame 0, its F and F_tot not yet advanced by C_affine, unless `started` (the `final` of an earlier
-        rollout). parameters: physical values the law names, per particle (N,) or scalar; volume: (N,) [m^3]; density
-        [kg/m^3]: number or (N,).
-        adapter: asked every `stride` substeps from the start of each frame; None: once, at the start of the rollout (an operator
-        that does not depend on the state). collect: called with `adapter.statistics()`, a named tuple of tensors, of every
-        evaluation. progress: called with the number of each frame. An adapter that has `flow` is no part of a chain; before it is
-        asked, F becomes flow(F (N, 3, 3), time until it is asked again [s]): plastic flow that a network has learned.
-        motions: of the colliders, instead of their own; start_time [s]: time of frame 0 in these motions.
-        timing: substeps that are chosen for each frame, or those of an earlier rollout, instead of `substeps` in all (see `clock`).
-        Frame 0 of the result holds the state as given. Errors: SimulationDiverged naming substep and particle; ConfigError.
-        """
-        prepared = self._prepare(state, parameters, volume, density, adapter, stride, collect, frames)
-        motions = checked_motions(motions, self.colliders)
-        clock = self._clock(timing, frames, prepared, parameters, density, motions)
-
-        def along(clock: Clock) -> tuple[Tensor, ...]:
-            place = len(clock.taken) - 1, frames - 1, clock.taken, self.frame_dt, start_time
-            return sample_frame(motions, *place, self.dtype, self.device, isinstance(timing, Replay))
-
-        poses = along if clock.varies and self.colliders else self._poses(motions, frames, start_time)
-        return self._run(prepared, self._begun(state, started), frames, clock, poses, started, progress, self.chained)
-
-    def rollout_worlds(
-        self,
-        state: ParticleState,
-        parameters: dict[str, Tensor],
-        volume: Tensor,
-        density: float | Tensor,
-        frames: int,
-        adapter: Callable | Sequence[Callable] | None = None,
+        adapter: Callable[[MaterialState], AdapterOperator] | Sequence[Callable] | None = None,
         stride: int | None = 1,
         progress: Callable[[int], None] | None = None,
         started: bool = False,
         motions: Sequence | None = None,
         start_time: float = 0.0,
+        timing: Adaptive | Replay | None = None,
+        collect: Callable[[Any], None] | None = None,
         gravity: Tensor | Sequence | None = None,
         together: int | None = None,
     ) -> Rollout:
-        """B rollouts of the same body at once, as `rollout` with the fixed time step: a leading dimension for the worlds.
+        """`frames` frames, the start being frame 0 (so frames - 1 intervals are simulated), of a body, or of B worlds at once.
 
-        state: x (B, N, 3) and so on; parameters: as in `rollout`, where they are the same in all worlds, or (B, 1) or (B, N),
-        vectors (B, 1, k) or (B, N, k). adapter: one for all worlds, which is asked for all particles, (B N, ...), or one for each.
-        motions: of the colliders in every world, B sequences, or one sequence of K for all. gravity: (B, 3) [m/s^2], where it is
-        not the simulator's in all worlds. volume (N,), density, frames, stride, progress, started, start_time: as `rollout`.
-        together: worlds that go through the same launches: all of them on a CUDA device, where they fill it, and one on a CPU,
-        where as many worlds as there are cores advance at a time; it divides B.
-        Returns a `Rollout` with x (T, B, N, 3) and so on, reactions (T - 1, substeps, B, K, 6): `Rollout.worlds` parts it. On a
-        CPU each world has the bits of its own `rollout`, where gradients of what worlds share are summed over them.
-        Errors: as `rollout`; SimulationDiverged names the world: none of the others is returned.
+        state: particles at frame 0, x (N, 3) and so on, their F and F_tot not yet advanced by C_affine, unless `started` (the
+        `final` of an earlier rollout). parameters: physical values the law names, per particle (N,) or scalar; volume: (N,) [m^3];
+        density [kg/m^3]: number or (N,).
+        adapter: asked every `stride` substeps from the start of each frame; None: once, at the start of the rollout (an operator
+        that does not depend on the state). collect: called with `adapter.statistics()`, a named tuple of tensors, of every
+        evaluation. progress: called with the number of each frame. Before an adapter that has `flow` is asked, F becomes
+        flow(F (N, 3, 3), time until it is asked again [s]): plastic flow that a network has learned. On CUDA gradients reach the
+        parameters of an adapter that is a torch module, not other tensors that it may use.
+        motions: of the colliders, instead of their own; start_time [s]: time of frame 0 in these motions.
+        timing: substeps that are chosen for each frame, or those of an earlier rollout, instead of `substeps` in all (see `clock`).
+        Frame 0 of the result holds the state as given. Errors: SimulationDiverged naming substep and particle; ConfigError.
+
+        Worlds: copies of the body that never meet, with the fixed time step. state: x (B, N, 3) and so on; parameters: the same in
+        all worlds, or (B, 1) or (B, N), vectors (B, 1, k) or (B, N, k). adapter: one for all worlds, which is asked for all
+        particles, (B N, ...), or one for each. motions: of the colliders in every world, B sequences, or one of K for all.
+        gravity: (B, 3) [m/s^2], where it is not the simulator's in all worlds. together: worlds that go through the same launches:
+        all of them on a CUDA device, where they fill it, and one on a CPU, where as many worlds as there are cores advance at a
+        time; it divides B. The result has x (T, B, N, 3) and so on, reactions (T - 1, substeps, B, K, 6): `Rollout.worlds` parts
+        it. On a CPU each world has the bits of its own rollout, where gradients of what worlds share are summed over them.
+        SimulationDiverged names the world: none of the others is returned.
         """
-        worlds = count_of_worlds(state, together)
-        gravities = gravity_of_worlds(gravity, worlds, self.numerics.gravity)
-        prepared = self._prepare(state, parameters, volume, density, adapter, stride, None, frames, worlds, gravities, together)
-        each = motions_of_worlds(motions, self.colliders, worlds)
-        poses = [self._poses(own, frames, start_time) for own in each]
-        poses = tuple(torch.cat(parts, 1) for parts in zip(*poses))
-        clock = Clock(self.frame_dt, self.substeps)
-        found = self._run(prepared, self._begun(state, started), frames, clock, poses, started, progress)
-        apart = {name: getattr(found, name).unflatten(1, (worlds, -1)) for name in RECORDED}
-        final = ParticleState(*(t.unflatten(0, (worlds, -1)) for t in State.of(found.final)))
-        forces = None if found.reactions is None else found.reactions.unflatten(2, (worlds, -1))
-        return replace(found, **apart, final=final, reactions=forces)
+        given = parameters, volume, density, adapter, stride, motions, gravity, together, timing
+        stepper, start = self._stepper(state, *given, frames, started, collect)
+        poses, all_known = self._poses(stepper, frames, start_time, isinstance(timing, Replay))
+        prepared, moment, varies = stepper.prepared, start, stepper.clock.varies
+        current, frame = stepper.enter(start, not started)
+        recorded = [flat(start.state)]
+        prepared.begin(current, all_known, (frames - 1) * self.substeps, varies, gives=True)
+        reactions, counts = [], []
+        for number in range(1, frames):
+            if number > 1:
+                current, frame = stepper.enter(moment, False)
+            alike = 0 if varies or self.colliders else frames - 1 - number
+            moment, forces, count = stepper.through(moment, current, frame, poses(number - 1, frame), alike)
+            counts.append(count)
+            if forces is not None:
+                reactions.append(forces)
+            recorded.append(moment.state)
+            if progress is not None:
+                progress(number)
+        names = ("x", "v", "F", "F_tot") if self.law.plastic else ("x", "v", "F")
+        columns = stepper.apart((torch.stack([getattr(each, name) for each in recorded]) for name in names), 1)
+        inverted = int((_determinant(columns[2].detach()) <= 0).sum())
+        if inverted and self.options.on_inversion == "warn":
+            warnings.warn(f"{inverted} particle states with det F <= 0 in {frames} frames", stacklevel=2)
+        (forces,) = stepper.apart([torch.stack(reactions) if reactions else None], 2)
+        return Rollout(
+            *columns[:3], columns[-1], times=self.frame_dt * torch.arange(frames, dtype=self.dtype, device=self.device),
+            final=ParticleState(*stepper.apart(moment.state if frames > 1 else current)), inverted=inverted, reactions=forces,
+            counts=tuple(counts),
+        )  # fmt: skip
 
     def stepper(
         self,
@@ -243,100 +210,70 @@ class Simulator:
         timing: Adaptive | None = None,
         steps: int = 30,
     ) -> tuple[Stepper, Moment]:
-        """(what advances a body, or B of them, frame by frame, the moment to start from); arguments as `rollout` and
-        `rollout_worlds`.
+        """(what advances a body, or B of them, frame by frame, the moment to start from); arguments as `rollout`.
 
-        state: x (N, 3), or (B, N, 3) of B worlds. timing: choose the substeps of every frame (one world only). steps: for which
-        there shall be memory to keep all states, where a gradient is wanted; there may be more. Every step gives the bits of the
-        same frame of a rollout. Errors: ConfigError.
+        timing: choose the substeps of every frame. steps: for which there shall be memory to keep all states, where a gradient is
+        wanted; there may be more. Every step gives the bits of the same frame of a rollout. Errors: ConfigError.
         """
+        given = parameters, volume, density, adapter, stride, motions, gravity, together, timing
+        stepper, moment = self._stepper(state, *given, None, started)
+        stepper.prepared.give_memory(steps * self.substeps, torch.is_grad_enabled())
+        return stepper, moment._replace(substeps=self.substeps if started else 0)
+
+    def _stepper(
+        self, state: ParticleState, parameters: dict[str, Tensor], volume: Tensor, density: float | Tensor, adapter, stride,
+        motions, gravity, together: int | None, timing: Adaptive | Replay | None, frames: int | None, started: bool, collect=None,
+    ) -> tuple[Stepper, Moment]:  # fmt: skip
+        """frames: None where there may be any number of them. Errors: ConfigError."""
         worlds = None if state.x.ndim == 2 else count_of_worlds(state, together)
         if worlds is not None and timing is not None:
             raise ConfigError("timing: expected None with many worlds, which take the same substeps")
         if worlds is None and (gravity is not None or together is not None):
             raise ConfigError("gravity and together: expected None without worlds; gravity is the simulator's")
         gravities = None if worlds is None else gravity_of_worlds(gravity, worlds, self.numerics.gravity)
-        prepared = self._prepare(state, parameters, volume, density, adapter, stride, None, 1, worlds, gravities, together)
-        each = [checked_motions(motions, self.colliders)] if worlds is None else motions_of_worlds(motions, self.colliders, worlds)
-        each = [[m.timed(None, self.frame_dt) if isinstance(m, Motion) else m for m in own] for own in each]
-        chooser = None if timing is None else self._chooser(timing.control, prepared, parameters, density, each[0])
-        current = self._begun(state, started)
-        prepared.settle(flat(current))
-        prepared.give_memory(steps * self.substeps, torch.is_grad_enabled())
-        stepper = Stepper(prepared, worlds, self.substeps, self.frame_dt, chooser, each, self.dtype)
-        return stepper, Moment(current, self.substeps if started else 0)
-
-    def _run(
-        self, prepared: Prepared, start: ParticleState, frames: int, clock: Clock,
-        poses: tuple[Tensor, ...] | Callable[[Clock], tuple[Tensor, ...]], started: bool, progress: Callable[[int], None] | None,
-        chained: bool = False,
-    ) -> Rollout:  # fmt: skip
-        """The frames, of one body or of many worlds one after another. poses: of the colliders at all substeps or, where these
-        are not known beforehand, what tells those of the frame that is under way; chained: where the adapter can be."""
-        current = flat(start)
-        recorded = {name: [getattr(current, name)] for name in RECORDED}
-        if frames > 1:
-            clock.start(current)
-        if not started:
-            current = prepared.first_advance(current, clock.dt)
-        prepared.settle(current)
-        states = None
-        if chained and self._can_be_chained(prepared.adapter) and not clock.varies:
-            lengths = segments(self.substeps, prepared.stride)
-            states = self._chains.frames(
-                prepared.lanes.solvers[0], prepared.adapter, current, prepared.packed, frames - 1, lengths, prepared.collect
-            )
-        known = () if callable(poses) else poses
-        wanted, total = wants_gradient((*current, *prepared.held.values(), *known)), (frames - 1) * self.substeps
-        if states is None:
-            prepared.give_memory(total, wanted)
-        prepared.choose_lengths(total, wanted, clock.varies)
-        reactions = []
-        for frame in range(1, frames):
-            if frame > 1:
-                clock.start(current)
-            if states is not None:
-                current, forces = next(states), None
-            else:
-                lengths, first = prepared.lengths(clock.count, clock.varies), clock.first
-                along = poses(clock) if callable(poses) else tuple(part[first : first + clock.count] for part in poses)
-                current, forces = prepared.frame(current, lengths, first, along, clock.steps)
-            if forces is not None:
-                reactions.append(mean_force(forces, clock.steps) if clock.varies else forces)
-            for name, values in recorded.items():
-                values.append(getattr(current, name))
-            if progress is not None:
-                progress(frame)
-        return self._recorded(recorded, current, reactions, clock.taken)
-
-    def _can_be_chained(self, adapter: Callable | None) -> bool:
-        return isinstance(adapter, nn.Module) and getattr(adapter, "chained", True) and not self.colliders
-
-    def _clock(
-        self, timing: Adaptive | Replay | None, frames: int, prepared: Prepared, parameters: dict[str, Tensor],
-        density: float | Tensor, motions,
-    ) -> Clock:  # fmt: skip
-        if timing is None:
-            return Clock(self.frame_dt, self.substeps)
+        prepared = self._prepare(state, parameters, volume, density, adapter, stride, collect, frames, worlds, gravities, together)
+        each = motions_of_worlds(motions, self.colliders, worlds)
+        choose = None
         if isinstance(timing, Replay):
             counts = check_counts(timing.counts, frames)
-            return Clock(self.frame_dt, self.substeps, lambda frame, state: counts[frame - 1], timing.lag)
-        chooser = self._chooser(timing.control, prepared, parameters, density, motions)
-        return Clock(self.frame_dt, self.substeps, chooser.choose, timing.lag)
+            choose = lambda frame, *_: counts[frame - 1]  # noqa: E731
+        elif timing is not None:
+            solids = max((m.max_speed(reach(c.shape)) for m, c in zip(each[0], self.colliders)), default=0.0)
+            density = density if isinstance(density, Tensor) and density.ndim else float(density)
+            chooser = StepChooser(timing.control, self.numerics, parameters, prepared.packed, density, self.frame_dt, solids)
+            choose = chooser.choose
+        clock = Clock(self.frame_dt, self.substeps, None if frames == 1 else choose)
+        lag = 0.0 if timing is None else timing.lag
+        return Stepper(prepared, worlds, clock, each), Moment(self._begun(state, started), lag=lag)
+
+    def _poses(
+        self, stepper: Stepper, frames: int, start_time: float, replayed: bool
+    ) -> tuple[Callable[[int, Frame], tuple[Tensor, ...]], tuple[Tensor, ...]]:
+        """(what tells those of the colliders in a frame interval, all of them where these are known beforehand)."""
+        each, like = stepper.motions, (self.dtype, self.device)
+        if not self.colliders:
+            return lambda *_: (), ()
+        if stepper.clock.varies:
+            return lambda number, frame: sample_frame(
+                each[0], number, frames - 1, frame.first, frame.count, self.frame_dt, start_time, *like, replayed
+            ), ()
+        found = [sample_poses(own, frames - 1, self.substeps, self.dt, start_time, *like) for own in each]
+        found = tuple(torch.cat(parts, 1) if len(each) > 1 else parts[0] for parts in zip(*found))
+        return lambda _, frame: tuple(part[frame.first : frame.first + frame.count] for part in found), found
 
     def _prepare(
         self, state: ParticleState, parameters: dict[str, Tensor], volume: Tensor, density: float | Tensor, adapter, stride,
-        collect, frames: int, worlds: int | None = None, gravities: Sequence[tuple] | None = None, together: int | None = None,
+        collect, frames: int | None, worlds: int | None, gravities: Sequence[tuple] | None, together: int | None,
     ) -> Prepared:  # fmt: skip
         """What a rollout needs besides its state. Errors: ConfigError."""
-        if frames < 1 or (stride is not None and stride < 1):
+        if (frames is not None and frames < 1) or (stride is not None and stride < 1):
             raise ConfigError(f"frames and stride: expected at least 1, found {frames} and {stride}")
         check_state(self.numerics, state, volume)
         volume, n, count = volume.detach().contiguous(), len(volume), worlds or 1
         density, mean_mass = checked_density(density, volume)
         F = state.F if worlds is None else state.F.flatten(0, 1)
         packed = self.pack(parameters, n, polar_rotation(F) if self.law.reference is not None else None, worlds)
-        cutoff = self.mass_cutoff
+        cutoff = self.options.mass_cutoff
         if cutoff is None:
             cutoff = 0.0 if self.dtype == torch.float64 else 1e-12 * mean_mass
         if worlds is None:
@@ -345,52 +282,23 @@ class Simulator:
             size = together or (worlds if self.device.type == "cuda" else 1)
             volume, density = (t.repeat(size) if isinstance(t, Tensor) else t for t in (volume, density))
             solvers = [
-                SegmentSolver(self.numerics, volume, density, cutoff, gravities[i : i + size], i)
-                for i in range(0, worlds, size)
+                SegmentSolver(self.numerics, volume, density, cutoff, gravities[i : i + size], i) for i in range(0, worlds, size)
             ]
         if isinstance(adapter, Sequence):
             adapter = Several(adapter, count)
         lanes = Lanes(solvers, self.buffers)
-        return Prepared(self.numerics, self._ask, lanes, packed, adapter, stride, collect, self._long)
+        return Prepared(self.numerics, self._ask, lanes, packed, adapter, stride, collect, self.gathers)
 
     def _begun(self, state: ParticleState, started: bool) -> ParticleState:
         """The state that is advanced: F_tot is F itself where the law does not yield."""
-        spins = started or self.init_affine == "spin"
+        spins = started or self.options.init_affine == "spin"
         C_affine = state.C_affine if spins else torch.zeros_like(state.C_affine)
         return replace(state, C_affine=C_affine, F_tot=state.F_tot if self.law.plastic else state.F)
-
-    def _chooser(
-        self, control: StepControl, prepared: Prepared, parameters: dict[str, Tensor], density: float | Tensor, motions
-    ) -> StepChooser:
-        solids = max((m.max_speed(reach(c.shape)) for m, c in zip(motions, self.colliders)), default=0.0)
-        density = density if isinstance(density, Tensor) and density.ndim else float(density)
-        return StepChooser(control, self.numerics, parameters, prepared.packed, density, self.frame_dt, solids)
-
-    def _recorded(
-        self, recorded: dict[str, list[Tensor]], current: State, reactions: list[Tensor], taken: list[int]
-    ) -> Rollout:
-        stacked = {name: torch.stack(values) for name, values in recorded.items() if name != "F_tot"}
-        stacked["F_tot"] = torch.stack(recorded["F_tot"]) if self.law.plastic else stacked["F"]
-        frames = len(recorded["x"])
-        times = self.frame_dt * torch.arange(frames, dtype=self.dtype, device=self.device)
-        inverted = int((_determinant(stacked["F"].detach()) <= 0).sum())
-        if inverted and self.on_inversion == "warn":
-            warnings.warn(f"{inverted} particle states with det F <= 0 in {frames} frames", stacklevel=4)
-        per_frame = torch.stack(reactions) if reactions else None
-        return Rollout(
-            **stacked, times=times, final=ParticleState(*current), inverted=inverted, reactions=per_frame, counts=tuple(taken)
-        )
-
-    def _poses(self, motions: Sequence[Motion | Trajectory], frames: int, start_time: float) -> tuple[Tensor, ...]:
-        if not self.colliders:
-            return ()
-        return sample_poses(motions, frames - 1, self.substeps, self.dt, start_time, self.dtype, self.device)
 
     def material_state(self, F: Tensor, C_affine: Tensor, parameters: dict[str, Tensor]) -> MaterialState:
         """What an adapter would read at deformation gradients F (N, 3, 3); differentiable. For analysis and tests."""
         rotation = torch.eye(3, dtype=self.dtype, device=self.device).expand(len(F), 3, 3)
         return MaterialState(*material_state(self.law, F, C_affine, self.pack(parameters, len(F), rotation)))
-
 
 
 def _determinant(F: Tensor) -> Tensor:

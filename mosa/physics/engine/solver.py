@@ -10,11 +10,11 @@ from torch import Tensor
 
 from mosa.errors import SimulationDiverged
 from mosa.physics.engine.budget import Budget, substep_bytes
-from mosa.physics.engine.numerics import Numerics, State, Steps
+from mosa.physics.engine.numerics import Numerics, State
 from mosa.physics.engine.workspace import Workspace
 from mosa.physics.grid.transfer_kernels import INVERTED, NO_EVENT, NONFINITE, OUTSIDE, WINDOW
 from mosa.physics.grid.window import MAX_NODES, SMALL, extent, fallen, grid_window, window_of
-from mosa.physics.launching import copies, same_memory
+from mosa.physics.launching import same_memory
 
 WIDENED = 32
 """Most substeps of a segment whose window may be widened for particles of any speed; longer ones are cut instead."""
@@ -58,41 +58,6 @@ class SegmentSolver:
                 with_adjoint=with_adjoint, worlds=self.worlds,
             )  # fmt: skip
         return self.workspaces[key]
-
-    def prepare(
-        self, state: State, held: dict, poses, substeps: int, windows: tuple[np.ndarray, np.ndarray],
-        with_adjoint: bool, steps: Steps | None = None,
-    ) -> Workspace:  # fmt: skip
-        """A workspace loaded with the start of a segment. poses: of the colliders at its substeps, None where there are none;
-        windows: of every world."""
-        work = self.workspace(substeps, held["G"] is not None, held["plastic_G"] is not None, with_adjoint)
-        work.set_window(*windows)
-        work.load(state, held, self.volume, self.mass, self.cutoff, poses, steps, self.gravities)
-        return work
-
-    def advance(
-        self, state: State, held: dict, poses, substeps: int, first: int, steps: Steps | None = None, kept: bool = False
-    ) -> tuple[State, tuple, tuple, list[Tensor]]:
-        """(state after `substeps`, reactions (force, torque) of the colliders or (), grid windows used, `Workspace.tape`).
-
-        first: number of the first substep, for messages; steps: their times, the numerics' dt by default; kept: whether to make
-        the last, [] otherwise.
-
-        Errors: SimulationDiverged naming substep and particle; LeftWindow of more than `WIDENED` substeps.
-        """
-        steps = steps or Steps(self.numerics.dt, self.numerics.dt)
-        cut = substeps > WIDENED  # where the first window does not do, not widened
-
-        def run(windows: tuple[np.ndarray, np.ndarray]) -> Workspace:
-            work = self.prepare(state, held, poses, substeps, windows, with_adjoint=kept, steps=steps)
-            work.advance()
-            return work
-
-        # a few substeps that gravity takes out of the window are cheaper than nodes for it in every window
-        margins = (2,) if cut else (2, 3 + substeps // 2)
-        work, final, windows = self.within(run, state, substeps * steps.dt, margins, cut, first, steps.dt)
-        reaction = () if work.colliders is None else tuple(copies(work.colliders.reaction))
-        return final, reaction, windows, work.tape() if kept else []
 
     def within(
         self, run: Callable[[tuple[np.ndarray, np.ndarray]], Workspace], state: State, time: float, margins: Sequence[int],

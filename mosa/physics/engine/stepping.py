@@ -6,19 +6,19 @@ Both go through `Prepared.frame`, so that steps give the bits that a rollout giv
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mosa.errors import ConfigError
 from mosa.physics.contact.motion import Motion, Poses, Trajectory, sample_poses
 from mosa.physics.engine.adapter_interface import ANSWER, AdapterOperator, MaterialState
-from mosa.physics.engine.adaptive_steps import StepChooser
 from mosa.physics.engine.budget import room, substep_bytes
-from mosa.physics.engine.chain_schedule import SEGMENT
+from mosa.physics.engine.chain_schedule import SEGMENT, Chains
+from mosa.physics.engine.clock import Clock, Frame, Moment
 from mosa.physics.engine.lanes import Lanes
 from mosa.physics.engine.material_operations import first_advance
 from mosa.physics.engine.numerics import Numerics, State, Steps, flat
@@ -36,7 +36,8 @@ LONGEST_KEPT = 96
 class Prepared:
     """The bodies of one rollout: the parameters of their law, packed, what an adapter answered last, and what advances them.
 
-    ask: (adapter, F, C_affine, packed, collect) -> its answer by name. long: whether segments may be long (CUDA)."""
+    ask: (adapter, F, C_affine, packed, collect) -> its answer by name. gathers: whether a stretch of motion has as many substeps as
+    it can: segments are long, and an adapter that is a torch module is asked inside, in a chain of segments."""
 
     numerics: Numerics
     ask: Callable[..., dict[str, Tensor | None]]
@@ -45,12 +46,15 @@ class Prepared:
     adapter: Callable[[MaterialState], AdapterOperator] | None
     stride: int | None
     collect: Callable[[Any], None] | None
-    long: bool
+    gathers: bool
     held: dict[str, Tensor | None] = None
     most_alone: int = SEGMENT
 
     def __post_init__(self) -> None:
-        self.held = {"parameters": self.packed, **dict.fromkeys(ANSWER)}
+        self.held, self.chains = {"parameters": self.packed, **dict.fromkeys(ANSWER)}, None
+        alone = len(self.lanes.solvers) == 1 and self.stride is not None and not hasattr(self.adapter, "flow")
+        if self.gathers and alone and isinstance(self.adapter, nn.Module):
+            self.chains = Chains(self.lanes, self.adapter, self.ask, self.packed, self.collect)
 
     def first_advance(self, state: State, dt: float) -> State:
         """The advance of F by dt [s] with which a motion begins."""
@@ -64,7 +68,7 @@ class Prepared:
         return state._replace(F=mapped, F_tot=F_tot + dt * (C @ F_tot))
 
     def settle(self, state: State) -> None:
-        """Ask an adapter whose operator is the same in every state, once and for all: nothing cuts the segments then."""
+        """Ask an adapter whose operator is the same in every state, once and for all: nothing cuts segments then."""
         if self.adapter is not None and self.stride is None:
             self.held.update(self.ask(self.adapter, state.F, state.C_affine, self.packed, self.collect))
             self.adapter = None
@@ -75,30 +79,38 @@ class Prepared:
             each = substep_bytes(self.numerics, len(self.packed))
             self.lanes.give(room(self.numerics.device, substeps * each, self.lanes.worlds))
 
-    def choose_lengths(self, substeps: int, wanted: bool, variable: bool) -> None:
-        """How long segments may be that nothing cuts, in a motion of `substeps` substeps."""
+    def begin(self, state: State, poses: tuple[Tensor, ...], substeps: int, variable: bool, gives: bool = False) -> None:
+        """Before a motion of `substeps` substeps: how long stretches may be that nothing cuts. gives: also memory, as above."""
+        self.settle(state)
+        weights = () if self.chains is None else self.chains.look()
+        wanted = wants_gradient((*state, *self.held.values(), *poses, *weights))
+        if gives:
+            self.give_memory(substeps, wanted)
         self.most_alone = SEGMENT
-        if self.long and not variable and not wanted:
+        if self.chains is not None:
+            self.chains.begin(state, substeps, self.stride, wanted)
+        elif self.gathers and not variable and not wanted:
             self.most_alone = LONGEST
-        elif self.long and not variable and self.lanes.room:
+        elif self.gathers and not variable and self.lanes.room:
             self.most_alone = max(SEGMENT, min(LONGEST_KEPT, substeps // 8))
 
-    def lengths(self, count: int, variable: bool) -> list[int]:
-        """Of the segments of a frame of `count` substeps; variable: sizes that many counts share."""
-        if variable:
-            return segments(count, SEGMENT if self.adapter is None else self.stride)
-        return segments(count, None if self.adapter is None else self.stride, self.most_alone)
+    def lengths(self, frame: Frame) -> list[int]:
+        """Of the segments of a frame; where counts vary, sizes that many of them share."""
+        if self.adapter is not None:
+            return segments(frame.count, self.stride)
+        return segments(frame.count, None, self.most_alone) if frame.steps is None else segments(frame.count, SEGMENT)
 
-    def frame(
-        self, state: State, lengths: Sequence[int], first: int, poses: tuple[Tensor, ...], steps: Steps | None
-    ) -> tuple[State, Tensor | None]:
-        """(state after the segments of a frame, reactions (substeps, W K, 6) or None). first: number of its first substep; poses:
-        of W worlds with K colliders at its substeps, () where there are none; steps: None for the numerics' dt."""
+    def frame(self, state: State, frame: Frame, poses: tuple[Tensor, ...], alike: int = 0) -> tuple[State, Tensor | None]:
+        """(state after a frame, reactions (substeps, W K, 6) or None). poses: of W worlds with K colliders at its substeps, ()
+        where there are none; alike: frames that follow and are known to have as many substeps and no poses."""
+        lengths, first, steps = self.lengths(frame), frame.first, frame.steps
+        if self.chains is not None:
+            return self.chains.frame(state, lengths, first, poses, steps, alike)
         forces, done = [], 0
         flow = getattr(self.adapter, "flow", None)
         for length in lengths:
             if flow is not None:
-                state = state._replace(F=flow(state.F, length * (self.numerics.dt if steps is None else steps.dt)))
+                state = state._replace(F=flow(state.F, length * frame.dt))
             if self.adapter is not None:
                 self.held.update(self.ask(self.adapter, state.F, state.C_affine, self.packed, self.collect))
             along = tuple(part[done : done + length] for part in poses)
@@ -123,16 +135,6 @@ def mean_force(forces: Tensor, steps: Steps) -> Tensor:
     return (longer * forces[:1] + forces.sum(0, keepdim=True)) / (len(forces) + longer)
 
 
-class Moment(NamedTuple):
-    """Where a motion is that is advanced step by step. state: (N, ...) or, of B worlds, (B, N, ...); substeps: done since its
-    start, in how many frames; lag [s]: the last substep's dt, 0 before the first, for steps whose substeps are chosen."""
-
-    state: ParticleState
-    substeps: int = 0
-    frames: int = 0
-    lag: float = 0.0
-
-
 class Step(NamedTuple):
     """moment: after the step; reactions: (substeps, K, 6), (substeps, B, K, 6) of B worlds, as in a `Rollout`, None without
     colliders, (1, ...) where substeps are chosen; count: substeps taken."""
@@ -145,21 +147,14 @@ class Step(NamedTuple):
 class Stepper:
     """Advances bodies by one frame at a time, with colliders where the caller puts them. Made by `Simulator.stepper`.
 
-    prepared: with what is the same in all steps; worlds: None for one body without a leading dimension; count: substeps of a
-    step; chooser: where they are chosen instead; motions: of the colliders, of every world.
+    prepared: with what is the same in all steps; worlds: None for one body without a leading dimension; clock: how many substeps
+    the steps take; motions: of the colliders, of every world.
     """
 
     def __init__(
-        self, prepared: Prepared, worlds: int | None, count: int, frame_dt: float, chooser: StepChooser | None,
-        motions: Sequence[Sequence[Motion | Trajectory]], dtype: torch.dtype,
-    ) -> None:  # fmt: skip
-        self.prepared, self.worlds, self.count, self.frame_dt, self.chooser = prepared, worlds, count, frame_dt, chooser
-        self.motions, self.dtype = motions, dtype
-
-    @property
-    def dt(self) -> float:
-        """[s] of a substep where their count is fixed."""
-        return self.frame_dt / self.count
+        self, prepared: Prepared, worlds: int | None, clock: Clock, motions: Sequence[Sequence[Motion | Trajectory]]
+    ) -> None:
+        self.prepared, self.worlds, self.clock, self.motions = prepared, worlds, clock, motions
 
     def step(
         self, moment: Moment, poses: Poses | Callable[[int, float], Poses] | None = None, speed: float | None = None
@@ -170,44 +165,51 @@ class Stepper:
         dt [s]; None: of their own motions. speed: bound of the colliders' speeds [m/s] for substeps that are chosen, None for
         that of their own motions. Errors: SimulationDiverged naming substep and particle; ConfigError.
         """
-        prepared, variable = self.prepared, self.chooser is not None
-        state = flat(moment.state)
-        if not prepared.numerics.law.plastic:
-            state = state._replace(F_tot=state.F)
-        count = self.chooser.choose(moment.frames + 1, state, speed) if variable else self.count
-        dt = self.frame_dt / count
-        if moment.substeps == 0:
-            state = prepared.first_advance(state, dt)
-        steps = Steps(0.5 * (moment.lag + dt), dt) if variable else None
-        along = self._poses(moment, count, dt, poses)
-        prepared.choose_lengths(count, wants_gradient((*state, *prepared.held.values(), *along)), variable)
-        state, forces = prepared.frame(state, prepared.lengths(count, variable), moment.substeps, along, steps)
-        if forces is not None:
-            forces = mean_force(forces, steps) if variable else forces
-            forces = forces.unflatten(1, (self.worlds, -1)) if self.worlds is not None else forces
-        if self.worlds is not None:
-            state = tuple(t.unflatten(0, (self.worlds, -1)) for t in state)
-        after = Moment(ParticleState(*state), moment.substeps + count, moment.frames + 1, dt)
-        return Step(after, forces, count)
+        state, frame = self.enter(moment, moment.substeps == 0, speed)
+        along = self._poses(moment, frame, poses)
+        self.prepared.begin(state, along, frame.count, self.clock.varies)
+        after, forces, count = self.through(moment, state, frame, along)
+        return Step(after._replace(state=ParticleState(*self.apart(after.state))), *self.apart([forces], 1), count)
 
-    def _poses(self, moment: Moment, count: int, dt: float, poses: Poses | Callable | None) -> tuple[Tensor, ...]:
+    def enter(self, moment: Moment, begins: bool, speed: float | None = None) -> tuple[State, Frame]:
+        """(all particles before the next frame, the frame). begins: whether a motion does, whose F is not advanced yet."""
+        state = flat(moment.state)
+        if not self.prepared.numerics.law.plastic:
+            state = state._replace(F_tot=state.F)
+        frame = self.clock.frame(moment, state, speed)
+        return self.prepared.first_advance(state, frame.dt) if begins else state, frame
+
+    def through(self, moment: Moment, state: State, frame: Frame, poses: tuple[Tensor, ...], alike: int = 0) -> Step:
+        """The frame that `enter` found, of all particles one world's after the other's. poses, alike: as `Prepared.frame`."""
+        state, forces = self.prepared.frame(state, frame, poses, alike)
+        if forces is not None and frame.steps is not None:
+            forces = mean_force(forces, frame.steps)
+        return Step(Moment(state, moment.substeps + frame.count, moment.frames + 1, frame.dt), forces, frame.count)
+
+    def apart(self, tensors: Iterable[Tensor | None], dim: int = 0) -> list[Tensor | None]:
+        """With a dimension for the worlds in place of `dim`."""
+        return [t if self.worlds is None or t is None else t.unflatten(dim, (self.worlds, -1)) for t in tensors]
+
+    def _poses(self, moment: Moment, frame: Frame, poses: Poses | Callable | None) -> tuple[Tensor, ...]:
         """(S, W K, ...) each, in the simulator's type."""
-        colliders, device = len(self.motions[0]), self.prepared.numerics.device
+        colliders, numerics, count = len(self.motions[0]), self.prepared.numerics, frame.count
         if not colliders:
             return ()
         if poses is None:
-            each = [self.sample(moment, count, dt, motions) for motions in self.motions]
-            return tuple(torch.cat(parts, 1).to(self.dtype).to(device) for parts in zip(*each))
-        poses = poses(count, dt) if callable(poses) else poses
+            each = [self.sample(moment, count, frame.dt, motions) for motions in self.motions]
+            return tuple(torch.cat(parts, 1).to(numerics.dtype).to(numerics.device) for parts in zip(*each))
+        poses = poses(count, frame.dt) if callable(poses) else poses
         leading = (count, colliders) if self.worlds is None else (count, self.worlds, colliders)
         for name, part, shape in zip(Poses._fields, poses, ((3,), (3, 3), (3,), (3,)), strict=True):
             if tuple(part.shape) != (*leading, *shape):
                 raise ConfigError(f"poses: {name}: expected shape {(*leading, *shape)}, found {tuple(part.shape)}")
-        poses = [part.to(dtype=self.dtype, device=device) for part in poses]
+        poses = [part.to(dtype=numerics.dtype, device=numerics.device) for part in poses]
         return tuple(poses if self.worlds is None else (part.flatten(1, 2) for part in poses))
 
     def sample(self, moment: Moment, count: int, dt: float, motions: Sequence[Motion | Trajectory], after: int = 0) -> Poses:
         """Poses (S, K, ...) float64 of colliders with these motions at `count` substeps of dt [s] from `after` substeps after
         `moment`, at the times at which a rollout takes them."""
-        first, start = (moment.substeps, 0.0) if self.chooser is None else (0, moment.frames * self.frame_dt)
+        frame_dt = self.clock.frame_dt
+        motions = [motion.timed(None, frame_dt) if isinstance(motion, Motion) else motion for motion in motions]
+        first, start = (0, moment.frames * frame_dt) if self.clock.varies else (moment.substeps, 0.0)
         return sample_poses(motions, 1, count, dt, start, torch.float64, torch.device("cpu"), first + after)

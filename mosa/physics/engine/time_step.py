@@ -54,8 +54,3 @@ def required_substeps(
             "use a coarser grid (dx), a softer start, or raise simulation.max_substeps"
         )
     return count
-
-
-def courant_number(modulus_max: float, density: float, dt: float, dx: float, factor: float = 1.0) -> float:
-    """c dt/dx of a time step dt [s] on a grid of spacing dx [m]."""
-    return wave_speed(modulus_max, density, factor) * dt / dx
