@@ -155,6 +155,7 @@ BODY = {key: kind for key, kind in TRAINING.items()
         if key.split(".")[0] in ("seed", "simulation", "prior", "heterogeneity", "adapter", "world")}  # fmt: skip
 """Of these, what a checkpoint's body is built from."""
 EVALUATION: dict[str, Kind] = {
+    "deterministic": FLAG,
     "evaluation.floor": FLAG,
     "evaluation.samples": COUNT,
     "evaluation.assignment": COUNT,
