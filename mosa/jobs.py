@@ -6,13 +6,15 @@ Imported by every process of a sweep, whatever its launcher, through `hydra.call
 from __future__ import annotations
 
 import errno
+import fcntl
 import hashlib
 import os
 import shutil
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
@@ -21,14 +23,14 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from mosa.commands import fail
-from mosa.errors import MosaError
+from mosa.errors import ConfigError, MosaError
 
 FAILED = "failed"
 """Folder in that of a sweep: one file for each job that ended in an error, named after its number, with the message."""
 LONGEST = 120
 """Bytes of a job's folder name that its overrides may have: a file system takes 255 for the whole of it."""
 DISK = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.EIO, errno.ENOTDIR,
-        errno.EISDIR}  # fmt: skip
+        errno.EISDIR, errno.EFBIG}  # fmt: skip
 """What a disk or a folder's rights refuse, which is no mistake of the program."""
 
 
@@ -83,10 +85,48 @@ def terminated(number: int, *_) -> None:
 
 def disk_message(error: OSError) -> str | None:
     """One sentence on what the disk refused; None for any other error."""
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        return f"{error.filename or 'a file'}: cannot be opened ({error.strerror}); allow more of them at once with ulimit -n"
     if error.errno not in DISK:
         return None
     return (f"{error.filename or 'a file'}: cannot be written or read ({error.strerror}); free space, or choose other folders with "
             "hydra.run.dir= and scene.cache= (eval.py: cache=)")
+
+
+NO_MEMORY = ("can't allocate memory", "out of memory", "Failed to allocate")
+"""What torch and Warp say where the machine, or a GPU, has no more: errors of types that are also others'."""
+
+
+def memory_message(error: Exception) -> str | None:
+    """One sentence on memory that there is not; None for any other error."""
+    if not isinstance(error, MemoryError) and not any(text in str(error) for text in NO_MEMORY):
+        return None
+    told = " ".join(str(error).split())[:200] or "the machine has no more"
+    return f"{told}; lower the sizes (simulation.particles, scene.scale)"
+
+
+@contextmanager
+def held(folder: str | Path) -> Iterator[None]:
+    """A run's folder as this process's own. The system's lock on it ends with the process, however that ends, and leaves no file.
+
+    Errors: ConfigError where another process has it."""
+    try:
+        number = os.open(folder, os.O_RDONLY)
+    except OSError:  # said where the folder is written to
+        yield
+        return
+    try:
+        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(number)
+        raise ConfigError(f"hydra.run.dir: another process is at work in {folder}; wait until it has ended, or give this run a "
+                          "folder of its own") from None
+    except OSError:  # a file system that knows no locks
+        pass
+    try:
+        yield
+    finally:
+        os.close(number)
 
 
 def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float | None:
@@ -95,16 +135,20 @@ def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float
     first = os.environ.get("LOCAL_RANK", "0") == "0"  # of the processes of a fit on several devices: it speaks for all
     if first and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, terminated)
+    folder = OmegaConf.select(HydraConfig.get(), "runtime.output_dir") if HydraConfig.initialized() else None
     try:
-        return job(cfg)
+        with held(folder) if first and folder is not None else nullcontext():
+            return job(cfg)
     except KeyboardInterrupt:
         if first:
             fail("stopped; resume with ckpt_path=<run folder>/checkpoints/last.ckpt, where the fit had begun")
         sys.exit(143 if signal.SIGTERM in signals else 130)
     except MosaError as error:
         message = f"{type(error).__name__}: {error}"
-    except MemoryError as error:
-        message = f"MemoryError: {error or 'the machine has no more'}; lower the sizes (simulation.particles, scene.scale)"
+    except (MemoryError, RuntimeError) as error:
+        if (reason := memory_message(error)) is None:
+            raise
+        message = f"MemoryError: {reason}"
     except OSError as error:
         if (reason := disk_message(error)) is None:
             raise

@@ -13,7 +13,7 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from mosa.errors import ConfigError
-from mosa.jobs import LONGEST, Failures, attempt, folder_name
+from mosa.jobs import LONGEST, Failures, attempt, folder_name, held
 
 ROOT = Path(__file__).parents[1]
 
@@ -55,7 +55,21 @@ def test_a_mistake_of_the_program_is_not_swallowed(sweep):
         attempt(fail(ConnectionResetError(errno.ECONNRESET, "reset")), None)
 
 
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EACCES])
+def test_a_run_folder_is_one_process_own_until_that_ends(tmp_path):
+    """Two runs in one folder mixed their checkpoints and figures without a word."""
+    code = f"import time; from mosa.jobs import held\nwith held({str(tmp_path)!r}): print('held', flush=True); time.sleep(60)"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=ROOT) as other:
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(ConfigError, match=r"hydra\.run\.dir: another process is at work in"), held(tmp_path):
+            pass
+        other.kill()
+        other.wait()
+        with held(tmp_path):
+            pass
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EFBIG])
 def test_what_a_disk_refuses_is_one_message(sweep, capsys, code):
     attempt(fail(OSError(code, os.strerror(code), "/full/file")), None)
     assert f"/full/file: cannot be written or read ({os.strerror(code)})" in capsys.readouterr().err
@@ -66,6 +80,18 @@ def test_a_single_run_exits_with_2(sweep, monkeypatch):
     with pytest.raises(SystemExit) as caught:
         attempt(fail(ConfigError("seed: wrong")), None)
     assert caught.value.code == 2
+
+
+@pytest.mark.parametrize("error", [
+    MemoryError(), RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes."),
+    RuntimeError("CUDA out of memory. Tried to allocate 9.00 GiB"), OSError(errno.EMFILE, os.strerror(errno.EMFILE), "/a/file"),
+])  # fmt: skip
+def test_what_the_machine_has_not_is_one_message(sweep, capsys, error):
+    attempt(fail(error), None)
+    said = capsys.readouterr().err.strip()
+    assert len(said.splitlines()) == 1 and ("simulation.particles" in said or "ulimit -n" in said)
+    with pytest.raises(RuntimeError):
+        attempt(fail(RuntimeError("another one")), None)
 
 
 def test_a_long_name_is_cut_and_stays_its_own():
