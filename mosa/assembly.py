@@ -70,7 +70,7 @@ class Run:
         """Folder of cached reconstructions: scene.cache, or mosa/ in the user's cache folder."""
         if self.cfg.scene.get("cache"):
             return Path(self.cfg.scene.cache)
-        return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "mosa"
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mosa"
 
     @property
     def reconstruction_settings(self) -> ReconstructionSettings:

@@ -13,7 +13,7 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from mosa.errors import ConfigError
-from mosa.jobs import LONGEST, Failures, attempt, folder_name, held
+from mosa.jobs import LONGEST, Failures, attempt, check_folders, folder_name, held, quoted
 
 ROOT = Path(__file__).parents[1]
 
@@ -100,6 +100,31 @@ def test_a_long_name_is_cut_and_stays_its_own():
     names = {folder_name("x" * 500 + str(i)) for i in range(50)}
     assert len(names) == 50 and all(len(name.encode()) <= LONGEST + 9 for name in names)
     assert len(folder_name("ü" * 500).encode()) <= LONGEST + 9
+
+
+@pytest.mark.parametrize(("argument", "found"), [
+    ("scene.path=/data/höhle", "scene.path='/data/höhle'"), ("scene.path=~/x", "scene.path='~/x'"),
+    ("scene.path=/a=b & c", "scene.path='/a=b & c'"), ("scene.path=/a b", "scene.path=/a b"), ("seed=0,1", "seed=0,1"),
+    ("fit.x=[ä]", "fit.x=[ä]"), ("x='ä'", "x='ä'"), ("prior=ä,b", "prior=ä,b"), ("--cfg=ä", "--cfg=ä"), ("banana", "banana"),
+])  # fmt: skip
+def test_values_that_hydra_cannot_read_are_quoted(argument, found):
+    """It ended a run whose path had an umlaut in it."""
+    assert quoted(argument) == found
+
+
+def test_a_run_folder_that_cannot_be_made_is_said_before_hydra_fails(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    check_folders([f"hydra.run.dir={tmp_path}/new/folder", "hydra.sweep.dir=a/${now:%H}", "seed=0"])
+    for wrong in ("file", "file/below"):
+        with pytest.raises(SystemExit) as ended:
+            check_folders(["seed=0", f"hydra.run.dir={tmp_path}/{wrong}"])
+        assert ended.value.code == 2 and "hydra.run.dir: expected a folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("arguments", [["banana"], ["banana=3"], ["scene=banana"]])
+def test_what_hydra_refuses_is_a_mistake_of_the_user_too(arguments):
+    found = subprocess.run([sys.executable, "train.py", *arguments], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert found.returncode == 2 and "Traceback" not in found.stderr
 
 
 PROGRAM = """

@@ -4,15 +4,11 @@ With any of simulate.velocity, simulate.rotation, simulate.position, simulate.he
 learned law out from a new start instead.
 """
 
-import os
-import sys
-from pathlib import Path
-
 import hydra
 from omegaconf import DictConfig
 
 from mosa.commands import begin_log, configuration
-from mosa.jobs import attempt, check_arguments
+from mosa.jobs import attempt, command
 
 
 @hydra.main(version_base="1.3", config_path=configuration(), config_name="eval")
@@ -27,6 +23,4 @@ def run(cfg: DictConfig) -> float | None:
 
 
 def main() -> None:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    check_arguments(sys.argv[1:], Path(configuration()))
-    run()
+    command(run, configuration())

@@ -1,14 +1,10 @@
 """A 3DGS file of an object becomes a body that falls, without any video:  mosa-splats ply=object.ply prior=corotated"""
 
-import os
-import sys
-from pathlib import Path
-
 import hydra
 from omegaconf import DictConfig
 
 from mosa.commands import begin_log, configuration
-from mosa.jobs import attempt, check_arguments
+from mosa.jobs import attempt, command
 
 
 @hydra.main(version_base="1.3", config_path=configuration(), config_name="splats")
@@ -23,6 +19,4 @@ def run(cfg: DictConfig) -> None:
 
 
 def main() -> None:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    check_arguments(sys.argv[1:], Path(configuration()))
-    run()
+    command(run, configuration())

@@ -2,13 +2,12 @@
 
 import os
 import sys
-from pathlib import Path
 
 import hydra
 from omegaconf import DictConfig
 
 from mosa.commands import begin_log, configuration
-from mosa.jobs import Failures, attempt, check_arguments
+from mosa.jobs import Failures, attempt, command
 
 
 @hydra.main(version_base="1.3", config_path=configuration(), config_name="train")
@@ -23,10 +22,8 @@ def run(cfg: DictConfig) -> float | None:
 
 
 def main() -> None:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # on small tensors and shared machines a second thread was measured 30x slower
     if os.environ.get("LOCAL_RANK", "0") != "0":  # a further process of a fit on several devices: the first speaks for all
         os.environ["TQDM_DISABLE"] = "1"
         sys.stdout = open(os.devnull, "w")  # until the process ends
-    check_arguments(sys.argv[1:], Path(configuration()))
-    run()
+    command(run, configuration())
     sys.exit(1 if Failures.count else 0)
