@@ -318,7 +318,7 @@ def price(gpu: int | None = None) -> str:
                 f"long_runs.timed({exact})")  # fmt: skip
         made = subprocess.run([sys.executable, "-c", code], env=environment(gpu), cwd=ROOT, capture_output=True, text=True)
         if made.returncode:
-            return f"not measured: {made.stderr[-300:]}"
+            return f"not measured: {' '.join(made.stderr.split())[-300:]}"
         seconds[exact] = json.loads(made.stdout.splitlines()[-1])
     return "; ".join(f"{name} {1e3 * plain:.2f} -> {1e3 * seconds[True][name]:.2f} ms ({seconds[True][name] / plain:.2f} times)"
                      for name, plain in seconds[False].items())  # fmt: skip
