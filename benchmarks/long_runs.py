@@ -1,13 +1,23 @@
-"""Many runs: in a row, side by side, killed and resumed; and many rollouts in one process.
+"""Many runs, killed and resumed, many rollouts in one process, and equal runs on a GPU: what leaks, differs or is left behind.
 
-    OMP_NUM_THREADS=1 python benchmarks/long_runs.py                     # small: about ten minutes on two cores
-    OMP_NUM_THREADS=1 python benchmarks/long_runs.py --runs 60 --kills 40 --rollouts 20000
-    OMP_NUM_THREADS=1 python benchmarks/long_runs.py --launcher submitit_local
+    OMP_NUM_THREADS=1 python benchmarks/long_runs.py                     # small: about fifteen minutes on two cores
+    OMP_NUM_THREADS=1 python benchmarks/long_runs.py --runs 200 --workers 24 --kills 6 --between 15 40 --launched 24 \\
+        --rollouts 21600 --frames 12 --particles 4000 --device cuda      # all of it, on 32 cores and two GPUs
+    OMP_NUM_THREADS=1 python benchmarks/long_runs.py --parts rollouts --rollouts 2000
 
-Runs are drawn (law, criterion, adapter, numbers of the fit) on the tiny scene. The same ones are made one after the other, then as
-a sweep of a launcher (the extra `sweep`), which is killed with SIGKILL, with all of its processes, at drawn moments and started
-again with resume=auto until it is complete. Told: exit codes, which figures differ between the two (times apart), what is left
-behind (processes, half-written files, locks), and by how much a process's memory grows over rollouts.
+Three parts, side by side where there are GPUs:
+
+- runs: drawn ones (law, criterion, adapter, numbers of the fit, seed) on the tiny scene, each in a process of its own, `workers`
+  beside each other. The same ones then as a sweep of joblib, and the first `launched` of them also of submitit's local executor.
+  Every process of a sweep is killed with SIGKILL at drawn moments, and the same command is given again, with resume=auto, until
+  it has come to its end.
+- rollouts: `rollouts` drawn drops of one body in one process, of `frames` frames. 21,600 are a day of them on a CPU, of 4 s each.
+  Every hundredth is made twice and compared.
+- equality (with --device cuda): two runs that are given the same, and two with deterministic=true; and what that costs a rollout
+  with and without gradient.
+
+One table at the end; exit code 1 where a row is not as asked: figures that differ, a process, half-written file or lock that is
+left, memory, file handles or threads that grow. The launchers are the extra `sweep`; a part whose launcher is not installed fails.
 """
 
 from __future__ import annotations
@@ -20,19 +30,35 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
 import torch
 
 ROOT = Path(__file__).parents[1]
-SMALL = ["debug=default", "evaluation.video=false", "logger=none", "simulation.particles=100",
-         "reconstruction.static.iterations=60", "reconstruction.appearance.iterations=60",
-         "reconstruction.dynamic.iterations=30"]  # fmt: skip
+SMALL = ["debug=default", "evaluation.video=false", "logger=none", "reconstruction.static.iterations=60",
+         "reconstruction.appearance.iterations=60", "reconstruction.dynamic.iterations=30", "identification.threads=1"]  # fmt: skip
 CHOICES = {
     "prior": ["corotated", "neo_hookean", "linear", "stvk"], "criterion": ["corrected", "free"], "adapter": ["operator", "none"],
-    "fit.joint.newton_iterations": [1, 2], "identification.count": [20.0, 30.0],
+    "fit.joint.newton_iterations": [1, 2], "identification.count": [20.0, 30.0], "seed": [0, 1, 2, 3],
 }  # fmt: skip
+MARKS = (".partial", ".tmp", ".lock")
+PARTS = ("runs", "rollouts", "equality")
+GROWTH = 20.0
+"""MB that a process's memory may differ by after thousands of rollouts: an allocator's pools, not a leak of each."""
+AGREE = 0.05
+"""Share by which figures of two equal runs on a GPU may differ, where sums are added in any order."""
+
+
+class Row(NamedTuple):
+    what: str
+    asked: str
+    found: str
+    met: bool
 
 
 def drawn(count: int, generator: random.Random) -> list[list[str]]:
@@ -47,140 +73,385 @@ def drawn(count: int, generator: random.Random) -> list[list[str]]:
     return found
 
 
-def environment() -> dict[str, str]:
-    return {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
+def environment(gpu: int | None = None) -> dict[str, str]:
+    path = f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
+    seen = {} if gpu is None else {"CUDA_VISIBLE_DEVICES": str(gpu)}
+    return {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path, **seen}
 
 
-def started(arguments: list[str], log: Path) -> subprocess.Popen:
+def started(arguments: list[str], log: Path, gpu: int | None = None) -> subprocess.Popen:
     with open(log, "a") as file:
-        return subprocess.Popen([sys.executable, str(ROOT / "train.py"), *arguments], cwd=ROOT, env=environment(), stdout=file,
+        return subprocess.Popen([sys.executable, str(ROOT / "train.py"), *arguments], cwd=ROOT, env=environment(gpu), stdout=file,
                                 stderr=file, start_new_session=True)  # fmt: skip
 
 
 def figures(folder: Path) -> dict:
     """Of a run, without what depends on the clock and the machine."""
-    found = json.loads((folder / "metrics.json").read_text())
-    return {key: value for key, value in found.items() if not key.startswith("time/")}
+    path = folder / "metrics.json"
+    if not path.is_file():
+        return {"metrics.json": "none"}
+    return {key: value for key, value in json.loads(path.read_text()).items() if not key.startswith("time/")}
 
 
 def processes_with(text: str) -> list[int]:
-    """Of this machine's processes, those whose command line or folder names `text`."""
+    """Of this machine's processes, those whose command line or folder names `text`, but this one and those that run parts."""
     found = []
     for place in Path("/proc").glob("[0-9]*"):
         try:
-            told = (place / "cmdline").read_bytes().decode(errors="ignore") + os.readlink(place / "cwd")
+            told = (place / "cmdline").read_bytes().decode(errors="ignore")
+            folder = os.readlink(place / "cwd")
         except OSError:
             continue
-        if text in told and int(place.name) != os.getpid():
+        if text in told + folder and "long_runs.py" not in told:
             found.append(int(place.name))
     return found
 
 
 def leftovers(*folders: Path) -> list[str]:
-    marks = (".partial", ".tmp", ".lock")
-    return [str(file) for folder in folders for file in folder.rglob("*") if file.name.endswith(marks)]
+    return [str(file) for folder in folders for file in folder.rglob("*") if file.name.endswith(MARKS)]
 
 
-def in_a_row(sets: list[list[str]], folder: Path, common: list[str]) -> list[dict]:
-    """The runs one after the other; their figures."""
-    made = []
-    for k, overrides in enumerate(sets):
-        began = time.perf_counter()
-        code = started([*common, *overrides, f"hydra.run.dir={folder}/{k}"], folder / f"{k}.log").wait(900)
-        print(f"run {k}: exit {code}, {time.perf_counter() - began:.0f} s: {' '.join(overrides)}", flush=True)
-        made.append(figures(folder / str(k)) if code == 0 else {"exit": code})
-    return made
+def told(row: Row) -> Row:
+    print(f"[{time.strftime('%H:%M:%S')}] {row.what}: {row.found}{'' if row.met else '   <- NOT AS ASKED'}", flush=True)
+    return row
 
 
-def killed_sweep(sets: list[list[str]], folder: Path, common: list[str], launcher: str, kills: int, span: tuple[float, float],
-                 generator: random.Random) -> tuple[list[dict], int]:  # fmt: skip
-    """The same runs as a sweep, killed `kills` times, then left alone; (their figures, jobs that a kill met unfinished)."""
-    # one experiment file per set: a sweep goes through them
+# -------------------------------------------------------------------------------------------------------------------------- runs
+
+
+def by_themselves(sets: list[list[str]], folder: Path, common: list[str], workers: int) -> list[dict]:
+    """The runs, each in a process of its own, `workers` beside each other; their figures."""
+
+    def one(k: int) -> dict:
+        code = started([*common, *sets[k], f"hydra.run.dir={folder}/{k}"], folder / f"{k}.log").wait(900)
+        return figures(folder / str(k)) if code == 0 else {"exit code": code}
+
+    # the first of each law first, alone with the kernels that it compiles
+    laws = [next(k for k, s in enumerate(sets) if s[0] == law) for law in sorted({s[0] for s in sets})]
+    with ThreadPoolExecutor(workers) as pool:
+        found = dict(zip(laws, pool.map(one, laws)))
+        others = [k for k in range(len(sets)) if k not in found]
+        found |= dict(zip(others, pool.map(one, others)))
+    return [found[k] for k in range(len(sets))]
+
+
+def experiments(sets: list[list[str]], folder: Path) -> str:
+    """One experiment file per set: what a sweep goes through, as its override."""
     conf = folder / "conf" / "experiment"
     conf.mkdir(parents=True)
     for k, overrides in enumerate(sets):
-        groups = [f"  - override /{key}: {value}" for key, value in (o.split("=") for o in overrides) if "." not in key]
-        lines = ["# @package _global_", "defaults:", *groups]
+        pairs = [override.split("=") for override in overrides]
+        groups = [f"  - override /{key}: {value}" for key, value in pairs if "." not in key and key != "seed"]
         tree: dict = {}
-        for key, value in (o.split("=") for o in overrides if "." in o.split("=")[0]):
-            at = tree
-            *path, last = key.split(".")
-            for part in path:
-                at = at.setdefault(part, {})
-            at[last] = json.loads(value)
-        lines += [f"{key}: {json.dumps(value)}" for key, value in tree.items()]
+        for key, value in pairs:
+            if "." in key or key == "seed":
+                *path, last = key.split(".")
+                at = tree
+                for part in path:
+                    at = at.setdefault(part, {})
+                at[last] = json.loads(value)
+        lines = ["# @package _global_", "defaults:", *groups, *(f"{key}: {json.dumps(value)}" for key, value in tree.items())]
         (conf / f"drawn_{k}.yaml").write_text("\n".join(lines) + "\n")
-    names = ",".join(f"drawn_{k}" for k in range(len(sets)))
+    return "experiment=" + ",".join(f"drawn_{k}" for k in range(len(sets)))
+
+
+def killed_sweep(sets: list[list[str]], folder: Path, common: list[str], launcher: str, workers: int, kills: int,
+                 span: tuple[float, float], generator: random.Random) -> tuple[list[dict], int, int, int]:  # fmt: skip
+    """The same runs as a sweep, killed at most `kills` times and given again.
+
+    Returns (their figures, exit code of the last, kills, jobs that a kill met unfinished)."""
+    folder.mkdir()
     sweep = ["-m", "--config-dir", str(folder / "conf"), *common, f"hydra/launcher={launcher}", "resume=auto",
-             *(["hydra.launcher.n_jobs=2"] if launcher == "joblib" else []), f"experiment={names}",
-             f"hydra.sweep.dir={folder}/sweep", "hydra.sweep.subdir=${hydra.job.num}"]
-    met = 0
-    for _ in range(kills):
-        process, wait = started(sweep, folder / "sweep.log"), generator.uniform(*span)
+             *([f"hydra.launcher.n_jobs={workers}"] if launcher == "joblib" else []), experiments(sets, folder),
+             f"hydra.sweep.dir={folder}/sweep", "hydra.sweep.subdir=${hydra.job.num}"]  # fmt: skip
+    met = count = 0
+    while True:
+        process = started(sweep, folder / "sweep.log")
         try:
-            process.wait(wait)
-            break  # it was faster than the kill
+            code = process.wait(generator.uniform(*span) if count < kills else 1800)
+            break
         except subprocess.TimeoutExpired:
             done = len(list((folder / "sweep").glob("*/metrics.json")))
-            met += len(sets) - done
-            os.killpg(process.pid, signal.SIGKILL)
+            met, count = met + len(sets) - done, count + 1
+            # as when the machine goes down: submitit's jobs are no children of the process that launched them
+            for number in {process.pid, *processes_with(str(folder))}:
+                try:
+                    os.kill(number, signal.SIGKILL)
+                except ProcessLookupError:
+                    continue
             process.wait()
-            time.sleep(1.0)
-            print(f"killed after {wait:.0f} s with {done} of {len(sets)} jobs complete; processes left: "
-                  f"{len(processes_with(str(folder / 'sweep')))}", flush=True)  # fmt: skip
-    code = started(sweep, folder / "sweep.log").wait(1800)
-    print(f"sweep resumed: exit {code}", flush=True)
-    made = [folder / "sweep" / str(k) for k in range(len(sets))]
-    return [figures(f) if (f / "metrics.json").is_file() else {} for f in made], met
+            time.sleep(0.5)
+            print(f"{launcher}: kill {count} with {done} of {len(sets)} jobs complete", flush=True)
+    return [figures(folder / "sweep" / str(k)) for k in range(len(sets))], code, count, met
 
 
-def growth_of_rollouts(checkpoint: Path, count: int) -> tuple[float, float]:
-    """(MB of this process's memory that `count` drawn rollouts add after a tenth of them, rollouts a second)."""
+def runs(options: argparse.Namespace, folder: Path) -> list[Row]:
+    generator, rows = random.Random(options.seed), []
+    sets = drawn(options.runs, generator)
+    common = [*SMALL, "simulation.particles=100", f"scene.cache={folder}/cache"]
+    (folder / "alone").mkdir()
+    began = time.perf_counter()
+    alone = by_themselves(sets, folder / "alone", common, options.workers)
+    wrong = [k for k, found in enumerate(alone) if "exit code" in found or "metrics.json" in found]
+    for k in wrong:
+        print(f"run {k} failed: {' '.join(sets[k])}: {(folder / 'alone' / f'{k}.log').read_text()[-1500:]}")
+    rows.append(told(Row(f"{len(sets)} drawn runs, {options.workers} beside each other", "all complete",
+                                 f"{len(sets) - len(wrong)}, {time.perf_counter() - began:.0f} s", not wrong)))  # fmt: skip
+    for launcher, count, kills in (("joblib", len(sets), options.kills), ("submitit_local", options.launched, 1)):
+        chosen = sets[:count]
+        if not chosen:
+            continue
+        began = time.perf_counter()
+        again, code, killed, met = killed_sweep(chosen, folder / launcher, common, launcher, options.workers, kills,
+                                                tuple(options.between), generator)  # fmt: skip
+        differ = [k for k, (a, b) in enumerate(zip(alone, again)) if a != b]
+        for k in differ:
+            names = sorted(name for name in {*alone[k], *again[k]} if alone[k].get(name) != again[k].get(name))
+            print(f"run {k} differs: {' '.join(sets[k])}: {names[:8]}")
+        if code or differ:
+            print((folder / launcher / "sweep.log").read_text()[-3000:])
+        found = (f"{len(differ)} with figures that differ, exit code {code}, {killed} kills met {met} unfinished jobs, "
+                 f"{time.perf_counter() - began:.0f} s")  # fmt: skip
+        asked = "0 differ, exit code 0" + (", a kill met some" if kills else "")
+        what = f"the {'same' if count == len(sets) else f'first {count}'} as a sweep of {launcher}, killed and resumed"
+        rows.append(told(Row(what, asked, found, not differ and code == 0 and (met > 0 or not kills))))
+    time.sleep(2.0)  # for what ends by itself: joblib's trackers
+    alive, left = processes_with(str(folder)), leftovers(folder)
+    print("\n".join(left))
+    rows.append(told(Row("left behind by them", "nothing",
+                                 f"{len(alive)} processes, {len(left)} half-written files or locks", not alive and not left)))
+    return rows
+
+
+# ---------------------------------------------------------------------------------------------------------------------- rollouts
+
+
+def resident() -> float:
+    """MB of this process's memory."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def on_device(device: str) -> float:
+    """MB of the GPU that are taken, by all of its processes."""
+    if device == "cpu":
+        return 0.0
+    free, total = torch.cuda.mem_get_info()
+    return (total - free) / 1e6
+
+
+def checkpoint(folder: Path, particles: int, device: str, gpu: int | None) -> Path:
+    """Of a small run whose body has so many particles."""
+    where = [] if device == "cpu" else ["trainer=gpu"]
+    size, places = f"simulation.particles={particles}", [f"scene.cache={folder}/cache", f"hydra.run.dir={folder}/run"]
+    code = started([*SMALL, *where, size, *places], folder / "run.log", gpu).wait(900)
+    if code:
+        raise SystemExit(f"the run that makes the body ended with {code}:\n{(folder / 'run.log').read_text()[-3000:]}")
+    return folder / "run" / "checkpoints" / "last.ckpt"
+
+
+def rollouts(options: argparse.Namespace, folder: Path) -> list[Row]:
+    """In this process: it is the one whose memory is looked at."""
     from mosa.twin import Twin
 
-    def resident() -> float:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-    twin, generator = Twin.load(checkpoint), torch.Generator().manual_seed(0)
-    early, began = 0.0, time.perf_counter()
-    for k in range(count):
-        if k == count // 10:
-            early = resident()
+    path = checkpoint(folder, options.particles, options.device, None)
+    twin, generator = Twin.load(path, options.device), torch.Generator().manual_seed(options.seed)
+    counts = {"MB of memory": resident, "MB of the GPU": lambda: on_device(options.device),
+              "file handles": lambda: len(os.listdir("/proc/self/fd")), "threads": threading.active_count}  # fmt: skip
+    early, differ, apart, made, began = {}, 0, 0.0, 0, time.perf_counter()
+    temporary = set(Path(tempfile.gettempdir()).glob("*"))
+    for k in range(options.rollouts):
+        if k == max(1, options.rollouts // 10):
+            early = {name: count() for name, count in counts.items()}
         speed, turn = torch.randn(3, generator=generator), torch.randn(4, generator=generator)
         height = 0.1 + 0.2 * float(torch.rand(1, generator=generator))
-        twin.simulate(rotation=[*turn[:3].tolist(), 90 * float(turn[3])], height=height, velocity=speed.tolist(), frames=8)
-    return resident() - early, count / (time.perf_counter() - began)
+        start = {"rotation": [*turn[:3].tolist(), 90 * float(turn[3])], "height": height, "velocity": speed.tolist(),
+                 "frames": options.frames}  # fmt: skip
+        found = twin.simulate(**start).x
+        if k % 100 == 0:
+            distance = float((twin.simulate(**start).x - found).norm(dim=-1).max()) / twin.body.settings.dx
+            differ, apart = differ + (distance > 0), max(apart, distance)
+        made = k + 1
+        if time.perf_counter() - began > options.seconds:
+            break
+    took = time.perf_counter() - began
+    grown = {name: count() - early.get(name, count()) for name, count in counts.items()}
+    new = sorted(p.name for p in set(Path(tempfile.gettempdir()).glob("*")) - temporary if p.stat().st_uid == os.getuid())
+    what = f"{made} rollouts of {options.frames} frames, {len(twin.body.rest)} particles, one process on {options.device}"
+    asked = f"{options.rollouts}; at most {GROWTH:g} MB, 0 handles, 0 threads added"
+    rows = [told(Row(what, asked, f"{made / took:.1f} a second; after the first tenth " + ", ".join(
+        f"{value:+.1f} {name}" if "MB" in name else f"{value:+d} {name}" for name, value in grown.items()),
+        made == options.rollouts and max(grown["MB of memory"], grown["MB of the GPU"]) <= GROWTH
+        and grown["file handles"] <= 0 and grown["threads"] <= 0))]  # fmt: skip
+    bound = "bit for bit" if options.device == "cpu" else "within 0.01 cells"
+    found = f"{differ} of {-(-made // 100)} differ, at most {apart:.2g} cells"
+    met = differ == 0 if options.device == "cpu" else apart < 0.01
+    rows.append(told(Row("every hundredth of them made twice", bound, found, met)))
+    what = "left in the temporary folder while they ran (by anyone)"
+    rows.append(told(Row(what, "reported", ", ".join(new[:5]) or "nothing", True)))
+    return rows
+
+
+# ---------------------------------------------------------------------------------------------------------------------- equality
+
+
+def apart(a: Path, b: Path) -> tuple[list[str], float, float]:
+    """(figures of two runs that differ, the largest relative difference of E, nu and errors, of positions [m])."""
+    one, other = figures(a), figures(b)
+    differ = sorted(name for name in {*one, *other} if one.get(name) != other.get(name))
+    compared = [name for name in one if name in ("id/E", "id/nu", "train/rms_m", "test/rms_m", "prior/test/rms_m")]
+    share = max((abs(one[n] - other.get(n, np.inf)) / max(abs(one[n]), 1e-12) for n in compared), default=np.inf)
+    distance = 0.0
+    for name in ("rollout.npz", "prior.npz"):
+        if (a / name).is_file() and (b / name).is_file():
+            with np.load(a / name) as x, np.load(b / name) as y:
+                same = [key for key in x.files if x[key].shape == y[key].shape]
+                differ += [f"{name}:{key}" for key in x.files if key not in same or not np.array_equal(x[key], y[key])]
+                distance = max([distance, *(float(np.abs(x[k] - y[k]).max()) for k in same if k.endswith("/x"))])
+    return differ, share, distance
+
+
+def price(gpu: int | None = None) -> str:
+    """What exact sums cost a rollout, with and without gradient: benchmarks/rollout.py's body, in a process each."""
+    seconds = {}
+    for exact in (False, True):
+        code = (f"import sys; sys.path.insert(0, {str(ROOT / 'benchmarks')!r}); import long_runs; "
+                f"long_runs.timed({exact})")  # fmt: skip
+        made = subprocess.run([sys.executable, "-c", code], env=environment(gpu), cwd=ROOT, capture_output=True, text=True)
+        if made.returncode:
+            return f"not measured: {' '.join(made.stderr.split())[-300:]}"
+        seconds[exact] = json.loads(made.stdout.splitlines()[-1])
+    return "; ".join(f"{name} {1e3 * plain:.2f} -> {1e3 * seconds[True][name]:.2f} ms ({seconds[True][name] / plain:.2f} times)"
+                     for name, plain in seconds[False].items())  # fmt: skip
+
+
+def timed(exact: bool, device: str = "cuda") -> None:
+    """Print the seconds of a frame of 64 substeps, by particles, forward and with gradient, as JSON."""
+    from mosa import exact_sums
+    from mosa.physics.contact.planes import Plane
+    from mosa.physics.engine.simulator import Simulator
+    from mosa.types import ParticleState
+
+    exact_sums.use(exact)
+    found = {}
+    for edge in (16, 32):
+        dx, axis = 1.0 / (1.2 * edge), torch.arange(edge)
+        x = (0.1 + dx / 2 * (torch.cartesian_prod(axis, axis, axis) + 0.5)).to(device)
+        eye = torch.eye(3, device=device).expand(len(x), 3, 3).contiguous()
+        state = ParticleState(x, torch.zeros_like(x), 0 * eye, eye, eye)
+        simulator = Simulator("corotated", dx=dx, substeps=64, frame_dt=64 * 2e-4 / edge * 16, gravity=(0, -9.8, 0), up=(0, 1, 0),
+                              planes=[Plane((0, 0.1, 0), (0, 1, 0))], device=device)  # fmt: skip
+        volume = torch.full((len(x),), (dx / 2) ** 3, device=device)
+        for name, wanted in (("forward", False), ("with gradient", True)):
+            times = []
+            for _ in range(6):
+                mu = torch.tensor(4e4, device=device, requires_grad=wanted)
+                if device != "cpu":
+                    torch.cuda.synchronize()
+                began = time.perf_counter()
+                out = simulator.rollout(state, {"mu": mu, "lam": 5e4}, volume, 1000.0, 6)
+                if wanted:
+                    out.x.square().sum().backward()
+                if device != "cpu":
+                    torch.cuda.synchronize()
+                times.append((time.perf_counter() - began) / 5)
+            found[f"{len(x)} particles {name}"] = min(times)
+    print(json.dumps(found))
+
+
+def equality(options: argparse.Namespace, folder: Path) -> list[Row]:
+    """Two pairs of runs, the pairs beside each other so that their times compare."""
+    where = ["trainer=gpu"] if options.device != "cpu" else []
+    common = [*(options.equal or ["debug=default"]), *where, "evaluation.video=false", "logger=none"]
+    began, pairs = time.perf_counter(), [(exact, k) for exact in (False, True) for k in (0, 1)]
+    short = ["fit.prior.iterations=1", "fit.joint.iterations=0", "fit.prior_eta.iterations=0", "evaluation.floor=false"]
+    # kernels: what it says of itself does not count
+    started([*common, *short, f"scene.cache={folder}/warm_cache", f"hydra.run.dir={folder}/warm"], folder / "warm.log").wait(900)
+
+    def one(pair: tuple[bool, int]) -> int:
+        exact, k = pair
+        name = f"{'exact' if exact else 'plain'}_{k}"
+        # XDG_CACHE_HOME stays: of kernels; a reconstruction that is found in a cache would be the same without any merit
+        return started([*common, f"deterministic={str(exact).lower()}", f"scene.cache={folder}/{name}_cache",
+                        f"hydra.run.dir={folder}/{name}"], folder / f"{name}.log").wait(900)  # fmt: skip
+
+    with ThreadPoolExecutor(4) as pool:
+        codes = list(pool.map(one, pairs))
+    if any(codes):
+        logs = "\n".join((folder / f"{'exact' if e else 'plain'}_{k}.log").read_text()[-1500:] for e, k in pairs)
+        return [told(Row("equal runs on a GPU", "complete", f"exit codes {codes}\n{logs}", False))]
+    times = {exact: [json.loads((folder / f"{name}_{k}" / "metrics.json").read_text()) for k in (0, 1)]
+             for exact, name in ((False, "plain"), (True, "exact"))}  # fmt: skip
+    plain, exact = (apart(folder / f"{name}_0", folder / f"{name}_1") for name in ("plain", "exact"))
+    stages = ("reconstruction", "starts", "fit", "evaluation")
+    spent = {key: [sum(found[k].get(f"time/{s}_s", 0.0) for s in stages) for k in (0, 1)] for key, found in times.items()}
+    rows = [
+        Row("two equal runs on a GPU", f"E, nu and errors within {AGREE:.0%}",
+            f"within {plain[1]:.2%}; positions within {1e3 * plain[2]:.3g} mm; {len(plain[0])} figures and arrays are not "
+            f"bit-equal, {time.perf_counter() - began:.0f} s", plain[1] <= AGREE),
+        Row("two with deterministic=true", "all figures and motions bit for bit",
+            f"{len(exact[0])} differ{': ' + ', '.join(exact[0][:6]) if exact[0] else ''}", not exact[0]),
+        Row("price of it: a whole run, four beside each other", "reported",
+            f"{sum(spent[False]) / 2:.0f} -> {sum(spent[True]) / 2:.0f} s "
+            + ", ".join(f"{s} {times[False][0].get(f'time/{s}_s', 0):.0f} -> {times[True][0].get(f'time/{s}_s', 0):.0f}"
+                        for s in stages), True),
+        Row("price of it: a frame of 64 substeps", "reported", price(), True),
+    ]  # fmt: skip
+    return [told(row) for row in rows]
+
+
+# -------------------------------------------------------------------------------------------------------------------------- main
+
+
+def beside(part: str, folder: Path, gpu: int) -> list[Row]:
+    """A part in a process of its own, on a GPU of its own."""
+    words = [word for word in sys.argv[1:] if word not in PARTS and word != "--parts"]
+    code = subprocess.run([sys.executable, __file__, *words, "--parts", part, "--rows", str(folder / "rows.json")], cwd=ROOT,
+                          env=environment(gpu)).returncode  # fmt: skip
+    if not (folder / "rows.json").is_file():
+        return [Row(part, "its rows", f"exit code {code}", False)]
+    return [Row(*row) for row in json.loads((folder / "rows.json").read_text())]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", type=int, default=4)
-    parser.add_argument("--kills", type=int, default=3)
-    parser.add_argument("--rollouts", type=int, default=400)
-    parser.add_argument("--between", type=float, nargs=2, default=(15.0, 60.0), help="seconds until a kill")
-    parser.add_argument("--launcher", default="joblib", help="joblib | submitit_local")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=None, help="default: all, without a GPU runs and rollouts")
+    parser.add_argument("--device", default="cpu", help="of rollouts and equality: cpu | cuda")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--runs", type=int, default=4)
+    parser.add_argument("--workers", type=int, default=2, help="runs beside each other")
+    parser.add_argument("--kills", type=int, default=2, help="of joblib's sweep; submitit's is killed once")
+    parser.add_argument("--between", type=float, nargs=2, default=(15.0, 60.0), help="seconds until a kill")
+    parser.add_argument("--launched", type=int, default=2, help="of the runs, by submitit's local executor")
+    parser.add_argument("--rollouts", type=int, default=400)
+    parser.add_argument("--frames", type=int, default=8)
+    parser.add_argument("--particles", type=int, default=100, help="of the body that is rolled out")
+    parser.add_argument("--seconds", type=float, default=1e9, help="for rollouts; fewer than asked fail")
+    parser.add_argument("--equal", nargs="+", default=None, metavar="KEY=VALUE", help="overrides of the runs that are compared")
+    parser.add_argument("--rows", type=Path, default=None, help="write the rows there, as JSON")
     options = parser.parse_args()
-    generator = random.Random(options.seed)
-    sets = drawn(options.runs, generator)
-    with tempfile.TemporaryDirectory(prefix="mosa_long_") as place:
-        folder = Path(place)
-        common = [*SMALL, f"scene.cache={folder}/cache"]
-        first = in_a_row(sets, folder, common)
-        second, met = killed_sweep(sets, folder, common, options.launcher, options.kills, tuple(options.between), generator)
-        wrong = [k for k, (a, b) in enumerate(zip(first, second)) if a != b or "exit" in a]
-        left = leftovers(folder)
-        alive = processes_with(place)
-        added, rate = growth_of_rollouts(folder / "0" / "checkpoints" / "last.ckpt", options.rollouts)
-        print(f"\n{len(sets)} runs in a row and as a sweep ({options.launcher}): {len(wrong)} with figures that differ\n"
-              f"{options.kills} kills met {met} unfinished jobs\n"
-              f"left: {len(alive)} processes, {len(left)} half-written files or locks\n"
-              f"{options.rollouts} rollouts in one process: {added:.1f} MB added after the first tenth, {rate:.1f} a second")
-        for k in wrong:
-            told = {key for key in {*first[k], *second[k]} if first[k].get(key) != second[k].get(key)}
-            print(f"run {k} differs: {' '.join(sets[k])}: {sorted(told)[:8]}")
-        print("\n".join(left))
-    sys.exit(1 if wrong or alive or left else 0)
+    if options.device != "cpu" and not torch.cuda.is_available():
+        parser.error(f"--device {options.device}: torch finds no CUDA device on this machine")
+    chosen = options.parts or [part for part in PARTS if part != "equality" or options.device != "cpu"]
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory(prefix="mosa_long_", ignore_cleanup_errors=True) as place:
+        folders = {part: Path(place) / part for part in chosen}
+        for folder in folders.values():
+            folder.mkdir()
+        own = [part for part in chosen if part == "runs" or options.device == "cpu" or len(chosen) == 1]
+        gpus = max(1, torch.cuda.device_count()) if options.device != "cpu" else 1
+        with ThreadPoolExecutor(len(chosen)) as pool:
+            elsewhere = [part for part in chosen if part not in own]
+            others = [pool.submit(beside, part, folders[part], i % gpus) for i, part in enumerate(elsewhere)]
+            for part in own:
+                rows += {"runs": runs, "rollouts": rollouts, "equality": equality}[part](options, folders[part])
+            rows += [row for other in others for row in other.result()]
+    if options.rows is not None:  # whoever asked for them prints them
+        options.rows.write_text(json.dumps(rows))
+        return
+    print("\n| what | asked | found |\n|---|---|---|")
+    for row in rows:
+        print(f"| {row.what} | {row.asked} | {'' if row.met else '**NOT AS ASKED:** '}{row.found} |")
+    sys.exit(0 if all(row.met for row in rows) else 1)
 
 
 if __name__ == "__main__":

@@ -219,7 +219,7 @@ def frames(_):
 def gradient(_):
     horizons, axes, rows = [1, 5, 20, 50, 200, 500, 1500], panels(2), []
     for ax, contact in zip(axes, (False, True)):
-        results = [Case("corotated", n, stride=10, contact=contact).compare(both_steps=True, scale=0.003 if contact else 0.05)
+        results = [Case("corotated", n, stride=10, contact=contact).compare(both_steps=True, scale=0.0003 if contact else 0.05)
                    for n in horizons]  # fmt: skip
         for name in results[0]:
             ax.loglog(horizons, [max(r[name].error, 1e-16) for r in results], "o-", ms=3, label=f"dL/d({name})")

@@ -6,29 +6,33 @@ Imported by every process of a sweep, whatever its launcher, through `hydra.call
 from __future__ import annotations
 
 import errno
+import fcntl
 import hashlib
 import os
 import shutil
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from mosa.commands import fail
-from mosa.errors import MosaError
+from mosa.errors import ConfigError, MosaError
 
 FAILED = "failed"
 """Folder in that of a sweep: one file for each job that ended in an error, named after its number, with the message."""
 LONGEST = 120
 """Bytes of a job's folder name that its overrides may have: a file system takes 255 for the whole of it."""
 DISK = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.EIO, errno.ENOTDIR,
-        errno.EISDIR}  # fmt: skip
+        errno.EISDIR, errno.EFBIG, errno.EEXIST}  # fmt: skip
 """What a disk or a folder's rights refuse, which is no mistake of the program."""
 
 
@@ -53,6 +57,53 @@ def check_arguments(arguments: Sequence[str], conf: Path) -> None:
             sys.exit(2)
 
 
+def quoted(argument: str) -> str:
+    """An override as Hydra's grammar reads it: a value with letters beyond ASCII, or ~, &, = and the like, as paths have them, gets
+    quotes. As it is where it can be read, and where it has a list, quotes or an escape of its own."""
+    key, mark, value = argument.partition("=")
+    if not mark or argument.startswith("-") or set(value) & set(",[]{}'\"\\"):
+        return argument
+    try:
+        OverridesParser.create().parse_overrides([argument])
+    except HydraException:
+        return f"{key}='{value}'"
+    return argument
+
+
+def check_folders(arguments: Sequence[str]) -> None:
+    """Exit with 2 and a message for a run folder that cannot be made, to which Hydra answers with a traceback."""
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        if key not in ("hydra.run.dir", "hydra.sweep.dir") or "$" in value:
+            continue
+        place = Path(value.strip("'\"")).absolute()
+        there = next(folder for folder in (place, *place.parents) if os.path.lexists(folder))
+        if not there.is_dir() or not os.access(there, os.W_OK):
+            reason = "it cannot be written to" if there.is_dir() else "it is none"
+            print(f"\nConfigError: {key}: expected a folder that can be made, found {value}: {there}: {reason}", file=sys.stderr)
+            sys.exit(2)
+
+
+def run_command(run: Callable[[], None], conf: str | Path) -> None:
+    """Run Hydra's `run` with what stands on the command line; conf: the folder of its groups.
+
+    Exit code 2 too for what Hydra refuses before any job begins: a mistake of the user like all others."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # on small tensors and shared machines a second thread was measured 30x slower
+    sys.argv[1:] = map(quoted, sys.argv[1:])
+    check_arguments(sys.argv[1:], Path(conf))
+    check_folders(sys.argv[1:])
+    try:
+        run()
+    except SystemExit as ended:
+        if ended.code == 1 and not begun:
+            sys.exit(2)
+        raise
+
+
+begun: list[bool] = []
+"""Whether this process has begun a job or a sweep."""
+
+
 class Failures(Callback):
     """Counts a sweep's failed jobs, whichever process each ran in."""
 
@@ -62,6 +113,7 @@ class Failures(Callback):
     def on_multirun_start(self, config: DictConfig, **_) -> None:
         shutil.rmtree(Path(config.hydra.sweep.dir) / FAILED, ignore_errors=True)  # of an earlier sweep in this folder
         Failures.count = 0
+        begun.append(True)
 
     def on_multirun_end(self, config: DictConfig, **_) -> None:
         files = sorted((Path(config.hydra.sweep.dir) / FAILED).glob("*.txt"), key=lambda file: int(file.stem))
@@ -83,28 +135,71 @@ def terminated(number: int, *_) -> None:
 
 def disk_message(error: OSError) -> str | None:
     """One sentence on what the disk refused; None for any other error."""
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        return f"{error.filename or 'a file'}: cannot be opened ({error.strerror}); allow more of them at once with ulimit -n"
     if error.errno not in DISK:
         return None
     return (f"{error.filename or 'a file'}: cannot be written or read ({error.strerror}); free space, or choose other folders with "
             "hydra.run.dir= and scene.cache= (eval.py: cache=)")
 
 
+NO_MEMORY = ("can't allocate memory", "out of memory", "Failed to allocate")
+"""What torch and Warp say where the machine, or a GPU, has no more: errors of types that are also others'."""
+
+
+def memory_message(error: Exception) -> str | None:
+    """One sentence on memory that there is not; None for any other error."""
+    if not isinstance(error, MemoryError) and not any(text in str(error) for text in NO_MEMORY):
+        return None
+    told = " ".join(str(error).split())[:200] or "the machine has no more"
+    return f"{told}; lower the sizes (simulation.particles, scene.scale)"
+
+
+@contextmanager
+def held(folder: str | Path) -> Iterator[None]:
+    """A run's folder as this process's own. The system's lock on it ends with the process, however that ends, and leaves no file.
+
+    Errors: ConfigError where another process has it."""
+    try:
+        number = os.open(folder, os.O_RDONLY)
+    except OSError:  # said where the folder is written to
+        yield
+        return
+    try:
+        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(number)
+        raise ConfigError(f"hydra.run.dir: another process is at work in {folder}; wait until it has ended, or give this run a "
+                          "folder of its own") from None
+    except OSError:  # a file system that knows no locks
+        pass
+    try:
+        yield
+    finally:
+        os.close(number)
+
+
 def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float | None:
     """job(cfg) and its result. A mistake of the user ends in one message and exit code 2; in a sweep it is kept for the end, the
     result is infinite, and the other jobs go on. A stop ends in 130 (Ctrl-C) or 143 (SIGTERM)."""
+    begun.append(True)
     first = os.environ.get("LOCAL_RANK", "0") == "0"  # of the processes of a fit on several devices: it speaks for all
     if first and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, terminated)
+    folder = OmegaConf.select(HydraConfig.get(), "runtime.output_dir") if HydraConfig.initialized() else None
     try:
-        return job(cfg)
+        with held(folder) if first and folder is not None else nullcontext():
+            return job(cfg)
     except KeyboardInterrupt:
         if first:
             fail("stopped; resume with ckpt_path=<run folder>/checkpoints/last.ckpt, where the fit had begun")
         sys.exit(143 if signal.SIGTERM in signals else 130)
     except MosaError as error:
         message = f"{type(error).__name__}: {error}"
-    except MemoryError as error:
-        message = f"MemoryError: {error or 'the machine has no more'}; lower the sizes (simulation.particles, scene.scale)"
+    except (MemoryError, RuntimeError) as error:
+        if (reason := memory_message(error)) is None:
+            raise
+        message = f"MemoryError: {reason}"
     except OSError as error:
         if (reason := disk_message(error)) is None:
             raise

@@ -122,7 +122,7 @@ TRAINING: dict[str, Kind] = {
 BODY = {key: kind for key, kind in TRAINING.items()
         if key.split(".")[0] in ("seed", "simulation", "prior", "heterogeneity", "adapter", "world")}  # fmt: skip
 """Of these, what a checkpoint's body is built from."""
-EVALUATION: dict[str, Kind] = kinds_of(EvaluationSettings, "evaluation")
+EVALUATION: dict[str, Kind] = {"deterministic": FLAG} | kinds_of(EvaluationSettings, "evaluation")
 SIMULATION: dict[str, Kind] = {
     **{name: SECTION for name in ("simulate", "evaluation")},
     "extensions": or_null(NAMES),

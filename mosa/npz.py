@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,20 +11,15 @@ import numpy as np
 
 from mosa.errors import DataError
 from mosa.limits import machine_memory
+from mosa.whole_files import written_whole
 
 HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
     """The arrays, compressed: beside the target first, so that a full disk or a kill leaves no half file under its name."""
-    path = Path(path)
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        with open(partial, "wb") as file:
-            np.savez_compressed(file, **arrays)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with written_whole(path) as partial, open(partial, "wb") as file:
+        np.savez_compressed(file, **arrays)
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:

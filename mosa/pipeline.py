@@ -11,7 +11,7 @@ import lightning as L
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from mosa import __version__, parallel
+from mosa import __version__, exact_sums, parallel
 from mosa.assembly import assemble, scenes
 from mosa.config import build_evaluation, build_world, plain, world_config
 from mosa.costs import Costs, before_data, estimate
@@ -68,6 +68,7 @@ def train(cfg: DictConfig) -> float | None:
     check_configuration(plain(cfg))
     chosen(plain(cfg.logger))
     L.seed_everything(cfg.seed, verbose=False)
+    exact_sums.use(cfg.deterministic)
     clock, folder = Clock(), run_folder()
     log.info("mosa %s: %s", __version__, " ".join(HydraConfig.get().overrides.task))
     if (done := finished(cfg, folder)) is not None:
@@ -138,6 +139,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
                           "python eval.py ckpt_path=<run folder>/checkpoints/last.ckpt")
     load_extensions(plain(cfg).get("extensions"))
     check_evaluation(plain(cfg))
+    exact_sums.use(cfg.deterministic)
     folder = run_folder()
     twin = Twin.load(cfg.ckpt_path, named_device(cfg.device))
     if cfg.plan is not None:

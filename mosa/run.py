@@ -102,11 +102,13 @@ def device_of(cfg: DictConfig) -> str:
 
 def named_device(name: str) -> str:
     """A device that torch can use here. Errors: ConfigError."""
+    expected = "device: expected cpu, or cuda on a machine with a GPU, found"
+    if not isinstance(name, str) or name.partition(":")[0] not in ("cpu", "cuda"):
+        raise ConfigError(f"{expected} {name!r}")
     try:
         torch.empty(0, device=name)
     except (RuntimeError, AssertionError) as error:  # AssertionError: torch without CUDA
-        reason = str(error).splitlines()[0]
-        raise ConfigError(f"device: expected cpu, or cuda on a machine with a GPU, found {name!r} ({reason})") from error
+        raise ConfigError(f"{expected} {name!r} ({str(error).splitlines()[0]})") from error
     return name
 
 

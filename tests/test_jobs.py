@@ -13,7 +13,7 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from mosa.errors import ConfigError
-from mosa.jobs import LONGEST, Failures, attempt, folder_name
+from mosa.jobs import LONGEST, Failures, attempt, check_folders, folder_name, held, quoted
 
 ROOT = Path(__file__).parents[1]
 
@@ -55,7 +55,21 @@ def test_a_mistake_of_the_program_is_not_swallowed(sweep):
         attempt(fail(ConnectionResetError(errno.ECONNRESET, "reset")), None)
 
 
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EACCES])
+def test_a_run_folder_is_one_process_own_until_that_ends(tmp_path):
+    """Two runs in one folder mixed their checkpoints and figures without a word."""
+    code = f"import time; from mosa.jobs import held\nwith held({str(tmp_path)!r}): print('held', flush=True); time.sleep(60)"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=ROOT) as other:
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(ConfigError, match=r"hydra\.run\.dir: another process is at work in"), held(tmp_path):
+            pass
+        other.kill()
+        other.wait()
+        with held(tmp_path):
+            pass
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EFBIG])
 def test_what_a_disk_refuses_is_one_message(sweep, capsys, code):
     attempt(fail(OSError(code, os.strerror(code), "/full/file")), None)
     assert f"/full/file: cannot be written or read ({os.strerror(code)})" in capsys.readouterr().err
@@ -68,12 +82,49 @@ def test_a_single_run_exits_with_2(sweep, monkeypatch):
     assert caught.value.code == 2
 
 
+@pytest.mark.parametrize("error", [
+    MemoryError(), RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes."),
+    RuntimeError("CUDA out of memory. Tried to allocate 9.00 GiB"), OSError(errno.EMFILE, os.strerror(errno.EMFILE), "/a/file"),
+])  # fmt: skip
+def test_what_the_machine_has_not_is_one_message(sweep, capsys, error):
+    attempt(fail(error), None)
+    said = capsys.readouterr().err.strip()
+    assert len(said.splitlines()) == 1 and ("simulation.particles" in said or "ulimit -n" in said)
+    with pytest.raises(RuntimeError):
+        attempt(fail(RuntimeError("another one")), None)
+
+
 def test_a_long_name_is_cut_and_stays_its_own():
     assert folder_name("a=1,b=2") == "a=1,b=2"
     assert "/" not in folder_name("splats=../../x.ply")
     names = {folder_name("x" * 500 + str(i)) for i in range(50)}
     assert len(names) == 50 and all(len(name.encode()) <= LONGEST + 9 for name in names)
     assert len(folder_name("ü" * 500).encode()) <= LONGEST + 9
+
+
+@pytest.mark.parametrize(("argument", "found"), [
+    ("scene.path=/data/höhle", "scene.path='/data/höhle'"), ("scene.path=~/x", "scene.path='~/x'"),
+    ("scene.path=/a=b & c", "scene.path='/a=b & c'"), ("scene.path=/a b", "scene.path=/a b"), ("seed=0,1", "seed=0,1"),
+    ("fit.x=[ä]", "fit.x=[ä]"), ("x='ä'", "x='ä'"), ("prior=ä,b", "prior=ä,b"), ("--cfg=ä", "--cfg=ä"), ("banana", "banana"),
+])  # fmt: skip
+def test_values_that_hydra_cannot_read_are_quoted(argument, found):
+    """It ended a run whose path had an umlaut in it."""
+    assert quoted(argument) == found
+
+
+def test_a_run_folder_that_cannot_be_made_is_said_before_hydra_fails(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    check_folders([f"hydra.run.dir={tmp_path}/new/folder", "hydra.sweep.dir=a/${now:%H}", "seed=0"])
+    for wrong in ("file", "file/below"):
+        with pytest.raises(SystemExit) as ended:
+            check_folders(["seed=0", f"hydra.run.dir={tmp_path}/{wrong}"])
+        assert ended.value.code == 2 and "hydra.run.dir: expected a folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("arguments", [["banana"], ["banana=3"], ["scene=banana"]])
+def test_what_hydra_refuses_is_a_mistake_of_the_user_too(arguments):
+    found = subprocess.run([sys.executable, "train.py", *arguments], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert found.returncode == 2 and "Traceback" not in found.stderr
 
 
 PROGRAM = """

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import importlib
-import os
-import sys
 from collections.abc import Callable
-from pathlib import Path
 
 import hydra
 from omegaconf import DictConfig
 
 from mosa.commands import begin_log, configuration
-from mosa.jobs import attempt, check_arguments
+from mosa.jobs import attempt, run_command
 
 
 def command(module: str, job: str) -> Callable[[], None]:
@@ -33,8 +30,6 @@ def command(module: str, job: str) -> Callable[[], None]:
     configured = hydra.main(version_base="1.3", config_path=configuration(), config_name=module.rpartition(".")[2])(run)
 
     def main() -> None:
-        os.environ.setdefault("OMP_NUM_THREADS", "1")  # on small tensors and shared machines a second was measured 30x slower
-        check_arguments(sys.argv[1:], Path(configuration()))
-        configured()
+        run_command(configured, configuration())
 
     return main

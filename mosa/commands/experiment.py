@@ -11,6 +11,7 @@ from pathlib import Path
 
 from mosa.commands import configuration
 from mosa.errors import ConfigError, MosaError
+from mosa.jobs import disk_message
 
 RESULTS = Path("docs/results")
 
@@ -48,6 +49,11 @@ def main(words: list[str] | None = None) -> None:
         code = run(arguments(sys.argv[1:] if words is None else words))
     except MosaError as error:
         print(f"\n{type(error).__name__}: {error}", file=sys.stderr)
+        code = 2
+    except OSError as error:
+        if (reason := disk_message(error)) is None:
+            raise
+        print(f"\nDataError: {reason}", file=sys.stderr)
         code = 2
     except KeyboardInterrupt:
         print("\nstopped; the same command goes on from here", file=sys.stderr)

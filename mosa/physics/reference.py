@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.physics.contact.planes import THICKNESS, Plane
+from mosa.physics.contact.planes import SLOW, THICKNESS, TOUCHING, Plane
 from mosa.physics.contact.reference import fade
 from mosa.types import ParticleState
 
@@ -190,8 +190,8 @@ def collide(v: Tensor, y: Tensor, planes: Sequence[Plane], dx: float) -> Tensor:
         n = torch.tensor(plane.normal, dtype=torch.float64)
         n = n / n.norm()
         thickness = plane.thickness if plane.thickness is not None else THICKNESS * dx * (plane.friction > 0)
-        w = fade((y - torch.tensor(plane.point, dtype=torch.float64)) @ n, thickness)
-        un = v @ n
+        phi, un = (y - torch.tensor(plane.point, dtype=torch.float64)) @ n, v @ n
+        w = fade(phi, thickness) * torch.where(phi > TOUCHING, 1 / (1 + (un / SLOW) ** 2), torch.ones_like(un))
         tangential = v - un[:, None] * n
         if plane.mode == "sticky":
             after = torch.zeros_like(v)

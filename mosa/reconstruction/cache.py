@@ -19,6 +19,7 @@ from torch import Tensor
 from mosa.reconstruction.observed import Windows
 from mosa.rendering.lighting import LIGHT
 from mosa.rendering.spherical_harmonics import degree_of
+from mosa.whole_files import written_whole
 
 log = logging.getLogger(__name__)
 SPLATS = {"means": (3,), "scales": (3,), "rotations": (4,), "opacities": (), "colors": (3,)}
@@ -74,15 +75,11 @@ class StageCache:
             except Exception as error:
                 log.warning("%s: cannot be read (%s); this stage is computed again", path, error)
         result = compute()
-        partial = path.with_suffix(f".{os.getpid()}.tmp")
         try:
-            with open(partial, "wb") as file:
+            with written_whole(path) as partial, open(partial, "wb") as file:
                 torch.save(result, file)
-            os.replace(partial, path)
         except RuntimeError as error:  # what torch makes of a disk that is full
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
-        finally:
-            partial.unlink(missing_ok=True)
         return result
 
     def strip(self, name: str, windows: Windows, rendered: Tensor, columns: int = 8) -> None:

@@ -8,6 +8,7 @@ import functools
 
 import warp as wp
 
+from mosa.exact_sums import COLUMNS, HIGH, LARGEST, LOW
 from mosa.rendering.records import record_type
 
 
@@ -65,8 +66,7 @@ ADD_SUMS = """
     constexpr int moments = 6, total = moments + sizeof(direction.c) / sizeof(direction.c[0]);
     auto number = [&](int k) { return k < moments ? moment.c[k] : scale * direction.c[k - moments]; };
     auto add = [&](int k, decltype(scale * scale) sum) {
-        auto* start = k < moments ? &records.data[i].c[k] : &features.data[f].c[k - moments];
-        wp::atomic_add(start, sum);
+        TO_MEMORY
     };
 #if defined(__CUDA_ARCH__)
     constexpr int width = total <= 8 ? 8 : total <= 16 ? 16 : 32;
@@ -104,26 +104,47 @@ ADD_SUMS = """
 """
 
 
+PLAIN = """
+        auto* start = k < moments ? &records.data[i].c[k] : &features.data[f].c[k - moments];
+        wp::atomic_add(start, sum);"""
+
+# as `exact_sums.add_exactly`
+EXACT = f"""
+        const int number_of = k < moments ? 8 * i + k : (total - moments) * f + k - moments;
+        wp::int64* start = (k < moments ? records.data : features.data) + {COLUMNS} * number_of;
+        const double q = static_cast<double>(sum) * {HIGH:.1f};
+        if (fabs(q) <= {LARGEST:.1f}) {{
+            const double high = floor(q);
+            wp::atomic_add(start, static_cast<wp::int64>(high));
+            wp::atomic_add(start + 1, static_cast<wp::int64>(floor((q - high) * {LOW:.1f})));
+        }} else {{
+            wp::atomic_add(start + 2, wp::int64(1));
+        }}"""
+
+
 @functools.cache
-def add_sums(dtype: type, channels: int):
+def add_sums(dtype: type, channels: int, exact: bool = False):
     """A function that adds what the lanes bring for one Gaussian to its gradients in memory.
 
     Instead of summing one number after the other over all lanes, which takes five exchanges each, the lanes share out the
     numbers (up to 32 at a time): 16 numbers take 16 exchanges, lane 2 k ends with the sum of number k, and one instruction
-    adds all of them to memory that lies together.
+    adds all of them to memory that lies together. exact: to exact sums (8 records, COLUMNS), (channels features, COLUMNS).
     """
     moments = wp.types.vector(length=6, dtype=dtype)
     vecc = wp.types.vector(length=channels, dtype=dtype)
 
-    @wp.func_native(ADD_SUMS)
+    sums = wp.array2d(dtype=wp.int64)
+    to_records, to_features = (sums, sums) if exact else (wp.array(dtype=record_type(dtype)), wp.array(dtype=vecc))
+
+    @wp.func_native(ADD_SUMS.replace("TO_MEMORY", EXACT if exact else PLAIN))
     def function(
         thread: int,
         moment: moments,
         scale: dtype,
         direction: vecc,
-        records: wp.array(dtype=record_type(dtype)),
+        records: to_records,
         i: int,
-        features: wp.array(dtype=vecc),
+        features: to_features,
         f: int,
     ): ...
 

@@ -15,6 +15,7 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from mosa.exact_sums import COLUMNS, needed, sum_functions
 from mosa.rendering.covariance import CLAMP_MARGIN
 from mosa.rendering.projection_kernels import projection_kernels
 from mosa.rendering.raster_kernels import raster_kernels
@@ -200,12 +201,14 @@ def composite_backward(
     """Moments (B, N, 8) of the records (records.py) and the gradient of the features."""
     arrays = _Arrays(records.dtype)
     moments, grad_features = torch.zeros_like(records), torch.zeros_like(features)
+    found, exact = (moments, grad_features), g.scan == "tile" and needed(records.device)
     if g.scan == "tile":
-        _, kernel = tile_kernels(arrays.scalar, features.shape[-1])
+        _, kernel = tile_kernels(arrays.scalar, features.shape[-1], exact)
         threads, state = tile_threads(len(records), g.width, g.height), (transmittance, grad_alpha)
     else:
         _, kernel = raster_kernels(arrays.scalar, features.shape[-1])
         threads, state = len(records), (transmittance.clone(), -grad_alpha * transmittance)
+    sums = [torch.zeros(t.numel(), COLUMNS, dtype=torch.int64, device=t.device) for t in found] if exact else []
     wp.launch(
         kernel,
         dim=threads,
@@ -216,10 +219,13 @@ def composite_backward(
             arrays.vectors(grad_image),
             *map(arrays.scalars, state),
         ],
-        outputs=[arrays.vectors(moments), arrays.vectors(grad_features)],
+        outputs=[wp.from_torch(t) for t in sums] if exact else [arrays.vectors(t) for t in found],
         device=wp.device_from_torch(records.device),
     )
-    return moments, grad_features
+    for target, added in zip(found, sums):
+        given = [wp.from_torch(added), arrays.scalars(target)]
+        wp.launch(sum_functions(arrays.scalar).settle, target.numel(), given, device=wp.device_from_torch(records.device))
+    return found
 
 
 def project_backward(

@@ -70,15 +70,19 @@ def reach_function(dtype: type):
 
 
 @functools.cache
-def tile_kernels(dtype: type, channels: int):
-    """(forward, backward) for one Warp scalar type and number of channels, to be launched over `tile_threads`."""
+def tile_kernels(dtype: type, channels: int, exact: bool = False):
+    """(forward, backward) for one Warp scalar type and number of channels, to be launched over `tile_threads`.
+
+    exact: the backward pass adds to exact sums, see `lanes.add_sums`."""
     record = record_type(dtype)
     vec2 = wp.types.vector(length=2, dtype=dtype)
     vec6 = wp.types.vector(length=6, dtype=dtype)
     vecc = wp.types.vector(length=channels, dtype=dtype)
     load, _, _, center, _, pixels = record_functions(dtype)
     reaches = reach_function(dtype)
-    add_to_gradients = add_sums(dtype, channels)
+    add_to_gradients = add_sums(dtype, channels, exact)
+    sums = wp.array2d(dtype=wp.int64)
+    to_records, to_features = (sums, sums) if exact else (wp.array(dtype=record), wp.array(dtype=vecc))
 
     @wp.func
     def block_of(thread: int, width: int, height: int):
@@ -179,8 +183,8 @@ def tile_kernels(dtype: type, channels: int):
         transmittance: wp.array(dtype=dtype),
         grad_alpha: wp.array(dtype=dtype),
         # out, zero at first
-        moments: wp.array(dtype=record),
-        grad_features: wp.array(dtype=vecc),
+        moments: to_records,
+        grad_features: to_features,
     ):
         thread = wp.tid()
         b, tile, left, top = block_of(thread, width, height)

@@ -126,11 +126,11 @@ def test_the_stiff_direction_of_a_body_is_found_from_its_drops(criterion):
 
 
 def test_rivals_explain_the_drop_with_their_own_numbers(monkeypatch):
-    """A neo-Hookean body, seen hitting hard, identified with a corotated backbone: the laws of other forms come nearer to the
+    """A neo-Hookean body, seen in a drop, identified with a corotated backbone: the laws of other forms come nearer to the
     drop than with the corotated law's numbers, and the body stays the corotated one."""
     truth = small_body(adapter=False, law="neo_hookean")
     body = small_body(law="corotated")
-    found = identification(body, [take_of(truth, start(turn=0.5, axis=(0.3, 0.5, 0.8), speed=-2.5), FRAMES)])
+    found = identification(body, [take_of(truth, start(turn=0.5, axis=(0.3, 0.5, 0.8), speed=-1.5), FRAMES)])
     run(found)
     posterior, here = found.posterior(), read_numbers(body)
     assert set(posterior.rivals) == {"neo_hookean", "stvk"} and body.material.law == "corotated"

@@ -5,7 +5,8 @@ import torch
 import warp as wp
 
 from mosa.errors import ConfigError
-from mosa.physics.contact.planes import MODES, THICKNESS, Plane, ground_plane, make_plane_functions, pack_planes
+from mosa.physics.contact.grid_update import update_kernels
+from mosa.physics.contact.planes import MODES, SLOW, THICKNESS, Plane, ground_plane, make_plane_functions, pack_planes
 from mosa.types import Ground
 
 collide, adj_collide = make_plane_functions(wp.float64)
@@ -63,6 +64,47 @@ def test_adjoint(mode, friction):
     smooth = (un.abs() > 1e-4) & (slide.abs() > 1e-2)
     assert smooth.sum() > 150
     torch.testing.assert_close((adjoint * du).sum(1)[smooth], difference[smooth], rtol=1e-6, atol=1e-7)
+
+
+def updated(momentum, planes, seed=None, dx=0.1):
+    """Velocities (M, 3) of a row of nodes along y after contact, or the adjoint of `seed` (M, 3) with respect to their momenta;
+    mass 1."""
+    kernels, count = update_kernels(wp.float64), len(momentum)
+    values, modes = pack_planes(planes, torch.float64, torch.device("cpu"), dx)
+    grid = torch.cat([momentum, torch.ones(count, 1).double()], 1)
+    window = torch.tensor([[0, 0, 0], [1, count, 1], [0, 0, 0]], dtype=torch.int32)
+    out = torch.zeros_like(grid)
+    vec4 = wp.types.vector(4, wp.float64)
+    given = [wp.from_torch(window, dtype=wp.vec3i), 1, wp.from_torch(grid, dtype=vec4), wp.from_torch(torch.zeros(1, 3).double(),
+             dtype=wp.vec3d), 0.0, dx, wp.from_torch(values), wp.from_torch(modes), len(planes)]  # fmt: skip
+    if seed is None:
+        wp.launch(kernels.grid_update, 1, [*given, wp.from_torch(out, dtype=vec4)], device="cpu")
+    else:
+        seeds = torch.cat([seed, torch.zeros(count, 1).double()], 1)
+        wp.launch(kernels.adj_grid, 1, [*given, wp.from_torch(seeds, dtype=vec4), wp.from_torch(out, dtype=vec4)], device="cpu")
+    return out[:, :3]
+
+
+FLOORS = [Plane((0, 0.52, 0), (0, 1, 0), "separate", 0.3), Plane((0, 0.4, 0), (0.2, 1, 0), "separate", 0.1, 0.25)]
+
+
+def test_contact_above_a_plane_is_with_what_is_slow():
+    """A node at rest but for gravity is held as one inside is; an impact is not felt above the plane."""
+    speeds = torch.tensor([1e-4 * SLOW, SLOW, 100 * SLOW]).double()
+    for speed in speeds:
+        after = updated(-speed * torch.tensor([[0.0, 1.0, 0.0]]).double().expand(8, 3), FLOORS[:1])[:, 1] / -speed
+        assert torch.equal(after[:6], torch.zeros(6).double()) and after[7] == 1  # inside; 1.8 cells above
+        share = 1 / (1 + float(speed / SLOW) ** 2)
+        assert float(after[6]) == pytest.approx(1 - share * 0.8753, abs=1e-4)  # 0.8 cells above, where the fade is 0.8753
+
+
+def test_adjoint_of_contact_that_fades():
+    generator = torch.Generator().manual_seed(2)
+    for scale in (0.3 * SLOW, SLOW, 10 * SLOW):
+        u, a, du = (torch.randn(12, 3, generator=generator, dtype=torch.float64) for _ in range(3))
+        u, h = scale * u, 1e-6 * scale
+        difference = (a * (updated(u + h * du, FLOORS) - updated(u - h * du, FLOORS))).sum(1) / (2 * h)
+        torch.testing.assert_close((updated(u, FLOORS, a) * du).sum(1), difference, rtol=1e-5, atol=1e-6)
 
 
 def test_ground_is_below_its_height_along_up():

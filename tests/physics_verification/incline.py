@@ -36,6 +36,24 @@ def slide(angle: float, friction: float, dtype: torch.dtype = torch.float64, law
     return float(gain[0] + friction * gain[1]), float(v[-1, 0])
 
 
+def bounced(thickness: float | None) -> float:
+    """Largest speed upwards [m/s] of a soft block of 6 x 5 x 4 cells of 20 mm after its fall at 1.5 m/s, turned, onto friction 0.3.
+    thickness [m]: of the contact."""
+    dx, E, frame_dt = 0.02, 3e4, 1 / 60
+    mu, lam, t = E / 2.7, E * 0.35 / (1.35 * 0.3), 0.6
+    R = torch.eye(3, dtype=torch.float64)
+    R[:2, :2] = torch.tensor([[math.cos(t), -math.sin(t)], [math.sin(t), math.cos(t)]])
+    x = lattice((12, 10, 8), dx / 2) @ R.T
+    state = resting(x - torch.tensor([0.0, float(x[:, 1].min()) - 0.02, 0.0]).double(), (0.3, -1.5, 0.0))
+    plane = Plane((0, 0, 0), (0, 1, 0), "separate", 0.3, thickness)
+    substeps = math.ceil(frame_dt * (math.sqrt((lam + 2 * mu) / DENSITY) + 3) / (0.4 * dx))
+    sim = Simulator("corotated", dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=(0, -GRAVITY, 0), up=(0, 1, 0),
+                    planes=[plane], dtype=torch.float64)  # fmt: skip
+    with torch.no_grad():
+        out = sim.rollout(state, {"mu": mu, "lam": lam}, uniform_volume(state, dx / 2), DENSITY, 20)
+    return float(out.v.mean(1)[:, 1].max())
+
+
 def point_mass(angle: float, friction: float) -> float:
     """g (sin - friction cos) [m/s^2]."""
     t = math.radians(angle)

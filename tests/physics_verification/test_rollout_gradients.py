@@ -46,7 +46,7 @@ def test_18_training_horizon_on_a_smooth_path():
 
 
 def test_18_training_horizon_through_contact():
-    found = Case("corotated", 1500, stride=20, contact=True).compare(both_steps=True, scale=0.001, names=("E", "weights"))
+    found = Case("corotated", 1500, stride=20, contact=True).compare(both_steps=True, scale=0.0003, names=("E", "weights"))
     assert_agreement(found, smooth=False)
 
 

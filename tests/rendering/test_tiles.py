@@ -8,6 +8,7 @@ import torch
 import warp as wp
 from drawn_splats import NAMES, draw, gradients, objective, render, ring, slopes
 
+from mosa import exact_sums
 from mosa.errors import ConfigError
 from mosa.rendering.projection_kernels import ALPHA_MIN, TILE
 from mosa.rendering.rasterizer import rasterize
@@ -171,3 +172,25 @@ def test_images_beyond_what_a_record_holds_are_refused():
     scene.cameras = replace(scene.cameras, width=2**16)
     with pytest.raises(ConfigError, match="no side may be longer than 65535"):
         render(scene, rasterize)
+
+
+def test_gradients_by_exact_sums_are_the_same_to_rounding(monkeypatch):
+    scene = draw(60, images=2, size=0.15)
+    plain = gradients(scene, rasterize, scan="tile")
+    monkeypatch.setattr("mosa.rendering.splatting.needed", lambda device: True)
+    for ours, wanted in zip(gradients(scene, rasterize, scan="tile"), plain, strict=True):
+        torch.testing.assert_close(ours, wanted, rtol=1e-9, atol=1e-12 * float(wanted.abs().max()))
+
+
+@pytest.mark.gpu
+def test_on_a_gpu_gradients_are_equal_bit_for_bit_where_that_is_asked_for():
+    scene = draw(1500, images=3)
+    scene.cameras = ring(3, 61, 45)
+    for name in (*NAMES, "background", "state_index", "cameras"):
+        setattr(scene, name, getattr(scene, name).to("cuda"))
+    exact_sums.use()
+    try:
+        first = gradients(scene, rasterize)
+        assert all(all(map(torch.equal, first, gradients(scene, rasterize))) for _ in range(3))
+    finally:
+        exact_sums.use(False)

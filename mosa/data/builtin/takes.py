@@ -6,7 +6,6 @@ import functools
 import hashlib
 import logging
 import os
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from mosa.npz import read_npz
 from mosa.progress import tqdm
 from mosa.threads import threaded
 from mosa.types import Cameras
+from mosa.whole_files import written_whole
 
 log = logging.getLogger(__name__)
 
@@ -160,13 +160,8 @@ def read_take(file: Path) -> Take | None:
 def write_take(file: Path, take: Take) -> None:
     """Write atomically: a process that is stopped leaves no half file, two that write at once leave one whole."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=file.parent, suffix=".npz")
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            np.savez_compressed(stream, **vars(take))
-        os.replace(temporary, file)
-    finally:
-        Path(temporary).unlink(missing_ok=True)
+    with written_whole(file) as partial, open(partial, "wb") as stream:
+        np.savez_compressed(stream, **vars(take))
 
 
 def pictures_to_footage(pictures: np.ndarray, size: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:

@@ -1,10 +1,13 @@
 """Device buffers of the colliders of a segment: poses, reactions and their adjoints by substep, and the launches on them."""
 
 import weakref
+from math import prod
 
+import torch
 import warp as wp
 from torch import Tensor
 
+from mosa.exact_sums import COLUMNS, sum_functions
 from mosa.physics.contact.collider_kernels import collider_kernels
 from mosa.physics.contact.colliders import PackedColliders
 
@@ -19,7 +22,7 @@ class ColliderBuffers:
 
     def __init__(self, packed: PackedColliders, scalar, substeps: int, work, with_adjoint: bool) -> None:
         self.count = len(packed)
-        self.kernels = collider_kernels(scalar)
+        self.kernels = collider_kernels(scalar, work.exact)
         self._scalar, self._work, self.with_adjoint = scalar, weakref.proxy(work), with_adjoint
         self._packed = [
             wp.from_torch(packed.shapes, dtype=scalar), wp.from_torch(packed.codes, dtype=wp.int32),
@@ -35,9 +38,18 @@ class ColliderBuffers:
             return [tensor for tensor, _ in made], [array for _, array in made]
 
         self.poses, self._poses = buffers(pose)
+        def sums(tensors):
+            """What nodes add to, of which `tensors` are made: exact sums, or the tensors themselves (None)."""
+            if not work.exact:
+                return None
+            shapes = [(*t.shape[:2], prod(t.shape[2:]), COLUMNS) for t in tensors]
+            return [work.array(shape, wp.int64, torch.int64) for shape in shapes]
+
         self.reaction, self._reaction = buffers(pose[2:])
+        self._reaction_sums = sums(self.reaction)
         if with_adjoint:
             self.adj_poses, self._adj_poses = buffers(pose)
+            self._adj_sums = sums(self.adj_poses)
             self.adj_reaction, self._adj_reaction = buffers(pose[2:])
 
     def set_nodes(self, nodes: int) -> None:
@@ -53,12 +65,31 @@ class ColliderBuffers:
 
     def reset(self) -> None:
         """Before a segment: no reaction yet."""
-        for array in self._reaction:
+        for array in self._added_to(self._reaction, self._reaction_sums):
             array.zero_()
 
     def reset_adjoint(self) -> None:
-        for array in self._adj_poses:
+        for array in self._added_to(self._adj_poses, self._adj_sums):
             array.zero_()
+
+    def settle(self) -> None:
+        """After a segment: the reactions are what was added up."""
+        self._settle(self.reaction, self._reaction_sums)
+
+    def settle_adjoint(self) -> None:
+        self._settle(self.adj_poses, self._adj_sums)
+
+    @staticmethod
+    def _added_to(arrays: list, sums: list | None) -> list:
+        return arrays if sums is None else [array for _, array in sums]
+
+    def _settle(self, tensors: list[Tensor], sums: list | None) -> None:
+        if sums is None:
+            return
+        settle = sum_functions(self._scalar).settle
+        for target, (added, _) in zip(tensors, sums, strict=True):
+            flat = [wp.from_torch(added.view(-1, COLUMNS)), wp.from_torch(target.view(-1), dtype=self._scalar)]
+            self._work.run(settle, target.numel(), flat)
 
     def _arguments(self, place: list, step: int, time: float) -> list:
         return [*place, 1.0 / time, self.count, step, *self._packed, *self._poses]
@@ -66,13 +97,15 @@ class ColliderBuffers:
     def apply(self, step: int, place: list, time: float, velocity) -> None:
         """Contact at substep `step`, on node velocities in place. place: grid, cutoff, dx; time [s]: for which the
         substep's forces act."""
-        self._work.over_nodes(self.kernels.collide_nodes, [*self._arguments(place, step, time), velocity, *self._reaction])
+        self._work.over_nodes(self.kernels.collide_nodes, [
+            *self._arguments(place, step, time), velocity, *self._added_to(self._reaction, self._reaction_sums),
+        ])  # fmt: skip
 
     def adjoint(self, step: int, place: list, time: float, adj_velocity) -> None:
         """Turns the adjoint of node velocities after contact into that before it; `before` holds those velocities."""
         self._work.over_nodes(self.kernels.adj_collide_nodes, [
             *self._arguments(place, step, time), self.before_wp, *self._adj_reaction, adj_velocity, self._adj_mass,
-            *self._adj_poses,
+            *self._added_to(self._adj_poses, self._adj_sums),
         ])  # fmt: skip
 
     def add_mass(self, adj_grid) -> None:

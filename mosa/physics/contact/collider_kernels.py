@@ -14,6 +14,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from mosa.exact_sums import sum_functions
 from mosa.physics.contact.planes import make_fade, make_normal_adjoint, make_plane_functions
 from mosa.physics.contact.shapes import shape_functions
 from mosa.physics.grid.node_access import node_access
@@ -21,8 +22,10 @@ from mosa.physics.grid.stencil import node_functions
 
 
 @cache
-def collider_kernels(scalar) -> SimpleNamespace:
-    """Kernels collide_nodes, adj_collide_nodes, add_mass for wp.float32 or wp.float64 fields."""
+def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
+    """Kernels collide_nodes, adj_collide_nodes, add_mass for wp.float32 or wp.float64 fields.
+
+    exact: what nodes add up, reactions and the adjoints of poses, are exact sums (substeps, W K, numbers, COLUMNS) int64."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
     vec4 = wp.types.vector(length=4, dtype=scalar)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
@@ -34,7 +37,33 @@ def collider_kernels(scalar) -> SimpleNamespace:
     nodes = node_functions(scalar)
     node_position, nodes_of = nodes.node_position, nodes.nodes_of
     load3, store3 = node_access(scalar).load3, node_access(scalar).store3
-    module = f"mosa.physics.colliders_{scalar.__name__}"
+    module = f"mosa.physics.{'exact_' if exact else ''}colliders_{scalar.__name__}"
+    vectors = wp.array4d(dtype=wp.int64) if exact else wp.array2d(dtype=vec3)
+    matrices = wp.array4d(dtype=wp.int64) if exact else wp.array2d(dtype=mat33)
+    add_exactly = sum_functions(scalar).add_exactly
+
+    if exact:
+
+        @wp.func
+        def add_vector(sums: wp.array4d(dtype=wp.int64), substep: int, c: int, value: vec3):
+            for i in range(3):
+                add_exactly(sums[substep][c], i, value[i])
+
+        @wp.func
+        def add_matrix(sums: wp.array4d(dtype=wp.int64), substep: int, c: int, value: mat33):
+            for i in range(3):
+                for j in range(3):
+                    add_exactly(sums[substep][c], 3 * i + j, value[i, j])
+
+    else:
+
+        @wp.func
+        def add_vector(field: wp.array2d(dtype=vec3), substep: int, c: int, value: vec3):
+            wp.atomic_add(field, substep, c, value)
+
+        @wp.func
+        def add_matrix(field: wp.array2d(dtype=mat33), substep: int, c: int, value: mat33):
+            wp.atomic_add(field, substep, c, value)
 
     @wp.func
     def respond(
@@ -63,7 +92,7 @@ def collider_kernels(scalar) -> SimpleNamespace:
         inv_dt: scalar, count: int, substep: int, shapes: wp.array2d(dtype=scalar), codes: wp.array2d(dtype=int),
         fields: wp.array(dtype=scalar), position: wp.array2d(dtype=vec3), rotation: wp.array2d(dtype=mat33),
         linear: wp.array2d(dtype=vec3), angular: wp.array2d(dtype=vec3), velocity: wp.array(dtype=vec4),
-        force: wp.array2d(dtype=vec3), torque: wp.array2d(dtype=vec3),
+        force: vectors, torque: vectors,
     ):  # fmt: skip
         """Changes velocity in place, adds to force and torque of the substep."""
         world = wp.tid() / threads
@@ -79,8 +108,8 @@ def collider_kernels(scalar) -> SimpleNamespace:
                     after = respond(u, y, k, c, substep, shapes, codes, fields, position, rotation, linear, angular)
                     f = (m * inv_dt) * (u - after)
                     if wp.dot(f, f) > scalar(0.0):
-                        wp.atomic_add(force, substep, c, f)
-                        wp.atomic_add(torque, substep, c, wp.cross(y - position[substep, c], f))
+                        add_vector(force, substep, c, f)
+                        add_vector(torque, substep, c, wp.cross(y - position[substep, c], f))
                     u = after
                 store3(velocity, node, u)
 
@@ -91,8 +120,8 @@ def collider_kernels(scalar) -> SimpleNamespace:
         fields: wp.array(dtype=scalar), position: wp.array2d(dtype=vec3), rotation: wp.array2d(dtype=mat33),
         linear: wp.array2d(dtype=vec3), angular: wp.array2d(dtype=vec3), before: wp.array(dtype=vec4),
         adj_force: wp.array2d(dtype=vec3), adj_torque: wp.array2d(dtype=vec3), adj_velocity: wp.array(dtype=vec4),
-        adj_mass: wp.array(dtype=scalar), adj_position: wp.array2d(dtype=vec3), adj_rotation: wp.array2d(dtype=mat33),
-        adj_linear: wp.array2d(dtype=vec3), adj_angular: wp.array2d(dtype=vec3),
+        adj_mass: wp.array(dtype=scalar), adj_position: vectors, adj_rotation: matrices, adj_linear: vectors,
+        adj_angular: vectors,
     ):  # fmt: skip
         """before: node velocities as the first collider finds them. Turns adj_velocity into theirs, writes adj_mass, adds to the
         adjoints of the pose and of the velocities."""
@@ -143,10 +172,10 @@ def collider_kernels(scalar) -> SimpleNamespace:
                         aq = curvature(q, k, shapes, codes, fields, ag) + (slope * aw) * g
                         # q = Q^T r, r = y - position
                         ar = ar + Q * aq
-                        wp.atomic_add(adj_linear, substep, c, aV)
-                        wp.atomic_add(adj_angular, substep, c, wp.cross(r, aV))
-                        wp.atomic_add(adj_rotation, substep, c, wp.outer(an, local) + wp.outer(r, aq))
-                        wp.atomic_add(adj_position, substep, c, -ar)
+                        add_vector(adj_linear, substep, c, aV)
+                        add_vector(adj_angular, substep, c, wp.cross(r, aV))
+                        add_matrix(adj_rotation, substep, c, wp.outer(an, local) + wp.outer(r, aq))
+                        add_vector(adj_position, substep, c, -ar)
                 store3(adj_velocity, node, a)
             adj_mass[node] = am
 

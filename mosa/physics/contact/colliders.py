@@ -68,13 +68,14 @@ class Collider:
     """A moving rigid solid. mode, friction: as for a plane, relative to the solid's velocity at the node.
 
     thickness [m]: over this distance above the surface the contact fades in: whole in the share `planes.WHOLE` of it next to
-    the surface, then falling to nothing. None: `planes.THICKNESS` cells of the grid (of a mesh at most its margin). Plates then
-    squeeze a body with the force of its own law, whatever dx, and a shaken block stays where friction holds it; but an impact is
-    felt up to a cell and a half early, and rolling is braked. 0: a node is in contact or not, as for planes without friction; a
-    ball rolls as it should, and each plate squeezes a body by about a quarter of a cell less than its stroke. With a thickness the
-    result is differentiable in the collider's position also where its surface is flat; with 0 a node that changes sides is a jump
-    that no gradient sees, and positions act through curvature, lever arms and velocities only. The fade is per substep: a node of
-    small weight still comes to a stop within as many substeps as its weight is small.
+    the surface, then falling to nothing, at any speed (a plane's is with what is slow alone). None: `planes.THICKNESS` cells of
+    the grid (of a mesh at most its margin). Plates then squeeze a body with the force of its own law, whatever dx, and a shaken
+    block stays where friction holds it; but an impact is felt up to a cell and a half early, and rolling is braked. 0: a node is
+    in contact or not, as for planes without friction; a ball rolls as it should, and each plate squeezes a body by about a quarter
+    of a cell less than its stroke. With a thickness the result is differentiable in the collider's position also where its surface
+    is flat; with 0 a node that changes sides is a jump that no gradient sees, and positions act through curvature, lever arms and
+    velocities only. The fade is per substep: a node of small weight still comes to a stop within as many substeps as its weight is
+    small.
     """
 
     shape: Shape

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from mosa.physics.contact.planes import make_fade, make_plane_functions
+from mosa.physics.contact.planes import TOUCHING, make_fade, make_plane_functions, make_slowness
 from mosa.physics.grid.node_access import node_access
 from mosa.physics.grid.stencil import node_functions
 
@@ -18,7 +18,8 @@ def update_kernels(scalar) -> SimpleNamespace:
     vec3 = wp.types.vector(length=3, dtype=scalar)
     vec4 = wp.types.vector(length=4, dtype=scalar)
     collide, adj_collide = make_plane_functions(scalar)
-    fade, memory, nodes = make_fade(scalar), node_access(scalar), node_functions(scalar)
+    fade, slowness = make_fade(scalar), make_slowness(scalar)
+    memory, nodes = node_access(scalar), node_functions(scalar)
     load3, load4, store3, store4 = memory.load3, memory.load4, memory.store3, memory.store4
     node_position, nodes_of = nodes.node_position, nodes.nodes_of
     module = f"mosa.physics.grid_update_{scalar.__name__}"
@@ -28,11 +29,17 @@ def update_kernels(scalar) -> SimpleNamespace:
         return vec3(g[0], g[1], g[2]) / g[3] + impulse
 
     @wp.func
-    def touch(y: vec3, planes: wp.array2d(dtype=scalar), i: int):
-        """Weight of plane i's contact of a node at y."""
+    def touch(u: vec3, y: vec3, planes: wp.array2d(dtype=scalar), i: int):
+        """Weight of plane i's contact of a node at y that comes with velocity u, and its slope in u's normal part [s/m]."""
         normal = vec3(planes[i, 0], planes[i, 1], planes[i, 2])
-        w, _slope = fade(wp.dot(y, normal) - planes[i, 3], planes[i, 5])
-        return w
+        phi = wp.dot(y, normal) - planes[i, 3]
+        w, _slope = fade(phi, planes[i, 5])
+        change = scalar(0.0)
+        if w > scalar(0.0) and phi > scalar(wp.static(TOUCHING)):
+            slow, slope = slowness(wp.dot(u, normal))
+            change = w * slope
+            w = w * slow
+        return w, change
 
     @wp.func
     def contact(
@@ -41,7 +48,7 @@ def update_kernels(scalar) -> SimpleNamespace:
         """Velocity after the first `count` planes."""
         r = u
         for i in range(count):
-            w = touch(y, planes, i)
+            w, _change = touch(r, y, planes, i)
             if w > scalar(0.0):
                 hit = collide(r, vec3(planes[i, 0], planes[i, 1], planes[i, 2]), modes[i], planes[i, 4])
                 if w < scalar(1.0):
@@ -57,11 +64,13 @@ def update_kernels(scalar) -> SimpleNamespace:
         a = seed
         for reverse in range(count):
             i = count - 1 - reverse
-            w = touch(y, planes, i)
+            before = contact(u, y, planes, modes, i)
+            w, change = touch(before, y, planes, i)
             if w > scalar(0.0):
-                before = contact(u, y, planes, modes, i)
                 normal = vec3(planes[i, 0], planes[i, 1], planes[i, 2])
-                a = (scalar(1.0) - w) * a + adj_collide(before, normal, modes[i], planes[i, 4], w * a)
+                hit = collide(before, normal, modes[i], planes[i, 4])
+                along = (change * wp.dot(hit - before, a)) * normal
+                a = (scalar(1.0) - w) * a + adj_collide(before, normal, modes[i], planes[i, 4], w * a) + along
         return a
 
     @wp.kernel(module=module, enable_backward=False)

@@ -2,14 +2,16 @@
 
 A node at or below a plane (tolerance 1e-6 m) gets: `sticky` zero velocity; `slip` no normal part; `separate` no inward normal
 part, and the tangential part shrinks by Coulomb friction, |u_t| <- max(0, |u_t| - friction |u_n|).
-Above it, up to the plane's `thickness`, the change of velocity counts with a weight that fades to 0 (`make_fade`).
+Above it, up to the plane's `thickness`, the change of velocity counts with a weight that fades to 0 (`make_fade`), and that is the
+smaller the faster a node comes or goes (`make_slowness`).
 Planes act in the order given, after gravity.
 
 Why friction needs a thickness: an elastic body without damping that is shaken, as a block is that is released suddenly on an
 incline, opens and closes its contact as it vibrates, and each time it slides a little. Such sliding feeds the vibration (a
 mode-coupling instability), so the block creeps down an incline on which it should stay. Finite elements with Coulomb's law at
 their nodes do so too: it is the undamped model's own motion. Real contacts damp; this one does where it fades in, since what
-approaches is slowed before it is stopped. The price is that rolling is damped as well.
+approaches is slowed before it is stopped. Only what is slow: an impact would be felt a cell early and lose its bounce, by an
+amount that depends on dx. The price is that slow rolling is damped as well.
 """
 
 import math
@@ -29,13 +31,19 @@ stroke with the force of its own law, on coarse grids as on fine ones, and a sha
 WHOLE = 0.45
 """Share of the thickness, next to the surface, in which a node is in contact as those inside are."""
 
+SLOW = 0.05
+"""m/s: of a node along a plane's normal, at which the contact above the plane counts half. What shakes a resting body moves at
+g H/c, hundredths of it for the softest; a tenth of a second's fall is twenty times as fast."""
+TOUCHING = 1e-6
+"""m: above a plane or solid, where a node counts as inside."""
+
 
 @dataclass(frozen=True)
 class Plane:
     """A half space {y: (y - point).normal <= 0} that is solid. point: (3,) [m]; normal: (3,) outward, any length.
 
     mode: sticky | slip | separate; friction: Coulomb coefficient, for `separate`; thickness [m]: over this distance above the
-    plane the contact fades in; None: `THICKNESS` cells where there is friction, else 0.
+    plane the contact with what is slow fades in; None: `THICKNESS` cells where there is friction, else 0.
     """
 
     point: tuple[float, float, float]
@@ -91,7 +99,7 @@ def make_fade(scalar):
     def fade(phi: scalar, thickness: scalar):
         w = scalar(0.0)
         slope = scalar(0.0)
-        if phi <= wp.max(scalar(1.0e-6), scalar(wp.static(whole)) * thickness):
+        if phi <= wp.max(scalar(wp.static(TOUCHING)), scalar(wp.static(whole)) * thickness):
             w = scalar(1.0)
         elif phi < thickness:
             s = (phi / thickness - scalar(wp.static(whole))) / scalar(wp.static(rest))
@@ -100,6 +108,18 @@ def make_fade(scalar):
         return w, slope
 
     return fade
+
+
+def make_slowness(scalar):
+    """Warp function slowness(speed): (share that a contact above a plane has at this speed along the normal [m/s], its slope)."""
+
+    @wp.func
+    def slowness(speed: scalar):
+        q = speed / scalar(wp.static(SLOW))
+        share = scalar(1.0) / (scalar(1.0) + q * q)
+        return share, scalar(-2.0) * q * share * share / scalar(wp.static(SLOW))
+
+    return slowness
 
 
 def make_plane_functions(scalar):

@@ -8,15 +8,15 @@ from torch import Tensor
 
 from mosa.physics.contact.colliders import Box, Capsule, Collider, Cylinder, HalfSpace, Sphere
 from mosa.physics.contact.mesh import SignedDistanceField
-from mosa.physics.contact.planes import WHOLE
+from mosa.physics.contact.planes import TOUCHING, WHOLE
 
 
 def fade(phi: Tensor, thickness: float) -> Tensor:
     """Weight of the contact of nodes at distances phi (M,) [m]: 1 up to `WHOLE` of the thickness, then a smooth step to 0."""
     if thickness == 0:
-        return (phi <= 1e-6).to(phi)
+        return (phi <= TOUCHING).to(phi)
     s = ((phi / thickness - WHOLE) / (1 - WHOLE)).clamp(0, 1)
-    return torch.where(phi <= 1e-6, torch.ones_like(phi), (1 - s) ** 2 * (1 + 2 * s))
+    return torch.where(phi <= TOUCHING, torch.ones_like(phi), (1 - s) ** 2 * (1 + 2 * s))
 
 
 def signed_distance(shape, q: Tensor) -> Tensor:
@@ -62,7 +62,7 @@ def collide(
     """
     forces, torques = [], []
     for collider, x, Q, linear, angular in zip(colliders, *poses):
-        near = signed_distance(collider.shape, (y - x) @ Q).detach() <= max(collider.thickness, 1e-6)
+        near = signed_distance(collider.shape, (y - x) @ Q).detach() <= max(collider.thickness, TOUCHING)
         r = (y - x)[near]
         q = r @ Q
         if not q.requires_grad:

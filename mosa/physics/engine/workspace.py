@@ -13,6 +13,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from mosa.exact_sums import COLUMNS, needed
 from mosa.physics.constitutive.laws import SLOTS
 from mosa.physics.constitutive.material_kernels import kernels_of
 from mosa.physics.contact.collider_buffers import ColliderBuffers
@@ -47,7 +48,8 @@ class Workspace:
         self.worlds, self.size = worlds, particles // worlds
         self.numerics, self.particles, self.substeps, self.with_adjoint = numerics, particles, substeps, with_adjoint
         self.scalar = SCALARS[numerics.dtype]
-        self.kernels, self.update = transfer_kernels(self.scalar), update_kernels(self.scalar)
+        self.exact = needed(numerics.device)
+        self.kernels, self.update = transfer_kernels(self.scalar, self.exact), update_kernels(self.scalar)
         self.stress, self.mapping = kernels_of(numerics.law, self.scalar, adapted, plastic_adapted, numerics.strain)
         self.plastic = numerics.law.plastic
         n = particles
@@ -152,6 +154,8 @@ class Workspace:
         grids, vec4 = self.substeps if self.with_adjoint else 1, self.kernels.vec4
         self.fields = torch.zeros((2, grids, count, 4), dtype=self.numerics.dtype, device=self.numerics.device)
         self.grid_wp, self.velocity_wp = ([wp.from_torch(t, dtype=vec4) for t in slots] for slots in self.fields)
+        if self.exact:
+            self.sums, self.sums_wp = self.array((4 * count, COLUMNS), wp.int64, torch.int64)
         if self.colliders is not None:
             self.colliders.set_nodes(count)
         if self.with_adjoint:
@@ -224,14 +228,22 @@ class Workspace:
             self._graphs.capture(name, body)
         self._graphs.play(name, body)
 
-    def _run(self, kernel, dim: int, inputs: list, adj_inputs: list | None = None) -> None:
+    def run(self, kernel, dim: int, inputs: list, adj_inputs: list | None = None) -> None:
         launch(kernel, dim, inputs, self.flags_wp.device, adj_inputs)
 
     def over_nodes(self, kernel, inputs: list) -> None:
         """Launch for all nodes of the windows. Graphs hold the number of threads: one for all nodes of a world on a CPU, on a CUDA
         device one for each that there is room for, shared among the worlds in equal parts."""
         threads = -(-self.capacity // self.worlds) if self.flags_wp.device.is_cuda else 1
-        self._run(kernel, threads * self.worlds, [self.window_wp, threads, *inputs])
+        self.run(kernel, threads * self.worlds, [self.window_wp, threads, *inputs])
+
+    def _added_to(self, field) -> wp.array:
+        """What particles add to, of which the nodes' numbers in `field` are made."""
+        return self.sums_wp if self.exact else field
+
+    def _settle(self, field) -> None:
+        if self.exact:
+            self.over_nodes(self.kernels.settle, [self.sums_wp, field])
 
     def _geometry(self, dt: float) -> list:
         return [self.window_wp, self.size, self.numerics.dx, 1.0 / self.numerics.dx, dt]
@@ -271,21 +283,25 @@ class Workspace:
             self.colliders.reset()
         for step in range(first, first + count):
             a, b, g = step % states, (step + 1) % states, step % grids
-            self.over_nodes(kernels.clear, [self.grid_wp[g]])
-            self._run(self.stress, n, self._stress_arguments(a, g))
-            self._run(kernels.p2g, n, [
+            if not self.exact:
+                self.over_nodes(kernels.clear, [self.grid_wp[g]])
+            self.run(self.stress, n, self._stress_arguments(a, g))
+            self.run(kernels.p2g, n, [
                 self.x_wp[a], self.v_wp[a], self.C_affine_wp[a], self.F_wp[a], self.tau_wp[g], self.mass_wp, self.volume_wp,
-                *(geometry if step else kicked), int(numerics.check_J), step, self.flags_wp, self.grid_wp[g],
+                *(geometry if step else kicked), int(numerics.check_J), step, self.flags_wp, self._added_to(self.grid_wp[g]),
             ])  # fmt: skip
+            self._settle(self.grid_wp[g])
             self.over_nodes(self.update.grid_update, [*self._grid_arguments(g, step), self.velocity_wp[g]])
             if self.colliders is not None:
                 self.colliders.apply(step, self._collider_place(g), self._kick(step), self.velocity_wp[g])
-            self._run(kernels.g2p, n, [
+            self.run(kernels.g2p, n, [
                 self.x_wp[a], self.F_tot_wp[a], self.velocity_wp[g], *geometry, low, high, step, self.flags_wp,
                 self.x_wp[b], self.v_wp[b], self.C_affine_wp[b], self.F_tot_wp[b],
             ])  # fmt: skip
             if self.plastic:
-                self._run(self.mapping, n, self._mapping_arguments(a, b))
+                self.run(self.mapping, n, self._mapping_arguments(a, b))
+        if self.colliders is not None and first + count == self.substeps:
+            self.colliders.settle()
 
     def adjoint_steps(self, first: int, count: int, more: bool = False) -> None:
         """Launch the adjoint of `advance_steps`: from the seeds in slot (first + count) % 2 to slot first % 2.
@@ -300,16 +316,18 @@ class Workspace:
             a, b = step % 2, (step + 1) % 2  # adjoint slots; the states of all substeps are stored
             if self.plastic:
                 self.adj_F_wp[a].zero_()
-                self._run(self.mapping, n, self._mapping_arguments(step, step + 1), [
+                self.run(self.mapping, n, self._mapping_arguments(step, step + 1), [
                     self.adj_F_wp[a], self.adj_C_affine_wp[b], held["parameters"], held["plastic_G"], held["plastic_h"],
                     0.0, 0.0, 0, self.adj_F_wp[b],
                 ])  # fmt: skip
-            self.over_nodes(kernels.clear, [self.adj_velocity_wp])
-            self._run(kernels.adj_g2p, n, [
+            if not self.exact:
+                self.over_nodes(kernels.clear, [self.adj_velocity_wp])
+            self.run(kernels.adj_g2p, n, [
                 self.x_wp[step], self.F_tot_wp[step], self.velocity_wp[step], self.C_affine_wp[step + 1], *geometry,
                 self.adj_x_wp[b], self.adj_v_wp[b], self.adj_C_affine_wp[b], self.adj_F_tot_wp[b],
-                self.adj_x_wp[a], self.adj_F_tot_wp[a], self.adj_velocity_wp,
+                self.adj_x_wp[a], self.adj_F_tot_wp[a], self._added_to(self.adj_velocity_wp),
             ])  # fmt: skip
+            self._settle(self.adj_velocity_wp)
             if self.colliders is not None:
                 # the velocities that the colliders found are cheaper to compute again than to keep
                 self.over_nodes(self.update.grid_update, [*self._grid_arguments(step, step), self.colliders.before_wp])
@@ -317,11 +335,13 @@ class Workspace:
             self.over_nodes(self.update.adj_grid, [*self._grid_arguments(step, step), self.adj_velocity_wp, self.adj_grid_wp])
             if self.colliders is not None:
                 self.colliders.add_mass(self.adj_grid_wp)
-            self._run(kernels.adj_p2g, n, [
+            self.run(kernels.adj_p2g, n, [
                 self.x_wp[step], self.v_wp[step], self.C_affine_wp[step], self.tau_wp[step], self.mass_wp, self.volume_wp,
                 *(geometry if step else kicked), self.adj_grid_wp, self.adj_x_wp[a], self.adj_v_wp[a], self.adj_C_affine_wp[a],
                 self.adj_tau_wp,
             ])  # fmt: skip
-            self._run(self.stress, n, self._stress_arguments(step, step), [
+            self.run(self.stress, n, self._stress_arguments(step, step), [
                 self.adj_F_wp[a], self.adj_C_affine_wp[a], held["parameters"], held["G"], held["h"], self.adj_tau_wp,
             ])  # fmt: skip
+        if self.colliders is not None and first == 0:
+            self.colliders.settle_adjoint()

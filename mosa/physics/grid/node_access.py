@@ -10,6 +10,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from mosa.exact_sums import sum_functions
+
 
 def _either(cuda: str, cpu: str) -> str:
     return f"#if defined(__CUDA_ARCH__)\n{cuda}\n#else\n{cpu}\n#endif\n"
@@ -95,3 +97,32 @@ def node_access(scalar) -> SimpleNamespace:
     def add3(field: field4, i: int, value: vec3): ...
 
     return SimpleNamespace(load4=load4, load3=load3, store4=store4, store3=store3, add4=add4, add3=add3)
+
+
+@cache
+def exact_node_access(scalar) -> SimpleNamespace:
+    """add4, add3 as `node_access`, onto exact sums (4 nodes, COLUMNS) int64; settle_node(sums, field, i), which stores a node's
+    sums and clears them."""
+    vec3 = wp.types.vector(length=3, dtype=scalar)
+    vec4 = wp.types.vector(length=4, dtype=scalar)
+    store4, functions = node_access(scalar).store4, sum_functions(scalar)
+    add_exactly, total, clear = functions.add_exactly, functions.total, functions.clear
+
+    @wp.func
+    def add4(sums: wp.array2d(dtype=wp.int64), node: int, value: vec4):
+        for k in range(4):
+            add_exactly(sums, 4 * node + k, value[k])
+
+    @wp.func
+    def add3(sums: wp.array2d(dtype=wp.int64), node: int, value: vec3):
+        for k in range(3):
+            add_exactly(sums, 4 * node + k, value[k])
+
+    @wp.func
+    def settle_node(sums: wp.array2d(dtype=wp.int64), field: wp.array(dtype=vec4), node: int):
+        first = 4 * node
+        store4(field, node, vec4(total(sums, first), total(sums, first + 1), total(sums, first + 2), total(sums, first + 3)))
+        for k in range(4):
+            clear(sums, first + k)
+
+    return SimpleNamespace(add4=add4, add3=add3, settle_node=settle_node)

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from mosa.physics.grid.node_access import node_access
+from mosa.physics.grid.node_access import exact_node_access, node_access
 from mosa.physics.grid.stencil import node_functions, stencil_functions
 
 # slots of the flag array: the first substep * N + particle at which the event happened
@@ -27,17 +27,21 @@ _FLIPPED = wp.constant(INVERTED)
 
 
 @cache
-def transfer_kernels(scalar) -> SimpleNamespace:
-    """Kernels clear, p2g, g2p, adj_g2p, adj_p2g for wp.float32 or wp.float64 fields.
+def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
+    """Kernels clear, p2g, g2p, adj_g2p, adj_p2g, settle for wp.float32 or wp.float64 fields.
 
-    clear is launched with `threads` for each world and takes all nodes of its window, however many threads that is."""
+    clear and settle are launched with `threads` for each world and take all nodes of its window, however many threads that is.
+    exact: p2g and adj_g2p add to exact sums, which `settle` turns into the nodes' numbers and clears."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
     vec4 = wp.types.vector(length=4, dtype=scalar)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
     memory, stencil, nodes_of = node_access(scalar), stencil_functions(scalar), node_functions(scalar).nodes_of
-    load3, load4, store4, add3, add4 = memory.load3, memory.load4, memory.store4, memory.add3, memory.add4
+    load3, load4, store4 = memory.load3, memory.load4, memory.store4
+    adding = exact_node_access(scalar) if exact else memory
+    add3, add4, settle_node = adding.add3, adding.add4, exact_node_access(scalar).settle_node
+    added_to = wp.array2d(dtype=wp.int64) if exact else wp.array(dtype=vec4)
     spline, spline_slope, cell, local_cell = stencil.spline, stencil.spline_slope, stencil.cell, stencil.local_cell
-    module = f"mosa.physics.transfers_{scalar.__name__}"
+    module = f"mosa.physics.{'exact_' if exact else ''}transfers_{scalar.__name__}"
 
     # `steps` in the kernels holds the node offsets as scalars: Warp 1.19 retypes a loop variable that is cast to float64
 
@@ -50,11 +54,20 @@ def transfer_kernels(scalar) -> SimpleNamespace:
             store4(grid, node, vec4(z, z, z, z))
 
     @wp.kernel(module=module, enable_backward=False)
+    def settle(
+        window: wp.array(dtype=wp.vec3i), threads: int, sums: wp.array2d(dtype=wp.int64), grid: wp.array(dtype=vec4)
+    ):
+        world = wp.tid() / threads
+        first, end = nodes_of(window, world)
+        for node in range(first + wp.tid() - world * threads, end, threads):
+            settle_node(sums, grid, node)
+
+    @wp.kernel(module=module, enable_backward=False)
     def p2g(
         x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), C: wp.array(dtype=mat33), F: wp.array(dtype=mat33),
         tau: wp.array(dtype=mat33), mass: wp.array(dtype=scalar), volume: wp.array(dtype=scalar),
         window: wp.array(dtype=wp.vec3i), size: int, dx: scalar, inv_dx: scalar, dt: scalar,
-        check_J: int, substep: int, flags: wp.array(dtype=wp.int64), grid: wp.array(dtype=vec4),
+        check_J: int, substep: int, flags: wp.array(dtype=wp.int64), grid: added_to,
     ):  # fmt: skip
         p = wp.tid()
         xp = x[p]
@@ -161,7 +174,7 @@ def transfer_kernels(scalar) -> SimpleNamespace:
         window: wp.array(dtype=wp.vec3i), size: int, dx: scalar, inv_dx: scalar, dt: scalar,
         adj_x_new: wp.array(dtype=vec3), adj_v_new: wp.array(dtype=vec3), adj_C_new: wp.array(dtype=mat33),
         adj_A_new: wp.array(dtype=mat33),
-        adj_x: wp.array(dtype=vec3), adj_A: wp.array(dtype=mat33), adj_velocity: wp.array(dtype=vec4),
+        adj_x: wp.array(dtype=vec3), adj_A: wp.array(dtype=mat33), adj_velocity: added_to,
     ):  # fmt: skip
         """Writes adj_x and adj_A, adds to adj_velocity."""
         p = wp.tid()
@@ -288,5 +301,5 @@ def transfer_kernels(scalar) -> SimpleNamespace:
         adj_x[p] = adj_x[p] + inv_dx * (vec3(gx, gy, gz) - wp.transpose(B) * s)
 
     return SimpleNamespace(
-        clear=clear, p2g=p2g, g2p=g2p, adj_g2p=adj_g2p, adj_p2g=adj_p2g, vec3=vec3, vec4=vec4, mat33=mat33
+        clear=clear, settle=settle, p2g=p2g, g2p=g2p, adj_g2p=adj_g2p, adj_p2g=adj_p2g, vec3=vec3, vec4=vec4, mat33=mat33
     )

@@ -1,0 +1,37 @@
+"""Files that appear under their name complete or not at all, and what a killed process left of them."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def written_whole(path: str | Path) -> Iterator[Path]:
+    """Where to write a file that is renamed to `path` afterwards, if nothing went wrong. Each process writes beside the others, and
+    removes what processes of this machine that have ended left of the same file."""
+    path = Path(path)
+    own = f"{path.name}.{platform.node().replace('.', '_')}."
+    for old in path.parent.glob(f"{own.replace('[', '[[]')}*.partial"):
+        if not _runs(old.name.removeprefix(own).removesuffix(".partial")):
+            old.unlink(missing_ok=True)
+    partial = path.with_name(f"{own}{os.getpid()}.partial")
+    try:
+        yield partial
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _runs(number: str) -> bool:
+    """Whether a process of this machine has that number."""
+    try:
+        os.kill(int(number), 0)
+    except (ProcessLookupError, ValueError):
+        return False
+    except OSError:  # another user's
+        return True
+    return True

@@ -1,0 +1,42 @@
+"""Files that are complete under their name, beside what others write and what a kill left."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from mosa.whole_files import written_whole
+
+
+def test_a_file_appears_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "a[1].npz"
+    with pytest.raises(ZeroDivisionError), written_whole(path) as partial:
+        partial.write_text("half")
+        raise ZeroDivisionError
+    assert list(tmp_path.iterdir()) == []
+    with written_whole(path) as partial:
+        partial.write_text("all of it")
+        assert not path.exists()
+    assert path.read_text() == "all of it" and list(tmp_path.iterdir()) == [path]
+
+
+def test_what_a_killed_process_left_is_removed_by_the_next(tmp_path):
+    path = tmp_path / "a[1].npz"
+    code = f"""
+from mosa.whole_files import written_whole
+import os, signal
+with written_whole({str(path)!r}) as partial:
+    partial.write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    killed = subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)})
+    assert killed.returncode == -9
+    (left,) = tmp_path.iterdir()
+    other = left.with_name(left.name.replace("a[1]", "b"))
+    other.write_text("another file's")
+    alive = left.with_name(f"{left.name.rsplit('.', 2)[0]}.{os.getppid()}.partial")
+    alive.write_text("still being written")
+    with written_whole(path) as partial:
+        partial.write_text("all of it")
+    assert sorted(tmp_path.iterdir()) == sorted([path, other, alive])
