@@ -100,16 +100,6 @@ def device_of(cfg: DictConfig) -> str:
     return name
 
 
-def named_device(name: str) -> str:
-    """A device that torch can use here. Errors: ConfigError."""
-    try:
-        torch.empty(0, device=name)
-    except (RuntimeError, AssertionError) as error:  # AssertionError: torch without CUDA
-        reason = str(error).splitlines()[0]
-        raise ConfigError(f"device: expected cpu, or cuda on a machine with a GPU, found {name!r} ({reason})") from error
-    return name
-
-
 def most_particles(device: torch.device | str) -> int:
     """Of simulation.particles=auto."""
     return MOST_PARTICLES["cpu" if str(device) == "cpu" else "cuda"]

@@ -18,11 +18,12 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from mosa.analysis.figures import side_by_side, write_video
-from mosa.checkpoints import TENSORS, checked, checked_posterior, checked_splats, read_checkpoint
+from mosa.checkpoints import TENSORS, check_kinds, checked, checked_posterior, checked_splats, read_checkpoint
 from mosa.config import build_body, build_world
 from mosa.data.splat_files import save_frames
 from mosa.episode import Episode, Stepped, TwinState
 from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
+from mosa.limits import named_device
 from mosa.modules.body import Body, Start, World
 from mosa.modules.carried_splats import CarriedSplats, seen
 from mosa.modules.gauss_newton import Posterior
@@ -52,12 +53,14 @@ class Twin:
     @classmethod
     def load(cls, path: str | Path, device: str = "cpu") -> Twin:
         """Read a checkpoint, as data alone (docs/safety.md). Errors: DataError naming file and part where it is missing, damaged,
-        or was not written by this program."""
+        or was not written by this program; ConfigError for a device that is not here."""
+        device = named_device(device)
         checkpoint = read_checkpoint(path)
         config, begun, tensors = checked(checkpoint, path)
         splats = checked_splats(checkpoint, path)
         try:
             body = build_body(config, {name: tensors[name] for name in TENSORS})
+            check_kinds(tensors, body.state_dict())
             body.load_state_dict(tensors)
             if splats is not None:
                 body.splats = CarriedSplats.read(splats, body.rest)

@@ -17,9 +17,9 @@ import numpy as np
 
 from mosa.clips import BODIES, COLORS, FAINT, GRAY, Clip, read_run
 from mosa.errors import ConfigError, DataError, MosaError
+from mosa.limits import named_device
 from mosa.live import Live
 from mosa.live_viewer import LiveViewer
-from mosa.run import named_device
 from mosa.twin import Twin
 from mosa.viewing import add_ground, aim, open_server, view_of
 
