@@ -5,7 +5,8 @@
     python benchmarks/robustness.py --runs              # and whole processes: exit codes, a sweep of failures (minutes)
 
 Each attack ends in one clear message (a MosaError of one line), in a traceback, in a hang (over 60 s), or it runs. What runs is
-listed: those are the attacks that the program has no word against. The attacks are in robustness_attacks.py.
+listed: those are the attacks that the program has no word against. The attacks are in robustness_attacks.py and
+robustness_meaning.py.
 """
 
 from __future__ import annotations
@@ -19,9 +20,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from robustness_attacks import GROUPS
+from robustness_meaning import MORE
 
 from mosa.errors import MosaError
 
+ATTACKS = GROUPS | MORE
 PATIENCE = 60
 HEAD = "| group | tried | one clear message | traceback or hang | ran |\n|---|---|---|---|---|"
 
@@ -55,14 +58,14 @@ def outcome(attack: Callable[[], object]) -> tuple[str, str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", default=",".join(name for name in GROUPS if name != "runs"))
+    parser.add_argument("--only", default=",".join(name for name in ATTACKS if name != "runs"))
     parser.add_argument("--runs", action="store_true")
     options = parser.parse_args()
     rows, said = [], []
     for name in [*options.only.split(","), *(["runs"] if options.runs else [])]:
         counts = dict.fromkeys(("message", "traceback", "hang", "ran"), 0)
         with tempfile.TemporaryDirectory() as folder:
-            for what, attack in GROUPS[name](Path(folder)):
+            for what, attack in ATTACKS[name](Path(folder)):
                 kind, text = outcome(attack)
                 counts[kind] += 1
                 said += [f"{name}: {kind}: {what[:100]} {text[:150]}"] if kind != "message" else []

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
 
 import torch
@@ -19,6 +19,7 @@ from torch import Tensor
 from mosa.errors import ConfigError
 from mosa.modules.start import World
 from mosa.physics.contact.motion import exponential
+from mosa.schema import Kind, is_number, number, whole
 from mosa.types import Ground
 
 ROOM = 5.0
@@ -30,6 +31,18 @@ THICKNESS = 0.035
 FRICTION = 0.6
 LAST = 5
 """Control steps at the end over which a reward is averaged: the body may still quiver."""
+
+
+LENGTH = number(0, ROOM)
+_SOME, _ANGLE = number(1e-4, ROOM), number(0, math.pi)
+RANGES: dict[str, Kind] = {
+    "extents": Kind("three lengths of the body [m]", lambda v: isinstance(v, (tuple, list)) and len(v) == 3 and all(
+        is_number(x) and 0 <= x <= ROOM for x in v)),
+    "steps": whole(1, 10**5), "control_dt": number(1e-4, 1), "low": number(CLEARANCE, ROOM), "high": number(CLEARANCE, ROOM),
+    "tilt": _ANGLE, "unsteady_tilt": _ANGLE, "askew": _ANGLE, "lean": number(1e-3, math.pi), "near": _SOME, "radius": _SOME,
+    "still": number(1e-4, 100), "fastest": number(1e-4, 100), "narrow": number(0.1, 2),
+}  # fmt: skip
+"""What a field of a task may be: lengths [m] where nothing else is said."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +93,17 @@ class Task(ABC):
     tool: ClassVar[str | None] = None
     """Name of the solid that actions drive; None: one decision at the start, after which nothing is acted on."""
     ground_friction: ClassVar[float] = 0.3
+
+    def __post_init__(self) -> None:
+        """Errors: ConfigError naming the field that is out of its range."""
+        for field in fields(self):
+            value, kind = getattr(self, field.name), RANGES.get(field.name, LENGTH)
+            if not kind.fits(value):
+                raise ConfigError(f"options.{field.name}: expected {kind.described}, found {str(value)[:80]!r}")
+        for low, high in (("low", "high"), ("close", "far")):
+            if hasattr(self, low) and getattr(self, low) > getattr(self, high):
+                raise ConfigError(f"options.{low}: expected at most options.{high}={getattr(self, high):g}, found "
+                                  f"{getattr(self, low):g}")
 
     @property
     @abstractmethod
@@ -428,7 +452,9 @@ def task_named(name: str, rest: Tensor, **options: Any) -> Task:
     """The task for a body with rest positions (N, 3) [m]: its sizes follow from the body's. options: of the task.
 
     Errors: ConfigError naming what is unknown."""
-    if name not in TASKS:
+    if not isinstance(name, str) or name not in TASKS:
         raise ConfigError(f"task: expected one of {', '.join(TASKS)}, found {name!r}")
+    if unknown := sorted(set(options) - {field.name for field in fields(TASKS[name])} | set(options) & {"extents"}):
+        raise ConfigError(f"options.{unknown[0]}: expected a field of the task {name}, found it")
     extents = tuple(round(float(e), 2) for e in (rest.amax(0) - rest.amin(0)))
     return TASKS[name](extents, **options)
