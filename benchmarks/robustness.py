@@ -2,6 +2,7 @@
 
     python benchmarks/robustness.py                     # all groups, about two CPU-minutes
     python benchmarks/robustness.py --only data,npz     # some of them
+    python benchmarks/robustness.py --only cuda         # what a GPU answers otherwise (minutes)
     python benchmarks/robustness.py --runs              # and whole processes: exit codes, a sweep of failures (minutes)
 
 Each attack ends in one clear message (a MosaError of one line), in a traceback, in a hang (over 60 s), or it runs. What runs is
@@ -20,12 +21,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 from robustness_attacks import GROUPS
+from robustness_cuda import cuda
 from robustness_meaning import MORE
 
 from mosa.errors import MosaError
 
-ATTACKS = GROUPS | MORE
+ATTACKS = GROUPS | MORE | {"cuda": cuda}
 PATIENCE = 60
+LONGER = {"runs": 300, "cuda": 300}
+"""Seconds until an attack counts as a hang; of whole processes."""
 HEAD = "| group | tried | one clear message | traceback or hang | ran |\n|---|---|---|---|---|"
 
 
@@ -33,14 +37,14 @@ class Hang(Exception):
     """An attack took longer than PATIENCE seconds."""
 
 
-def outcome(attack: Callable[[], object]) -> tuple[str, str]:
+def outcome(attack: Callable[[], object], patience: int = PATIENCE) -> tuple[str, str]:
     """(message | traceback | hang | ran, what was said)."""
 
     def ring(*_):
         raise Hang
 
     signal.signal(signal.SIGALRM, ring)
-    signal.alarm(PATIENCE)
+    signal.alarm(patience)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -58,7 +62,7 @@ def outcome(attack: Callable[[], object]) -> tuple[str, str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", default=",".join(name for name in ATTACKS if name != "runs"))
+    parser.add_argument("--only", default=",".join(name for name in ATTACKS if name not in ("runs", "cuda")))
     parser.add_argument("--runs", action="store_true")
     options = parser.parse_args()
     rows, said = [], []
@@ -66,7 +70,7 @@ def main() -> None:
         counts = dict.fromkeys(("message", "traceback", "hang", "ran"), 0)
         with tempfile.TemporaryDirectory() as folder:
             for what, attack in ATTACKS[name](Path(folder)):
-                kind, text = outcome(attack)
+                kind, text = outcome(attack, LONGER.get(name, PATIENCE))
                 counts[kind] += 1
                 said += [f"{name}: {kind}: {what[:100]} {text[:150]}"] if kind != "message" else []
         rows.append(f"| {name} | {sum(counts.values())} | {counts['message']} | {counts['traceback'] + counts['hang']} | "

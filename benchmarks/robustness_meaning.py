@@ -719,7 +719,24 @@ def idle_keys(_: Path) -> Iterator[Attack]:
         yield f"{key}=1e30", huge
 
 
+def sections(_: Path) -> Iterator[Attack]:
+    """Something else in the place of every section, and every section left out."""
+
+    def below(tree: dict, above: str = "") -> Iterator[str]:
+        for key, value in tree.items():
+            if isinstance(value, dict) and key != "hydra":
+                yield f"{above}{key}"
+                yield from below(value, f"{above}{key}.")
+
+    config = composed()
+    for path in below({key: value for key, value in config.items() if key != "scene"}):
+        for value in (5, "abc", [[{}], 1], True, NAN, {"foo": 1}):
+            if path not in ("ckpt_path", "logger.tensorboard", "logger.csv", "logger") or not isinstance(value, dict):
+                yield f"{path}={value}", lambda p=path, v=value: configured(put(config, p, v))
+
+
 MORE = {
+    "sections": sections,
     "films": films,
     "senseless": senseless,
     "environments": environments,

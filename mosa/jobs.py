@@ -89,6 +89,15 @@ def disk_message(error: OSError) -> str | None:
             "hydra.run.dir= and scene.cache= (eval.py: cache=)")
 
 
+def gpu_message(error: RuntimeError) -> str | None:
+    """One sentence where a GPU has no memory left, as torch and Warp say it; None for any other error."""
+    said = str(error).splitlines()[0] if str(error) else ""
+    if type(error).__name__ != "OutOfMemoryError" and not ("Failed to allocate" in said and "cuda" in said):
+        return None
+    return (f"the GPU has no memory left ({said[:200]}); stop what else runs there, lower simulation.particles or scene.scale, or "
+            "take trainer=cpu (eval.py and others: device=cpu)")
+
+
 def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float | None:
     """job(cfg) and its result. A mistake of the user ends in one message and exit code 2; in a sweep it is kept for the end, the
     result is infinite, and the other jobs go on. A stop ends in 130 (Ctrl-C) or 143 (SIGTERM)."""
@@ -109,6 +118,10 @@ def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float
         if (reason := disk_message(error)) is None:
             raise
         message = f"DataError: {reason}"
+    except RuntimeError as error:
+        if (reason := gpu_message(error)) is None:
+            raise
+        message = f"MemoryError: {reason}"
     fail(message)
     if HydraConfig.get().mode != RunMode.MULTIRUN:
         sys.exit(2)

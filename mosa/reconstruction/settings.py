@@ -59,6 +59,8 @@ class ReconstructionSettings:
 
 
 def _section(cls: type, values: Mapping[str, Any], where: str) -> Any:
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{where}: expected a section of keys, found {str(values)[:80]!r}")
     known = {f.name for f in fields(cls)}
     unknown = sorted(set(values) - known)
     if unknown:
