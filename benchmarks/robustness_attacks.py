@@ -180,7 +180,8 @@ def overrides(_: Path) -> Iterator[Attack]:
     }  # fmt: skip
     for plus, each in wrong.items():
         for override in each:
-            yield plus + override, lambda o=plus + override: configured(composed(o))
+            of = ("adapter=mosa",) if override.startswith("adapter.alpha") else ()  # which has this key
+            yield plus + override, lambda o=plus + override, of=of: configured(composed(*of, o))
     for key in ("seed", "fit", "world", "simulation.stride", "fit.views", "scene", "losses", "trainer", "evaluation"):
         yield f"~{key}", lambda k=key: configured(put(composed(), k, ...))
 
