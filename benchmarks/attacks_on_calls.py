@@ -17,12 +17,14 @@ from mosa.known import check_known
 from mosa.schema import check
 
 
-def overrides(_: Path) -> Iterator[Attack]:
-    def configured(config: dict):
-        check_known(config, ROOT / "conf", "train", TRAINING, EVALUATION)
-        check(config, TRAINING, EVALUATION)
-        rehearse(config)
+def configured(config: dict):
+    """What a run checks of its configuration before anything else."""
+    check_known(config, ROOT / "conf", "train", TRAINING, EVALUATION)
+    check(config, TRAINING, EVALUATION)
+    rehearse(config)
 
+
+def overrides(_: Path) -> Iterator[Attack]:
     wrong = {
         "+": ["foo=1", "world.foo=1", "simulation.foo=1", "fit.foo=1", "rendering.foo=1", "trainer.max_epochs=1", "adapter.alfa=1",
               "logger._target_=nonsense", "evaluation.foo=1", "prior.parameters.mu=5", "prior.foo=1", "reconstruction.foo=1",

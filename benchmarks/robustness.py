@@ -2,11 +2,12 @@
 
     python benchmarks/robustness.py                     # all groups, about two CPU-minutes
     python benchmarks/robustness.py --only data,npz     # some of them
+    python benchmarks/robustness.py --only cuda         # what a GPU answers otherwise (minutes)
     python benchmarks/robustness.py --runs              # and whole processes: exit codes, a sweep of failures (minutes)
 
 Each attack ends in one clear message (a MosaError of one line), in a traceback, in a hang (over 60 s), or it runs. What runs is
-listed: those are the attacks that the program has no word against. The attacks are in attacks_on_files.py, attacks_on_calls.py and
-attacks_on_data.py.
+listed: those are the attacks that the program has no word against. The attacks are in attacks_on_files.py, attacks_on_calls.py,
+attacks_on_data.py, attacks_on_meaning.py and attacks_on_cuda.py.
 """
 
 from __future__ import annotations
@@ -22,14 +23,18 @@ from pathlib import Path
 import attacks_on_calls as calls
 import attacks_on_data as data
 import attacks_on_files as files
+from attacks_on_cuda import cuda
+from attacks_on_meaning import MORE
 
 from mosa.errors import MosaError
 
 GROUPS = {"checkpoints": files.checkpoints, "npz": files.npz, "overrides": calls.overrides, "colliders": calls.colliders,
           "calls": calls.calls, "data": data.data, "meshes": data.meshes, "caches": files.caches, "poses": data.poses,
-          "resumed": files.resumed, "runs": calls.runs}  # fmt: skip
+          "resumed": files.resumed, "runs": calls.runs} | MORE | {"cuda": cuda}  # fmt: skip
 """Name -> pairs of what is done and a function that does it, in a folder."""
 PATIENCE = 60
+LONGER = {"runs": 300, "cuda": 300}
+"""Seconds until an attack counts as a hang; of whole processes."""
 HEAD = "| group | tried | one clear message | traceback or hang | ran |\n|---|---|---|---|---|"
 
 
@@ -37,14 +42,14 @@ class Hang(Exception):
     """An attack took longer than PATIENCE seconds."""
 
 
-def outcome(attack: Callable[[], object]) -> tuple[str, str]:
+def outcome(attack: Callable[[], object], patience: int = PATIENCE) -> tuple[str, str]:
     """(message | traceback | hang | ran, what was said)."""
 
     def ring(*_):
         raise Hang
 
     signal.signal(signal.SIGALRM, ring)
-    signal.alarm(PATIENCE)
+    signal.alarm(patience)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -62,7 +67,7 @@ def outcome(attack: Callable[[], object]) -> tuple[str, str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", default=",".join(name for name in GROUPS if name != "runs"))
+    parser.add_argument("--only", default=",".join(name for name in GROUPS if name not in ("runs", "cuda")))
     parser.add_argument("--runs", action="store_true")
     options = parser.parse_args()
     rows, said = [], []
@@ -70,7 +75,7 @@ def main() -> None:
         counts = dict.fromkeys(("message", "traceback", "hang", "ran"), 0)
         with tempfile.TemporaryDirectory() as folder:
             for what, attack in GROUPS[name](Path(folder)):
-                kind, text = outcome(attack)
+                kind, text = outcome(attack, LONGER.get(name, PATIENCE))
                 counts[kind] += 1
                 said += [f"{name}: {kind}: {what[:100]} {text[:150]}"] if kind != "message" else []
         rows.append(f"| {name} | {sum(counts.values())} | {counts['message']} | {counts['traceback'] + counts['hang']} | "

@@ -23,7 +23,7 @@ from mosa.modules.material import RIVALS
 from mosa.physics.constitutive.laws import law_named
 from mosa.rendering.lighting import LIGHT
 from mosa.rendering.spherical_harmonics import DEGREES
-from mosa.schema import POSITIVE, THREE, WEIGHT, Kind, check, is_number, one_of, or_null, whole
+from mosa.schema import POSITIVE, THREE, WEIGHT, Kind, check, is_number, number, one_of, or_null, whole
 
 TENSORS = {"rest": (3,), "volume": (), "colors": (3,), "opacities": (), "covariances": (3, 3)}
 """What a body is made of, with the shape for each particle."""
@@ -48,12 +48,18 @@ GOING_ON: dict[str, Kind] = {
 NODES, DEPTH = 2_000_000, 40
 """Entries and levels of a checkpoint's containers: losses of a fit of 10,000 steps are 10,000."""
 
+STRONGEST, WIDEST = 1e4, 1e5
+"""[m/s^2] of gravity and [m] of a world's box."""
+BRIGHTEST = 10.0
+"""Of a colour, which a fit may bring beyond 1."""
+SPACING = 0.02, 5.0
+"""Distance between particles, in cells: 1/64 to 50 of them in a cell's volume, with room."""
 BOX = Kind("two corners, min below max",
            lambda v: isinstance(v, list) and len(v) == 2 and all(map(THREE.fits, v)) and all(a < b for a, b in zip(*v)))
 TURNED = Kind("a 3x3 rotation matrix", lambda v: is_rotation(v))
 START = {"rotation": TURNED, "center": THREE, "velocity": THREE, "angular_velocity": THREE}
 STORED: dict[str, Kind] = {
-    "density": POSITIVE, "dx": POSITIVE, "frame_dt": POSITIVE, "world.gravity": THREE, "world.box": BOX,
+    "density": number(0.1, 1e5), "dx": number(1e-6, 100), "frame_dt": number(1e-6, 100), "world.gravity": THREE, "world.box": BOX,
     "world.up": Kind("a direction", lambda v: THREE.fits(v) and any(v)),
     "world.ground.height": Kind("a number", is_number), "world.ground.mode": one_of("sticky", "slip", "separate"),
     "world.ground.friction": WEIGHT,
@@ -172,6 +178,7 @@ def checked(checkpoint: Mapping[str, Any], path: str | Path) -> tuple[dict, dict
         raise DataError(f"ckpt_path: {path}: expected the part state_dict, found none")
     tensors = {k.removeprefix("body."): v for k, v in state.items() if isinstance(k, str) and k.startswith("body.")}
     check_tensors(tensors, path)
+    check_sense(config, tensors, path)
     return config, saved["start"], tensors
 
 
@@ -259,8 +266,46 @@ def check_tensors(tensors: Mapping[str, Any], path: str | Path) -> None:
         unset = name.startswith("adapter.") and value.ndim == 0  # an adapter that was not switched on yet has no unit
         if value.is_floating_point() and not unset and not bool(torch.isfinite(value).all()):
             raise DataError(f"ckpt_path: {path}: body.{name}: expected finite numbers")
+    opacities, colors, covariances = (tensors[name].detach() for name in ("opacities", "colors", "covariances"))
+    if not 0 <= float(opacities.min()) <= float(opacities.max()) <= 1 or float(colors.abs().max()) > BRIGHTEST:
+        raise DataError(f"ckpt_path: {path}: body.opacities, body.colors: expected opacities from 0 to 1 and colours within "
+                        f"{BRIGHTEST:g}, found {float(opacities.min()):g} to {float(opacities.max()):g} and "
+                        f"{float(colors.abs().max()):g}")
+    widths, size = torch.linalg.eigvalsh(covariances.double()), float((tensors["rest"].amax(0) - tensors["rest"].amin(0)).max())
+    uneven = float((covariances - covariances.mT).abs().max()) > 1e-3 * float(covariances.abs().max())
+    if uneven or float(widths.min()) < -1e-3 * float(widths.max()) or float(widths.max()) > size**2:
+        raise DataError(f"ckpt_path: {path}: body.covariances: expected symmetric, positive ones of particles smaller than the "
+                        f"body of {size:.3g} m, found squared widths of {float(widths.min()):.3g} to {float(widths.max()):.3g} m^2")
     if not float(tensors["volume"].min()) > 0 or not math.isfinite(float(tensors["rest"].abs().max())):
         raise DataError(f"ckpt_path: {path}: body.volume: expected volumes above 0 m^3, found {float(tensors['volume'].min()):g}")
+
+
+def check_sense(config: Mapping[str, Any], tensors: Mapping[str, Tensor], path: str | Path) -> None:
+    """A body that can be, in a world that holds together: numbers may be finite and yet mean nothing. Errors: DataError."""
+    world, where = config["world"], f"ckpt_path: {path}: stored configuration: world"
+    gravity, up = (torch.tensor(world[name], dtype=torch.float64) for name in ("gravity", "up"))
+    if world["ground"] is not None:
+        corners = torch.cartesian_prod(*torch.tensor(world["box"], dtype=torch.float64).T) @ (up / up.norm())
+        if not float(corners.min()) <= world["ground"]["height"] <= float(corners.max()):
+            raise DataError(f"{where}.ground.height: expected a ground inside of the box {world['box']}, found "
+                            f"{world['ground']['height']:g}")
+        if bool(gravity.any()) and not float(gravity @ up) < 0:
+            raise DataError(f"{where}.gravity: expected a pull against up = {world['up']}, found {world['gravity']}")
+    if float(gravity.norm()) > STRONGEST or max(abs(x) for corner in world["box"] for x in corner) > WIDEST:
+        raise DataError(f"{where}: expected a gravity of at most {STRONGEST:g} m/s^2 and a box within {WIDEST:g} m, found "
+                        f"{world['gravity']} and {world['box']}")
+    share = float(tensors["volume"].double().mean()) ** (1 / 3) / config["dx"]
+    if not SPACING[0] < share < SPACING[1]:
+        raise DataError(f"ckpt_path: {path}: body.volume: expected particles {SPACING[0]:g} to {SPACING[1]:g} cells of "
+                        f"dx = {config['dx']:g} m apart, found {share:.3g}")
+
+
+def check_kinds(found: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> None:
+    """Numbers where numbers are wanted: copying would turn flags and whole numbers into them. Errors: DataError."""
+    for name, value in wanted.items():
+        if name in found and found[name].dtype != value.dtype and not (
+            {found[name].dtype, value.dtype} <= {torch.float32, torch.float64}):  # fmt: skip
+            raise DataError(f"body.{name}: expected {value.dtype}, found {found[name].dtype}")
 
 
 def check_same(checkpoint: Mapping[str, Any], module: torch.nn.Module, path: str | Path) -> None:

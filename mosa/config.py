@@ -119,8 +119,10 @@ def build_heterogeneity(config: Mapping[str, Any], low: Tensor, high: Tensor) ->
     return HETEROGENEITY[settings.kind](low, high, settings) if settings.enabled else None
 
 
-def rehearse(cfg: Mapping[str, Any]) -> None:
-    """Build what needs no data and drop it: a mistake then shows before the reconstruction. Errors: ConfigError naming the key."""
+def rehearse(cfg: Mapping[str, Any]) -> list[Stage]:
+    """Build what needs no data and drop it: a mistake then shows before the reconstruction. Returns the stages of the fit.
+
+    Errors: ConfigError naming the key."""
     build_settings(**cfg["reconstruction"])
     low, high = torch.zeros(3), torch.ones(3)
     with torch.random.fork_rng(devices=[]):
@@ -130,7 +132,7 @@ def rehearse(cfg: Mapping[str, Any]) -> None:
             warnings.simplefilter("ignore")
             adapter = fitting(build_adapter(cfg["adapter"]), material.law)
     build_simulation(cfg["simulation"], 1.0)
-    build_stages(cfg["fit"], heterogeneity, adapter, bool(material.candidates))
+    stages = build_stages(cfg["fit"], heterogeneity, adapter, bool(material.candidates))
     build_criterion(cfg)
     build_identification(cfg)
     build_evaluation(cfg)
@@ -142,6 +144,7 @@ def rehearse(cfg: Mapping[str, Any]) -> None:
     for collider in colliders_from_config(cfg["world"]["colliders"] or ()):
         if isinstance(collider.motion, Motion) and collider.motion.times is not None:
             collider.motion.sample(1, 1, 1.0)  # as many velocities as times
+    return stages
 
 
 def build_adapter(config: Mapping[str, Any]) -> torch.nn.Module | None:

@@ -133,6 +133,8 @@ class Episode:
 
     @state.setter
     def state(self, state: TwinState) -> None:
+        if not isinstance(state, TwinState):
+            raise ConfigError(f"state: expected a TwinState (TwinState.read makes one of tensors), found {type(state).__name__}")
         now = self.state
         for f in fields(TwinState):
             found, known = getattr(state, f.name), getattr(now, f.name)

@@ -10,7 +10,7 @@ class MosaError(Exception):
     """Base of every error this package raises on purpose. `train.py` and `eval.py` print it without a traceback."""
 
     def __str__(self) -> str:
-        message = super().__str__()
+        message = " ".join(super().__str__().splitlines())  # one line, whatever was found
         return message if len(message) <= LONGEST else f"{message[: LONGEST - 500]} ... {message[-500:]}"
 
 

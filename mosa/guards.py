@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from mosa.checkpoints import check_resumed, read_checkpoint
@@ -13,6 +15,7 @@ from mosa.data.agreement import lines_of_sight, misses
 from mosa.data.splat_files import check_formats
 from mosa.errors import ConfigError, DataError
 from mosa.extensions import registered_keys
+from mosa.idle import warn_of_idle
 from mosa.keys import CAPTURE, ENVIRONMENTS, EVALUATION, SIMULATION, SPLATS, TRAINING
 from mosa.known import check_known, conf_folder
 from mosa.limits import machine_memory
@@ -28,14 +31,17 @@ PARTICLE_BYTES = 5e3
 FEWEST = 8
 
 
-def check_configuration(values: Mapping[str, Any]) -> None:
-    """All that train.py's configuration says by itself. Errors: ConfigError naming the key."""
-    if (conf := conf_folder()) is not None:
+def check_configuration(values: Mapping[str, Any], conf: Path | None = None) -> None:
+    """All that train.py's configuration says by itself; a warning for each key that was set and does nothing. conf: the folder of
+    its YAML files, None for the running program's. Errors: ConfigError naming the key."""
+    if (conf := conf or conf_folder()) is not None:
         check_known(values, conf, "train", TRAINING, EVALUATION, registered_keys(values))
     check(values, TRAINING, EVALUATION)
     if values["simulation"]["particles"] != "auto":
         check_particles("simulation.particles", values["simulation"]["particles"])
-    rehearse(values)
+    stages = rehearse(values)
+    if HydraConfig.initialized():
+        warn_of_idle(HydraConfig.get().overrides.task, values, stages)
 
 
 def check_evaluation(values: Mapping[str, Any]) -> None:

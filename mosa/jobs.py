@@ -148,10 +148,13 @@ NO_MEMORY = ("can't allocate memory", "out of memory", "Failed to allocate")
 
 
 def memory_message(error: Exception) -> str | None:
-    """One sentence on memory that there is not; None for any other error."""
+    """One sentence on memory that there is not, of the machine or of a GPU; None for any other error."""
     if not isinstance(error, MemoryError) and not any(text in str(error) for text in NO_MEMORY):
         return None
     told = " ".join(str(error).split())[:200] or "the machine has no more"
+    if "cuda" in told.lower():
+        return (f"the GPU has no memory left ({told}); stop what else runs there, lower simulation.particles or scene.scale, or "
+                "take trainer=cpu (eval.py and others: device=cpu)")
     return f"{told}; lower the sizes (simulation.particles, scene.scale)"
 
 

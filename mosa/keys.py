@@ -47,7 +47,7 @@ SECTIONS = ("scene", "prior", "adapter", "reconstruction", "simulation", "fit", 
             "heterogeneity", "losses", "world", "criterion", "identification",
             "fit.prior", "fit.prior_eta", "fit.joint", "reconstruction.static",
             "reconstruction.appearance", "reconstruction.dynamic", "reconstruction.carried",
-            "reconstruction.informed")  # fmt: skip
+            "reconstruction.informed", "reconstruction.geometry")  # fmt: skip
 
 FIGURE = Kind("a figure's name like test/rms_m (docs/figures.md)",
               lambda v: isinstance(v, str) and v.split("/")[0] in FIGURES and "/" in v)

@@ -5,6 +5,10 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import torch
+
+from mosa.errors import ConfigError
+
 CGROUP = Path("/sys/fs/cgroup/memory.max")
 
 
@@ -16,3 +20,15 @@ def machine_memory() -> int:
     except OSError:
         return total
     return min(total, int(limit)) if limit.isdigit() else total
+
+
+def named_device(name: str | torch.device) -> str:
+    """The name of a device that torch can use here. Errors: ConfigError."""
+    wanted = "device: expected cpu, or cuda on a machine with a GPU, found"
+    if not isinstance(name, (str, torch.device)) or (str(name) != "cpu" and str(name).split(":")[0] != "cuda"):
+        raise ConfigError(f"{wanted} {name!r}")
+    try:
+        torch.empty(0, device=name)
+    except (RuntimeError, AssertionError) as error:  # AssertionError: torch without CUDA
+        raise ConfigError(f"{wanted} {str(name)!r} ({str(error).splitlines()[0]})") from error
+    return str(name)

@@ -21,6 +21,7 @@ from mosa.extensions import load_extensions
 from mosa.extrapolation import check_can_extrapolate, extrapolated
 from mosa.fitting import fit, fit_estimate
 from mosa.guards import check_begin, check_configuration, check_evaluation, check_seen, check_starts, evaluated_scene
+from mosa.limits import named_device
 from mosa.loggers import chosen, log_outcome
 from mosa.modules.body import Body, Start
 from mosa.outputs import figures_of, optimized, start_figures, write_outputs
@@ -36,7 +37,6 @@ from mosa.run import (
     device_of,
     finished,
     most_particles,
-    named_device,
     quiet,
     run_folder,
     shared_starts,

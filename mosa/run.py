@@ -100,18 +100,6 @@ def device_of(cfg: DictConfig) -> str:
     return name
 
 
-def named_device(name: str) -> str:
-    """A device that torch can use here. Errors: ConfigError."""
-    expected = "device: expected cpu, or cuda on a machine with a GPU, found"
-    if not isinstance(name, str) or name.partition(":")[0] not in ("cpu", "cuda"):
-        raise ConfigError(f"{expected} {name!r}")
-    try:
-        torch.empty(0, device=name)
-    except (RuntimeError, AssertionError) as error:  # AssertionError: torch without CUDA
-        raise ConfigError(f"{expected} {name!r} ({str(error).splitlines()[0]})") from error
-    return name
-
-
 def most_particles(device: torch.device | str) -> int:
     """Of simulation.particles=auto."""
     return MOST_PARTICLES["cpu" if str(device) == "cpu" else "cuda"]

@@ -14,6 +14,9 @@ from typing import Any, NamedTuple
 
 from mosa.errors import ConfigError
 
+LARGEST, MOST = 1e20, 10**9
+"""Of numbers and of whole numbers without limits of their own: single precision and an array's length hold them."""
+
 
 class Kind(NamedTuple):
     """described: as it stands in a message after 'expected'; fits: whether a value is one."""
@@ -35,9 +38,9 @@ def number(low: float, high: float = math.inf, *, above: bool = False) -> Kind:
 
 
 def whole(low: int, high: int | None = None) -> Kind:
-    limit = "" if high is None else f" and at most {high}"
-    return Kind(f"a whole number of at least {low}{limit}",
-                lambda v: isinstance(v, int) and not isinstance(v, bool) and low <= v and (high is None or v <= high))
+    high = MOST if high is None else high
+    return Kind(f"a whole number of at least {low} and at most {high}",
+                lambda v: isinstance(v, int) and not isinstance(v, bool) and low <= v <= high)
 
 
 def one_of(*names: str) -> Kind:
@@ -68,7 +71,7 @@ THREE = Kind("three numbers", lambda v: isinstance(v, list) and len(v) == 3 and 
 PLACE = Kind("three numbers, null for one that is left as it is",
              lambda v: isinstance(v, list) and len(v) == 3 and all(x is None or is_number(x) for x in v))  # fmt: skip
 TURN = Kind("four numbers, an axis and degrees", lambda v: isinstance(v, list) and len(v) == 4 and all(map(is_number, v)))
-POSITIVE, WEIGHT, COUNT = number(0, above=True), number(0), whole(1)
+POSITIVE, WEIGHT, COUNT = number(0, LARGEST, above=True), number(0, LARGEST), whole(1)
 WIDEST = 4096
 """Of a layer of a network: many times what any run has used, and far below what memory would not hold."""
 

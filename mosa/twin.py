@@ -18,11 +18,12 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from mosa.analysis.figures import side_by_side, write_video
-from mosa.checkpoints import TENSORS, checked, checked_posterior, checked_splats, read_checkpoint
+from mosa.checkpoints import TENSORS, check_kinds, checked, checked_posterior, checked_splats, read_checkpoint
 from mosa.config import build_body, build_world
-from mosa.data.splat_files import save_frames
+from mosa.data.splat_files import check_formats, save_frames
 from mosa.episode import Episode, Stepped, TwinState
 from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
+from mosa.limits import named_device
 from mosa.modules.body import Body, Start, World
 from mosa.modules.carried_splats import CarriedSplats, seen
 from mosa.modules.gauss_newton import Posterior
@@ -34,7 +35,7 @@ from mosa.rendering.cameras import look_at
 from mosa.rollout_file import save_rollout
 from mosa.shown_body import FILE as BODY_FILE
 from mosa.shown_body import save_body
-from mosa.twin_start import check_frames, check_variant, checked_dt, checked_substeps, start_in
+from mosa.twin_start import check_differentiable, check_frames, check_variant, checked_dt, checked_substeps, start_in
 from mosa.twin_worlds import TwinWorlds
 from mosa.types import Cameras, Rollout
 
@@ -52,12 +53,14 @@ class Twin:
     @classmethod
     def load(cls, path: str | Path, device: str = "cpu") -> Twin:
         """Read a checkpoint, as data alone (docs/safety.md). Errors: DataError naming file and part where it is missing, damaged,
-        or was not written by this program."""
+        or was not written by this program; ConfigError for a device that is not here."""
+        device = named_device(device)
         checkpoint = read_checkpoint(path)
         config, begun, tensors = checked(checkpoint, path)
         splats = checked_splats(checkpoint, path)
         try:
             body = build_body(config, {name: tensors[name] for name in TENSORS})
+            check_kinds(tensors, body.state_dict())
             body.load_state_dict(tensors)
             if splats is not None:
                 body.splats = CarriedSplats.read(splats, body.rest)
@@ -146,6 +149,7 @@ class Twin:
         """
         check_frames(frames, len(self.body.rest))
         check_variant(variant)
+        check_differentiable(differentiable)
         start, world = start_in(
             self.body, self.world, self.training_start, rotation=rotation, height=height, position=position, velocity=velocity,
             angular_velocity=angular_velocity, colliders=colliders,
@@ -213,8 +217,14 @@ class Twin:
         """Write into `folder`: `body.npz`, which the viewer shows the motion with; `rollout.npz` (with the poses of `colliders`,
         those of the rollout, where they are given); one PLY a frame (x y z red green blue); `simulation.mp4`; and the Gaussians
         that its images show in `formats` (`data.splat_files.FORMATS`: 3DGS PLY, splat, spz, usd) below `splats/`."""
-        folder = Path(folder)
-        (folder / "ply").mkdir(parents=True, exist_ok=True)
+        if not isinstance(formats, (list, tuple)):
+            raise ConfigError(f"formats: expected a list like ['ply'], found {str(formats)[:80]!r}")
+        check_formats(formats)
+        try:
+            folder = Path(folder)
+            (folder / "ply").mkdir(parents=True, exist_ok=True)
+        except (OSError, TypeError, ValueError) as error:
+            raise ConfigError(f"export: expected a folder that can be written, found {str(folder)[:100]!r} ({error})") from error
         save_body(folder / BODY_FILE, self.body, self.world)
         save_rollout(folder / "rollout.npz", {"simulation": rollout}, colliders)
         for t, x in enumerate(rollout.x.cpu().numpy()):

@@ -21,6 +21,10 @@ STARTED = ("rotation", "height", "position", "velocity", "angular_velocity")
 """What a start may say."""
 FASTEST = 1e6
 """[m/s], [rad/s] of a start: the time step would be refused far below."""
+MOST_SUBSTEPS = 10**6
+"""Of a step: it would take hours."""
+UNDER = 0.25
+"""Share of the body below the ground from which on it cannot start there: pressed against it, it has less."""
 STORED_BYTES = 4 * (3 + 3 + 9 + 9)
 """Of a particle in a frame of a rollout: x, v, F, F_tot."""
 
@@ -48,9 +52,15 @@ def checked_dt(value: float | None, default: float) -> float:
     return float(value)
 
 
+def check_differentiable(value: bool) -> None:
+    """Errors: ConfigError."""
+    if not isinstance(value, bool):
+        raise ConfigError(f"differentiable: expected True or False, found {value!r}")
+
+
 def checked_substeps(value: int | None) -> int | None:
-    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
-        raise ConfigError(f"substeps: expected a whole number of at least 1, or None, found {value!r}")
+    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MOST_SUBSTEPS):
+        raise ConfigError(f"substeps: expected a whole number of at least 1 and at most {MOST_SUBSTEPS}, or None, found {value!r}")
     return value
 
 
@@ -125,4 +135,9 @@ def start_in(
     if colliders is not None:
         world = replace(world, colliders=colliders_from_config(colliders, "colliders"))
     check_clear(world.colliders, center + arms, "the body", "world.colliders" if colliders is None else "colliders")
+    if world.ground is not None:
+        below = float((((center + arms) @ up).detach() < world.ground.height).double().mean())
+        if below > UNDER:
+            raise ConfigError(f"position: expected a body that starts above the ground of {world.ground.height:g} m, "
+                              f"found {below:.0%} of it below (height is that of its lowest point above the ground)")
     return start, world

@@ -11,7 +11,16 @@ from mosa.episode import Episode, Stepped, TwinState
 from mosa.errors import ConfigError
 from mosa.modules.body import Body, Start, World
 from mosa.physics.contact.colliders import Collider
-from mosa.twin_start import STARTED, check_frames, check_variant, checked_dt, checked_substeps, numbers, start_in
+from mosa.twin_start import (
+    STARTED,
+    check_differentiable,
+    check_frames,
+    check_variant,
+    checked_dt,
+    checked_substeps,
+    numbers,
+    start_in,
+)
 
 
 class TwinWorlds:
@@ -22,8 +31,9 @@ class TwinWorlds:
     ) -> None:
         if isinstance(count, bool) or not isinstance(count, int) or count < 1:
             raise ConfigError(f"worlds: expected a whole number of at least 1, found {count!r}")
-        if laws is not None and len(laws) != count:
-            raise ConfigError(f"laws: expected one for each of {count} worlds, found {len(laws)}")
+        if laws is not None and (not isinstance(laws, Tensor) or laws.ndim != 2 or len(laws) != count):
+            found = tuple(laws.shape) if isinstance(laws, Tensor) else repr(laws)[:80]
+            raise ConfigError(f"laws: expected one for each of {count} worlds, a tensor ({count}, numbers), found {found}")
         self.body, self.world, self.frame_dt, self.training_start = body, world, frame_dt, training_start
         self.count, self.laws = count, laws
         self.episode: Episode | None = None
@@ -40,6 +50,7 @@ class TwinWorlds:
         """
         check_frames(frames, self.count * len(self.body.rest))
         check_variant(variant)
+        check_differentiable(differentiable)
         found = self._found(starts, range(self.count), colliders)
         if gravity is not None:
             gravity = numbers("gravity", gravity, f"finite numbers ({self.count}, 3)")
@@ -56,12 +67,17 @@ class TwinWorlds:
         """Put the worlds with these numbers back to new starts, as `reset` takes them, None for those they had; the others stay as
         they are. Time is one for all and goes on: colliders that were driven are back where they began, others follow their
         motion. Errors: ConfigError naming the world."""
+        if not isinstance(which, (list, tuple, range)):
+            raise ConfigError(f"restart: expected a list of numbers of worlds, found {str(which)[:80]}")
         which, episode = list(which), self._going()
         given = None if starts is None else [start for start, _ in self._found(starts, which, episode.colliders)]
         return episode.restart(which, given)
 
     def _found(self, starts: Mapping | Sequence[Mapping] | None, which: Sequence[int], colliders) -> list[tuple[Start, World]]:
         """The starts of these worlds, and the world. Errors: ConfigError."""
+        listed = isinstance(starts, (list, tuple)) and all(isinstance(start, Mapping) for start in starts)
+        if starts is not None and not isinstance(starts, Mapping) and not listed:
+            raise ConfigError(f"starts: expected what Twin.simulate takes, by name, or a list of that, found {str(starts)[:80]}")
         each = [dict(starts or {})] * len(which) if starts is None or isinstance(starts, Mapping) else list(starts)
         if len(each) != len(which):
             raise ConfigError(f"starts: expected one, or one for each of {len(which)} worlds, found {len(each)}")

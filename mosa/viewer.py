@@ -17,9 +17,9 @@ import numpy as np
 
 from mosa.clips import BODIES, COLORS, FAINT, GRAY, Clip, read_run
 from mosa.errors import ConfigError, DataError, MosaError
+from mosa.limits import named_device
 from mosa.live import Live
 from mosa.live_viewer import LiveViewer
-from mosa.run import named_device
 from mosa.twin import Twin
 from mosa.viewing import add_ground, aim, open_server, view_of
 
@@ -193,7 +193,7 @@ def options(arguments: Sequence[str]) -> dict[str, str | None]:
         if known["live"] != "true" or known["checkpoint"] is None:
             raise ConfigError("run: expected the folder of a finished run, found none; python -m mosa.viewer run=<run folder>")
         known["run"] = known["checkpoint"]
-    if not known["port"].isdigit() or not 0 < int(known["port"]) < 65536:
+    if not known["port"].isdecimal() or not known["port"].isascii() or not 0 < int(known["port"]) < 65536:
         raise ConfigError(f"port: expected a number from 1 to 65535, found {known['port']!r}")
     if known["live"] not in ("true", "false"):
         raise ConfigError(f"live: expected true or false, found {known['live']!r}")

@@ -30,7 +30,9 @@ def open_server(host: str, port: int) -> Any:
     try:  # viser's own server would try port after port and then wait for ever
         with socket.create_server((host, 0)):
             pass
-    except OSError as error:
+        if not host:  # all addresses of the machine, which nobody asked for by name
+            raise ValueError("an empty name")
+    except (OSError, ValueError, TypeError) as error:
         raise ConfigError(f"host: expected 127.0.0.1, 0.0.0.0 or this machine's address, found {host!r} ({error})") from error
     return viser.ViserServer(host=host, port=port, label="MoSA", verbose=False)
 

@@ -90,15 +90,18 @@ def run(options: argparse.Namespace) -> int:
     more = [*options.overrides, *(["trainer=gpu"] if devices != [None] else [])]
     planned = {e.name: jobs_of(e, options.runs, more) for e in experiments}
     jobs = list({job.folder: job for found in planned.values() for job in found}.values())
+    check_overrides(options.overrides, list(jobs[0].overrides) if jobs else [])
     slots = len(devices) * options.jobs
     for line in estimate(jobs, gpu=devices != [None], slots=slots):
         print(line, flush=True)
+    results = options.results or (options.runs / "results" if options.quick else RESULTS)
     if options.dry_run:
         return 0
+    writable("--runs", options.runs)
+    writable("--results", results)
     failed = {} if options.collect else run_jobs(jobs, devices, options.jobs)
     from mosa.experiments.writing import write_results
 
-    results = options.results or (options.runs / "results" if options.quick else RESULTS)
     command = shown(options)
     for experiment in experiments:
         page = write_results(experiment, planned[experiment.name], results, command)
@@ -129,6 +132,43 @@ def shown(options: argparse.Namespace) -> str:
 
 def whole_numbers(where: str, text: str) -> list[int]:
     try:
-        return [int(part) for part in text.split(",")]
+        found = [int(part) for part in text.split(",")]
     except ValueError:
         raise ConfigError(f"{where}: expected whole numbers as 0,1, found {text!r}") from None
+    if len(set(found)) < len(found) or min(found) < 0 or max(found) >= 2**32:
+        raise ConfigError(f"{where}: expected different whole numbers of at least 0 and below 2^32, found {text!r}")
+    return found
+
+
+def check_overrides(words: list[str], overrides: list[str]) -> None:
+    """What --set says is known to train.py: each job would end in it, one after the other. overrides: of a job, with it.
+
+    Errors: ConfigError."""
+    for word in words:
+        key = word.partition("=")[0].lstrip("+~")
+        if "=" not in word or key.split(".")[0] == "hydra" or key in ("resume", "seed"):
+            raise ConfigError(f"--set: expected KEY=VALUE of train.py, without hydra's, resume and seed, which are the jobs' own, "
+                              f"found {word!r}")
+    if not words:
+        return
+    from hydra import compose, initialize_config_dir
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    from mosa.config import plain
+    from mosa.guards import check_configuration
+
+    try:
+        with initialize_config_dir(configuration(), version_base="1.3"):
+            values = plain(compose("train", overrides))
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(f"--set: {' '.join(str(error).split())[:300]}") from error
+    check_configuration(values, Path(configuration()))
+
+
+def writable(where: str, folder: Path) -> None:
+    """Errors: ConfigError for a folder that cannot be made."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{where}: expected a folder that can be written, found {folder} ({error.strerror})") from error

@@ -68,6 +68,8 @@ def matrix(value, shape: tuple[int, int], where: str) -> np.ndarray:
     if array.ndim == 2 and not whole:
         raise DataError(f"{where}: expected numbers, found texts or flags: {str(value)[:80]}")
     if array.shape == (4, 4) and shape == (3, 4):
+        if not np.abs(array[3] - (0, 0, 0, 1)).max() <= 1e-6:
+            raise DataError(f"{where}: expected 0, 0, 0, 1 in the fourth row, found {array[3].tolist()}; transposed, or scaled?")
         array = array[:3]
     if array.shape != shape:
         raise DataError(f"{where}: expected a {shape[0]}x{shape[1]} matrix, found shape {array.shape}")
@@ -165,6 +167,9 @@ def footage_of(
 ) -> Footage:
     """Footage from name -> (K, w2c) and, in the same order, (T, h, w, 3) images on white and (T, h, w) mattes, whose sizes may
     differ between cameras. Errors: DataError beginning with `where` (`mosa.data.one_size`)."""
+    for name in calibration:  # it stands in messages and figures
+        if not name.strip() or len(name) > 100 or not name.isprintable():
+            raise DataError(f"{where}: expected names of cameras of at most 100 printable characters, found {name[:60]!r}")
     K, stack, coverage = one_size(np.stack([k for k, _ in calibration.values()]), images, mattes, background=WHITE,
                                   names=list(calibration), where=where)
     w2c = np.stack([w for _, w in calibration.values()])

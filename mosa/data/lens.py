@@ -19,6 +19,8 @@ import numpy as np
 from mosa.errors import DataError
 
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+FOREIGN = ("k5", "k6", "s1", "s2", "s3", "s4")
+"""Of the rational and thin prism models, which are not undone."""
 MODELS = {name: False for name in ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")} | {
     name: True for name in ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 }

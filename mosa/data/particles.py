@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -36,16 +37,21 @@ def read_ply(path: Path) -> Tensor:
     return torch.from_numpy(points)
 
 
-def read_clouds(folder: Path, frames: int) -> tuple[Tensor, ...]:
-    """One cloud (M_t, 3) [m] per frame from the PLY files of a folder, ordered by the numbers in their names.
+def read_clouds(folder: Path, frames: Sequence[int]) -> tuple[Tensor, ...]:
+    """One cloud (M_t, 3) [m] for each of the frames, which are numbers as in the scene's files.
 
-    Errors: DataError where the folder is missing or holds another number of files than the scene has frames.
+    The last number in a file's name is its frame where all frames are found so; else, of as many files as frames, the order of
+    their numbers is the frames'. Errors: DataError where the folder is missing, or neither says which file is which frame.
     """
     if not Path(folder).is_dir():
         raise DataError(f"{folder}: folder not found; scene.particles is the folder of ground-truth PLY files, or null")
     files = sorted(Path(folder).glob("*.ply"), key=lambda f: [int(n) for n in re.findall(r"\d+", f.stem)])
-    if len(files) < frames:
+    numbered = {int(numbers[-1]): f for f in files if (numbers := re.findall(r"\d+", f.stem))}
+    if len(numbered) == len(files) and all(frame in numbered for frame in frames):
+        files = [numbered[frame] for frame in frames]
+    elif len(files) != len(frames):
         raise DataError(
-            f"{folder}: expected {frames} PLY files, one per frame, found {len(files)}; restrict scene.frames"
+            f"{folder}: expected {len(frames)} PLY files, one per frame, numbered {frames[0]} to {frames[-1]} as the frames are, "
+            f"found {len(files)}; restrict scene.frames"
         )
-    return tuple(read_ply(f) for f in files[:frames])
+    return tuple(read_ply(f) for f in files)

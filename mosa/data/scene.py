@@ -23,6 +23,10 @@ FORMATS = {
 `register_format` from another package."""
 
 
+MADE = ("name", "footage", "truth", "synthetic", "known_parameters")
+"""Arguments of `scene_from_footage` that a loader knows itself and no key says."""
+
+
 def register_format(name: str, place: str) -> None:
     """Make a data format known by the name in scene.format. place: module:function, imported when a configuration asks for it.
 
@@ -89,8 +93,14 @@ def held_out_sequences(**keys) -> list[Scene]:
 
 def under(root: str | None, path: str) -> Path:
     """`path` below `root` where it is relative and a root is given."""
-    path = Path(path).expanduser()
-    return path if path.is_absolute() or root is None else Path(root).expanduser() / path
+    try:
+        path = Path(path).expanduser()
+        whole = path if path.is_absolute() or root is None else Path(root).expanduser() / path
+        whole.exists()  # of a name that no file system takes it is an error
+    except (RuntimeError, OSError, ValueError) as error:
+        said = error.strerror if isinstance(error, OSError) else error
+        raise ConfigError(f"scene.path: expected a folder that can be, found {ascii(str(path))[:100]} ({said})") from error
+    return whole
 
 
 def beside(path: Path, name: str) -> Path | None:
@@ -103,7 +113,7 @@ def call(loader: Callable, arguments: dict) -> Scene:
     """loader(**arguments). Errors: ConfigError where it does not know a key that is set."""
     takes = dict(inspect.signature(loader).parameters)
     if "world" in takes:
-        takes |= {k: p for k, p in inspect.signature(scene_from_footage).parameters.items() if k not in ("name", "footage")}
+        takes |= {k: p for k, p in inspect.signature(scene_from_footage).parameters.items() if k not in MADE}
     known = set(takes)
     for key, parameter in takes.items():
         if parameter.default is parameter.empty and parameter.kind is parameter.KEYWORD_ONLY and key not in arguments:

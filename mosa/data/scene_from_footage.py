@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +19,10 @@ from mosa.types import Ground, Scene, Truth
 
 DENSITIES = 0.1, 1e5
 """[kg/m^3]: aerogel has 1, osmium 22,590."""
+LIGHT = 10.0
+"""[kg/m^3] below which a density is asked about: foams of polystyrene have 15."""
+STEEP = 3.0
+"""[degrees] of an incline that is said."""
 WIDEST = 1e5
 """[m] of scene.box: with gravity and seconds, nothing that cameras film is larger."""
 
@@ -71,21 +77,43 @@ def scene_from_footage(
         check_fps(fps)
         times = torch.tensor([(f - footage.frames[0]) / fps for f in footage.frames], dtype=torch.float32)
     if last_free_frame is not None:
-        if last_free_frame not in footage.frames:
+        if isinstance(last_free_frame, bool) or last_free_frame not in footage.frames:
             raise ConfigError(
                 f"scene.last_free_frame: no frame {last_free_frame}; the scene has {footage.frames[0]} to {footage.frames[-1]}"
             )
         last_free_frame = footage.frames.index(last_free_frame)
+    check_ground(ground, up / up.norm(), pull, box)
+    if density < LIGHT:
+        warnings.warn(f"scene.density: {density:g} kg/m^3 is lighter than nearly all solids; was it meant in g/cm^3? Moduli scale "
+                      "with it", stacklevel=4)
     scene = Scene(
         name=name, sequence=sequence, images=footage.images, mattes=footage.mattes, cameras=footage.cameras, times=times,
         gravity=pull, up=up / up.norm(), ground=ground, box=box, density=float(density),
         background=footage.background, synthetic=synthetic, last_free_frame=last_free_frame,
         holdout_cameras=held_out_cameras(holdout_cameras, footage.cameras.names),
         holdout_frames=held_out_frames(holdout_frames, footage.frames), truth=truth,
-        particles=read_clouds(particles, len(footage.frames)) if particles is not None else None,
+        particles=read_clouds(particles, footage.frames) if particles is not None else None,
         known_parameters=dict(known_parameters or {}),
     )  # fmt: skip
     return replace(scene, fingerprint=fingerprint(scene))
+
+
+def check_ground(ground: Ground | None, up: torch.Tensor, pull: torch.Tensor, box: torch.Tensor) -> None:
+    """The ground lies in the box, and what falls falls onto it: a warning where it is an incline. up: (3,) unit vector.
+
+    Errors: ConfigError naming scene.box."""
+    if ground is None:
+        return
+    corners = torch.stack(torch.meshgrid(*box.T, indexing="ij"), -1).reshape(-1, 3) @ up
+    low, high = float(corners.min()), float(corners.max())
+    if not low <= ground.height < high:
+        raise ConfigError(f"scene.box: expected one that the ground at scene.ground.height={ground.height:g} m lies in, found "
+                          f"{box.tolist()}, which reaches from {low:.4g} to {high:.4g} m along scene.up")
+    if float(pull.norm()) > 0:
+        angle = math.degrees(math.acos(min(1.0, float(-(pull.double() @ up.double()) / pull.double().norm()))))
+        if angle > STEEP:
+            warnings.warn(f"scene.gravity: pulls at {angle:.3g} degrees from scene.up, so that the ground is an incline: set "
+                          "scene.up along -scene.gravity where it is not", stacklevel=5)  # fmt: skip
 
 
 def vector(value, key: str) -> torch.Tensor:

@@ -7,19 +7,22 @@ that hold for this sequence only, such as {path: drop_2, frames: [3, 20]}.
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from mosa.data.scene import beside, held_out_sequences, load_scene, under
-from mosa.errors import ConfigError
+from mosa.errors import ConfigError, DataError
 from mosa.types import Scene
 
 OWN = ("path", "name", "frames", "fps", "last_free_frame", "holdout_cameras", "particles", "scale", "fill_holes")
 """What a sequence may have otherwise than the training one: not the world, of which there is one for all."""
 DEPTH = 3
 """Folders that a name is made of at most; what is then still called the same is numbered."""
+SHARED = 0.05
+"""Of a recording's pictures that may be another's to the bit."""
 NAME = re.compile(r"[\w.-]*\w[\w.-]*")
 
 
@@ -42,9 +45,25 @@ def load_sequences(keys: Mapping[str, Any]) -> tuple[Scene, list[Scene]]:
     entries = [("also_train", entry) for entry in also_train] + [("test", entry) for entry in test]
     names = sequence_names(keys, entries)
     scene = load_scene(**keys)
-    return scene, [
+    others = [
         load_scene(**keys_of(keys, where, entry), name=scene.name, sequence=name) for (where, entry), name in zip(entries, names)
     ]
+    check_distinct([scene, *others], ["scene.path", *(f"scene.{where}" for where, _ in entries)])
+    return scene, others
+
+
+def check_distinct(scenes: Sequence[Scene], where: Sequence[str]) -> None:
+    """No recording is another's copy: what is learned from says nothing as a held-out sequence. Errors: DataError."""
+    pictures: dict[bytes, int] = {}
+    for k, scene in enumerate(scenes):
+        own = {hashlib.sha256(picture.numpy().tobytes()).digest()
+               for views, mattes in zip(scene.images, scene.mattes) for picture, matte in zip(views, mattes) if bool(matte.any())}
+        same = [pictures[each] for each in own if each in pictures]
+        if len(same) > SHARED * len(own):
+            raise DataError(f"{where[k]}: {len(same)} of the {len(own)} pictures of {scene.name}/{scene.sequence} are those of "
+                            f"{where[same[0]]} too: expected every recording once; what is learned from says nothing as a held-out "
+                            "sequence")
+        pictures |= {each: k for each in own if each not in pictures}
 
 
 def taught_names(keys: Mapping[str, Any]) -> list[str]:

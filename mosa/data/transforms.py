@@ -24,7 +24,7 @@ from mosa.data.footage import (
     world_to_camera,
 )  # fmt: skip
 from mosa.data.images import check_amount, composite, expect_size, fill_holes, read_image, resize, scaled_size
-from mosa.data.lens import COEFFICIENTS, is_fisheye, lens_of
+from mosa.data.lens import COEFFICIENTS, FOREIGN, is_fisheye, lens_of
 from mosa.data.scene_from_footage import scene_from_footage
 from mosa.errors import DataError
 from mosa.types import Scene
@@ -110,6 +110,9 @@ def read_shots(file: Path, document, fps: float | None) -> list[Shot]:
         for key in ("file_path", "transform_matrix"):
             if not isinstance(entry, dict) or key not in entry:
                 raise DataError(f"{where}: expected the key {key}")
+        if bent := [k for k in FOREIGN if entry.get(k, document.get(k))]:
+            raise DataError(f"{where}: {bent[0]}: expected a lens of k1, k2, k3, p1, p2 (or k1 to k4 of a fisheye), found a "
+                            "rational or thin prism model; undistort the images first")
         intrinsics = shared | {k: number(v, f"{where}, {k}") for k, v in entry.items() if k in intrinsic_keys()}
         fisheye = is_fisheye(entry.get("camera_model", document.get("camera_model")),
                              entry.get("is_fisheye", document.get("is_fisheye")), where)

@@ -11,11 +11,14 @@ import torch
 from mosa.data.agreement import check_agreement, holes_report
 from mosa.data.falling import check_fall
 from mosa.data.footage import TIME_JITTER
+from mosa.data.outlines import check_outlines, check_particles
 from mosa.errors import DataError
 from mosa.types import Scene
 
 FULL = 0.99
 """Share of an image from which on a matte says nothing."""
+SQUARE, NEARLY = 2.0, 1.05
+"""Ratios of the two focal lengths of a camera from which on they are refused, and warned of: sensors have square pixels."""
 
 
 def validate(scene: Scene) -> Scene:
@@ -48,6 +51,9 @@ def validate(scene: Scene) -> Scene:
     for frame in range(1, scene.frames):
         check_agreement(scene, label, frame)
     check_fall(scene, label)
+    if not scene.synthetic:
+        check_outlines(scene, label)
+        check_particles(scene, label)
     holes = None if scene.synthetic else holes_report(scene)
     if holes:
         warnings.warn(f"{label}: {holes}", stacklevel=2)
@@ -64,6 +70,7 @@ def check_cameras(scene: Scene, label: str) -> None:
             raise DataError(
                 f"{label}: camera {name}: expected positive focal lengths, found {cameras.K[v].diagonal()[:2].tolist()}"
             )
+        check_pixels(cameras.K[v], f"{label}: camera {name}")
         R = cameras.w2c[v, :3, :3].double()
         if float((R @ R.T - torch.eye(3, dtype=R.dtype)).abs().max()) > 2e-3 or float(torch.linalg.det(R)) < 0:
             raise DataError(f"{label}: camera {name}: expected a rotation in its pose, found {R.tolist()}")
@@ -73,6 +80,21 @@ def check_cameras(scene: Scene, label: str) -> None:
                 f"{label}: camera {name}: the principal point ({cx:.1f}, {cy:.1f}) px lies outside of its {cameras.width}x"
                 f"{cameras.height} px images: intrinsics of another resolution?"
             )
+
+
+def check_pixels(K: torch.Tensor, label: str) -> None:
+    """A pinhole camera's matrix, and both focal lengths nearly one. Errors: DataError where one is twice the other; a warning where
+    they differ visibly."""
+    if float((K[[1, 2, 2, 2], [0, 0, 1, 2]] - torch.tensor([0.0, 0.0, 0.0, 1.0])).abs().max()) > 1e-6:
+        raise DataError(f"{label}: intrinsics: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]], found {K.tolist()}")
+    across, down = K[0, 0].item(), K[1, 1].item()
+    ratio = max(across / down, down / across)
+    said = (f"{label}: expected focal lengths of square pixels, found fl_x = {across:.5g} and fl_y = {down:.5g} px: were the "
+            "images stretched, or one of them taken for another size?")
+    if ratio >= SQUARE:
+        raise DataError(said)
+    if ratio > NEARLY:
+        warnings.warn(said, stacklevel=4)
 
 
 def check_times(scene: Scene, label: str) -> None:

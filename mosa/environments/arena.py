@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,10 +47,11 @@ def simulator_named(
         return Simulator(name, learned, "adapted" if name == "learned" else "prior")
     material, seed = "anisotropic", 0
     if scene is None:
-        known = learned.config["cfg"]["scene"]
-        if known.get("format") != "builtin":
-            raise ConfigError(f"simulator: expected learned or isotropic for a run on a scene of format {known.get('format')}: the "
-                              "truth is known for built-in scenes only")
+        known = learned.config["cfg"].get("scene")
+        if not isinstance(known, Mapping) or known.get("format") != "builtin" or not isinstance(known.get("name"), str):
+            described = str(known.get("format"))[:80] if isinstance(known, Mapping) else "that its checkpoint does not name"
+            raise ConfigError(f"simulator: expected learned or isotropic for a run on a scene of format {described}: the truth is "
+                              "known for built-in scenes only (truth.scene=<one of them>)")
         scene, material, seed = known["name"], known.get("material", material), known.get("seed", seed)
     return Simulator(name, true_twin(scene, material=material, seed=seed, device=device, spacing=spacing))
 

@@ -18,7 +18,7 @@ from mosa.environments.study import Bench, Setting, one, table
 from mosa.environments.tasks import TASKS
 from mosa.errors import ConfigError
 from mosa.guards import check_environments
-from mosa.run import named_device
+from mosa.limits import named_device
 
 log = logging.getLogger(__name__)
 

@@ -5,9 +5,10 @@ World axes: y up, the ground at y = 0. Plain tensors, no Gymnasium.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
 
 import torch
@@ -15,12 +16,27 @@ from torch import Tensor
 
 from mosa.errors import ConfigError
 from mosa.modules.start import World
+from mosa.schema import Kind, is_number, number, whole
 from mosa.types import Ground
 
 ROOM = 5.0
 """Half width [m] of the world: a body that rolls away is a failure, not an error."""
 LAST = 5
 """Control steps at the end over which a reward is averaged: the body may still quiver."""
+
+
+CLEARANCE = 0.04
+"""Height [m] of the lowest particle above what it falls on at which the simulation begins; the flight before is a parabola."""
+LENGTH = number(0, ROOM)
+_SOME, _ANGLE = number(1e-4, ROOM), number(0, math.pi)
+RANGES: dict[str, Kind] = {
+    "extents": Kind("three lengths of the body [m]", lambda v: isinstance(v, (tuple, list)) and len(v) == 3 and all(
+        is_number(x) and 0 <= x <= ROOM for x in v)),
+    "steps": whole(1, 10**5), "control_dt": number(1e-4, 1), "low": number(CLEARANCE, ROOM), "high": number(CLEARANCE, ROOM),
+    "tilt": _ANGLE, "unsteady_tilt": _ANGLE, "askew": _ANGLE, "lean": number(1e-3, math.pi), "near": _SOME, "radius": _SOME,
+    "still": number(1e-4, 100), "fastest": number(1e-4, 100), "narrow": number(0.1, 2),
+}  # fmt: skip
+"""What a field of a task may be: lengths [m] where nothing else is said."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +87,17 @@ class Task(ABC):
     tool: ClassVar[str | None] = None
     """Name of the solid that actions drive; None: one decision at the start, after which nothing is acted on."""
     ground_friction: ClassVar[float] = 0.3
+
+    def __post_init__(self) -> None:
+        """Errors: ConfigError naming the field that is out of its range."""
+        for field in fields(self):
+            value, kind = getattr(self, field.name), RANGES.get(field.name, LENGTH)
+            if not kind.fits(value):
+                raise ConfigError(f"options.{field.name}: expected {kind.described}, found {str(value)[:80]!r}")
+        for low, high in (("low", "high"), ("close", "far")):
+            if hasattr(self, low) and getattr(self, low) > getattr(self, high):
+                raise ConfigError(f"options.{low}: expected at most options.{high}={getattr(self, high):g}, found "
+                                  f"{getattr(self, low):g}")
 
     @property
     @abstractmethod

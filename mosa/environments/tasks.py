@@ -10,18 +10,16 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from mosa.environments.task import Quantity, Task, Trials, View
+from mosa.environments.task import CLEARANCE, Quantity, Task, Trials, View
 from mosa.errors import ConfigError
 from mosa.physics.contact.motion import exponential
 
-CLEARANCE = 0.04
-"""Height [m] of the lowest particle above what it falls on at which the simulation begins; the flight before is a parabola."""
 THICKNESS = 0.035
 """[m] over which every solid's contact fades in: the same in simulators of different grids."""
 FRICTION = 0.6
@@ -304,7 +302,9 @@ def task_named(name: str, rest: Tensor, **options: Any) -> Task:
     """The task for a body with rest positions (N, 3) [m]: its sizes follow from the body's. options: of the task.
 
     Errors: ConfigError naming what is unknown."""
-    if name not in TASKS:
+    if not isinstance(name, str) or name not in TASKS:
         raise ConfigError(f"task: expected one of {', '.join(TASKS)}, found {name!r}")
+    if unknown := sorted(set(options) - {field.name for field in fields(TASKS[name])} | set(options) & {"extents"}):
+        raise ConfigError(f"options.{unknown[0]}: expected a field of the task {name}, found it")
     extents = tuple(round(float(e), 2) for e in (rest.amax(0) - rest.amin(0)))
     return TASKS[name](extents, **options)

@@ -13,14 +13,19 @@ from mosa.data.builtin.objects import drop_named, object_named
 from mosa.data.builtin.published import PublishedMaterial
 from mosa.data.builtin.shapes import SHAPES
 from mosa.data.builtin.takes import built
+from mosa.errors import ConfigError
+from mosa.limits import named_device
 from mosa.modules.body import Body
 from mosa.modules.model import Model
 from mosa.modules.simulation_settings import SimulationSettings
 from mosa.modules.start import Start, World
+from mosa.schema import number, whole
 from mosa.twin import Twin
 from mosa.types import Ground
 
 MAX_SUBSTEPS = 5000
+FINEST, COARSEST = 5e-4, 4.0
+"""[m] and shares of the body's longest side: bounds of the distance between particles."""
 APPEARANCE = (0.8, 0.35)
 """Opacity of a particle in pictures, and its standard deviation in spacings."""
 
@@ -65,7 +70,13 @@ def true_twin(
     particles; spacing [m]: of the particles, None for the films' own (a coarser one is a quicker, poorer truth).
     Rest positions are those of the training sequence's frame 0, as a learned twin's are. Errors: ConfigError naming the key.
     """
-    body, drop = object_named(name), drop_named(name, sequence)
+    device, body, drop = named_device(device), object_named(name), drop_named(name, sequence)
+    if not whole(0, 2**32 - 1).fits(seed):
+        raise ConfigError(f"scene.seed: expected a whole number of at least 0 and below 2^32, found {str(seed)[:80]!r}")
+    widest = float(np.ptp(np.asarray(SHAPES[body.shape].bounds), axis=0).max()) / COARSEST
+    if spacing is not None and not number(FINEST, widest).fits(spacing):
+        raise ConfigError(f"truth.spacing: expected a distance of {FINEST:g} to {widest:.3g} m between particles, a quarter of the "
+                          f"body's longest side, or null, found {str(spacing)[:80]!r}")
     spacing = body.spacing if spacing is None else float(spacing)
     surface, particles, _ = built(body.shape, body.pitch, spacing, seed)
     hidden = body.material.variant(material)

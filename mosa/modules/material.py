@@ -16,7 +16,7 @@ from mosa.physics.constitutive.plasticity import friction_alpha
 from mosa.physics.engine.adapter_interface import MaterialState
 from mosa.physics.engine.law_options import AS_USUAL, LawOptions
 from mosa.physics.engine.simulator import Simulator
-from mosa.schema import is_number
+from mosa.schema import LARGEST, is_number
 
 NU_MAX, ANGLE_MAX = 0.49, 89.0
 AUTO = "auto"
@@ -171,12 +171,12 @@ class Material(nn.Module):
         if value in form.held:
             self.held.append(name)
             self.register_buffer(f"held_{name}", torch.tensor(value))
-        elif form.low < value < form.high:
+        elif form.low < value < min(form.high, LARGEST):
             self.begins[name] = form.inverse(value)
             self.raw[name] = nn.Parameter(torch.tensor(self.begins[name]), requires_grad=learned)
         else:
             raise ConfigError(
-                f"prior.parameters.{name}: expected a number between {form.low:g} and {form.high:g}, found {value:g}"
+                f"prior.parameters.{name}: expected a number between {form.low:g} and {min(form.high, LARGEST):g}, found {value:g}"
             )
 
     def _add_direction(self, name: str, value: Sequence[float], learned: bool) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import logging
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mosa.data.outlines import left_open, whole_views
 from mosa.data.splats import load_ply
 from mosa.errors import ConfigError, DataError
 from mosa.progress import tqdm
@@ -21,7 +23,7 @@ from mosa.reconstruction.cache import StageCache
 from mosa.reconstruction.carried import fit_carried
 from mosa.reconstruction.filling import Particles, body_volume, fill
 from mosa.reconstruction.geometry import Geometry, find_geometry
-from mosa.reconstruction.hull import Volume, hull_bounds, visual_hull
+from mosa.reconstruction.hull import Volume, hull_bounds, occupancy, visual_hull
 from mosa.reconstruction.initial import inherited_colors
 from mosa.reconstruction.moved import MovingParts, cues_of, first_motion
 from mosa.reconstruction.observed import Windows, object_windows
@@ -153,7 +155,8 @@ def _motion_settings(settings: ReconstructionSettings) -> dict[str, Any]:
 def imported_splats(path: str, scene: Scene) -> Appearance:
     """Gaussians of a 3DGS PLY inside the scene's box, with their harmonics.
 
-    Errors: DataError where the file is not one, or fewer than eight of its Gaussians lie in the box.
+    Errors: DataError where the file is not one, fewer than eight of its Gaussians lie in the box, or they are not where the mattes
+    of frame 0 show the object.
     """
     splats, harmonics = load_ply(path)
     inside = ((splats.means > scene.box[0]) & (splats.means < scene.box[1])).all(1)
@@ -163,7 +166,30 @@ def imported_splats(path: str, scene: Scene) -> Appearance:
             f"{path}: expected Gaussians in the scene's box {scene.box.tolist()} m, found {int(inside.sum())} of {len(inside)}: "
             f"the file spans {low} to {high}; bring it into the scene's world and metres first"
         )
-    return Appearance(Splats(*(getattr(splats, f.name)[inside] for f in fields(Splats))), harmonics[inside])
+    kept = Splats(*(getattr(splats, f.name)[inside] for f in fields(Splats)))
+    check_place(path, kept, scene)
+    return Appearance(kept, harmonics[inside])
+
+
+FILLED, SUSPECT = 0.5, 0.9
+"""Shares of imported Gaussians inside of the mattes, and of the mattes that they fill, below which they are another object, or the
+same elsewhere; and below which that is said."""
+
+
+def check_place(path: str, splats: Splats, scene: Scene) -> None:
+    """Gaussians lie where the mattes of frame 0 show the object, and fill them. Errors: DataError; a warning where few do not."""
+    views = whole_views(scene, 0)
+    if len(views) < 2:
+        return
+    mattes, cameras = scene.mattes[views, 0], scene.cameras.select(views)
+    within = float((splats.opacities * (occupancy(splats.means, mattes, cameras) > 0.25)).sum() / splats.opacities.sum())
+    filled = 1 - float(left_open(splats.means, 2 * float(splats.scales.mean()), mattes, cameras).median())
+    said = (f"{path}: expected Gaussians where the mattes of frame 0 show the object, found {within:.0%} of their opacity there "
+            f"and {filled:.0%} of the mattes filled: check the file's unit, axes and place in the scene's world")
+    if min(within, filled) < FILLED:
+        raise DataError(said)
+    if within < SUSPECT:
+        warnings.warn(said, stacklevel=2)
 
 
 def _render_still(splats: Splats, windows: Windows, background: Tensor) -> Tensor:

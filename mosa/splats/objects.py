@@ -24,6 +24,7 @@ from mosa.data.splats import load_ply
 from mosa.errors import ConfigError, DataError
 from mosa.extensions import load_extensions
 from mosa.guards import check_splats
+from mosa.limits import named_device
 from mosa.modules.body import Body, Start
 from mosa.modules.carried_splats import CarriedSplats
 from mosa.reconstruction.filling import fill
@@ -31,7 +32,7 @@ from mosa.reconstruction.initial import inherited_colors
 from mosa.reconstruction.pipeline import FEW, filling_spacing
 from mosa.reconstruction.resolution import PER_CELL, grid_spacing
 from mosa.reconstruction.shell import solid_of
-from mosa.run import most_particles, named_device, quiet, run_folder
+from mosa.run import most_particles, quiet, run_folder
 from mosa.twin import Twin
 from mosa.twin_start import numbers
 from mosa.types import Appearance, Splats

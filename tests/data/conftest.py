@@ -7,6 +7,7 @@ import torch
 
 from mosa.data.builtin.renderer import ring_of_cameras
 from mosa.data.export import export_pacnerf, export_transforms
+from mosa.data.falling import track_of
 from mosa.types import Ground, Scene
 
 BOX = [[-1.0, -0.1, -1.0], [1.0, 1.0, 1.0]]
@@ -67,3 +68,12 @@ def assert_same_footage(found: Scene, expected: Scene) -> None:
     assert torch.allclose(found.cameras.w2c, expected.cameras.w2c, atol=1e-6)
     assert torch.allclose(found.times, expected.times, atol=1e-7)
     assert math.isclose(found.density, expected.density)
+
+
+def clouds_of(scene: Scene, count: int = 9, frames: int | None = None) -> torch.Tensor:
+    """(T, count, 3) [m] drawn particles where the cameras see the object of each frame; of more frames where it is seen last."""
+    track = track_of(scene)
+    spread = 1.5 * track.radius * (torch.rand(frames or scene.frames, count, 3) - 0.5)
+    spread[:, :2] = 0.75 * track.radius * torch.tensor([[-1.0], [1.0]])  # the cloud's extent, whatever was drawn
+    points = track.points[torch.arange(len(spread)).clamp(max=scene.frames - 1)].float()
+    return points[:, None] + spread - spread.mean(1, keepdim=True)

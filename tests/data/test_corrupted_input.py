@@ -189,7 +189,8 @@ def cut_particles(folder):
 PARTICLES = {
     "NaN": (nan_particle, "003.ply: expected finite positions, found NaN or infinity in 1 of 9, first at 4"),
     "truncated": (cut_particles, "002.ply: expected a PLY file"),
-    "too few": (lambda f: export_particles(torch.rand(4, 9, 3), f), "expected 5 PLY files, one per frame, found 4"),
+    "too few": (lambda f: export_particles(torch.rand(4, 9, 3), f),
+                "expected 5 PLY files, one per frame, numbered 0 to 4 as the frames are, found 4"),
     "no PLY": (
         lambda f: (f.mkdir(), [(f / f"{t}.ply").write_text("hello") for t in range(5)]),
         "0.ply: expected a PLY file",

@@ -12,7 +12,7 @@ import torch
 from mosa.data.export import export_particles, export_transforms
 from mosa.data.scene import held_out_sequences, load_scene
 
-from .conftest import WORLD, assert_same_footage
+from .conftest import WORLD, assert_same_footage, clouds_of
 
 
 def pacnerf(folder, **keys):
@@ -123,7 +123,7 @@ def test_frame_rate_overrides_the_times_of_the_data(pacnerf_folder):
 
 
 def test_particles_are_ordered_by_number(blocks, pacnerf_folder, tmp_path):
-    positions = torch.rand(12, 7, 3)
+    positions = clouds_of(blocks, frames=12)
     folder = export_particles(positions, tmp_path / "ply")
     for file in folder.glob("*.ply"):  # unpadded: 10 sorts before 2 as text
         file.rename(folder / f"{int(file.stem)}.ply")
@@ -191,7 +191,7 @@ def meeting_spread(scene, frame):
     return float((arm - (arm * along).sum(-1, keepdim=True) * along).norm(dim=-1).mean())
 
 
-def test_particles_beside_the_images_are_found(pacnerf_folder, tmp_path):
-    positions = torch.rand(5, 7, 3)
+def test_particles_beside_the_images_are_found(blocks, pacnerf_folder, tmp_path):
+    positions = clouds_of(blocks)
     export_particles(positions, pacnerf_folder / "ply")
     assert torch.equal(pacnerf(pacnerf_folder, particles="ply", root=str(tmp_path / "elsewhere")).particles[2], positions[2])

@@ -2,24 +2,31 @@
 
 import json
 import shutil
+from dataclasses import replace
+from itertools import permutations
 
 import pytest
 import torch
 
 from mosa.data.export import export_pacnerf, export_particles, export_transforms
 from mosa.data.sequences import load_sequences, sequence_names, taught_names
-from mosa.errors import ConfigError
+from mosa.errors import ConfigError, DataError
 
-from .conftest import WORLD, assert_same_footage
+from .conftest import WORLD, assert_same_footage, clouds_of
 
 
 @pytest.fixture
 def folders(blocks, tmp_path):
     """Four recordings below one root, in both layouts."""
-    for name in ("first", "second", "a/drop", "b/drop"):
-        export_transforms(blocks, tmp_path / "transforms" / name)
-        export_pacnerf(blocks, tmp_path / "pacnerf" / name)
+    for k, name in enumerate(("first", "second", "a/drop", "b/drop")):
+        export_transforms(recorded(blocks, k), tmp_path / "transforms" / name)
+        export_pacnerf(recorded(blocks, k), tmp_path / "pacnerf" / name)
     return tmp_path
+
+
+def recorded(scene, k):
+    """The scene in other colours: no picture of one recording is another's."""
+    return replace(scene, images=scene.images[..., list(permutations(range(3)))[k]])
 
 
 def keys(folders, layout="transforms", **more):
@@ -32,9 +39,9 @@ def test_folders_are_sequences_of_the_training_folders_object(blocks, folders, l
     scene, others = load_sequences(named)
     assert [s.sequence for s in (scene, *others)] == ["train", "second", "a_drop", "b_drop"]
     assert taught_names(named) == ["second"]
-    for each in others:
+    for k, each in enumerate(others, 1):
         assert each.name == scene.name == "first"
-        assert_same_footage(each, blocks)
+        assert_same_footage(each, recorded(blocks, k))
 
 
 def test_without_lists_there_is_one_sequence(folders):
@@ -66,6 +73,18 @@ def test_what_is_learned_from_is_not_held_out(folders, other):
         load_sequences(keys(folders, also_train=["second"], test=["second"]))
 
 
+def test_a_copy_of_what_is_learned_from_is_not_held_out(folders):
+    """Nor are some of its pictures, in a folder of their own with another order of cameras."""
+    shutil.copytree(folders / "transforms" / "first", folders / "transforms" / "copy")
+    file = folders / "transforms" / "copy" / "transforms.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"frames": json.loads(file.read_text())["frames"][::-1]}))
+    with pytest.raises(DataError, match=r"scene.test: 15 of the 15 pictures of first/copy are those of scene.path too"):
+        load_sequences(keys(folders, test=["copy"]))
+    with pytest.raises(DataError, match=r"scene.test: 6 of the 9 pictures of second/copy are those of scene.also_train"):
+        load_sequences(keys(folders, path="second", also_train=[{"path": "first", "frames": [1, 4]}],
+                            test=[{"path": "copy", "frames": [0, 2]}]))
+
+
 def test_names_are_unique_and_fit_for_files(folders):
     entries = [("test", path) for path in ("x/my drop!", "y/my drop!", "y/My_Drop", "çà", "one/drops.json", "one/more.json", "%")]
     names = sequence_names(keys(folders), entries)
@@ -95,11 +114,11 @@ def test_a_built_in_scene_has_its_own_held_out_sequences():
         load_sequences({"format": "builtin", "name": "tiny", "test": ["somewhere"]})
 
 
-def test_particles_beside_the_images_come_first_and_are_a_sequences_own(folders):
+def test_particles_beside_the_images_come_first_and_are_a_sequences_own(blocks, folders):
     """Clouds of different folders have different numbers of points."""
     counts = {"transforms/first/ply": 5, "transforms/second/ply": 6, "transforms/ply": 7, "elsewhere": 8}
     for name, count in counts.items():
-        export_particles(torch.rand(5, count, 3), folders / name)
+        export_particles(clouds_of(blocks, count), folders / name)
     test = ["a/drop", {"path": "b/drop", "particles": str(folders / "elsewhere")}]
     scene, (second, third, fourth) = load_sequences(keys(folders, particles="ply", also_train=["second"], test=test))
     assert len(scene.particles[0]) == 5 and len(second.particles[0]) == 6

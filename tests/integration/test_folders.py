@@ -61,9 +61,10 @@ def run(tmp_path_factory, cache):
     for sequence in ("train", "test_60", "test_40"):
         scene = load_scene(format="builtin", name="tiny", sequence=sequence, cache=cache)
         capture(scene, folder / "data" / sequence)
+        if sequence == "train":
+            export_particles(scene.truth.positions, folder / "data" / "ply")
         if sequence == "test_40":
             export_particles(scene.truth.positions, folder / "data" / sequence / "ply")
-    export_particles(scene.truth.positions, folder / "data" / "ply")  # of the training sequence, for this test as good as its own
     result = call("train.py", folder / "run", *QUICK, f"scene.root={folder}/data", "scene.path=train", "scene.particles=ply",
                   "scene.also_train=[test_60]", "scene.test=[{path: test_40, name: second}]", f"scene.cache={cache}")
     assert result.returncode == 0, result.stderr[-3000:]

@@ -235,7 +235,7 @@ def test_resume_auto_goes_on_and_then_skips(run, cache, tmp_path):
         (["ckpt_path=nowhere.ckpt"], "ckpt_path: no file nowhere.ckpt"),
         (["losses.colour=1"], "colour"),
         (["trainer.devices=1000", "trainer.accelerator=gpu"], "trainer.devices: expected at most"),
-        (["fit.clip=abc"], "fit.clip: expected a number above 0, found 'abc'"),
+        (["fit.clip=abc"], "fit.clip: expected a number above 0 and at most 1e+20, found 'abc'"),
         (["scene=pacnerf", "scene.path=/nonexistent"], "/nonexistent"),
     ],
 )

@@ -51,3 +51,20 @@ def test_splats_of_another_world_are_refused(squashed, tmp_path):
     settings = build_settings(splats=str(save_ply(tmp_path / "far.ply", splats)), **QUICK)
     with pytest.raises(DataError, match=r"far.ply: expected Gaussians in the scene's box .*found 0 of 20"):
         reconstruct(squashed, settings=settings, spacing=0.03, cache_dir=None, progress=False)
+
+
+@pytest.mark.parametrize("change, unit", [
+    (lambda x, middle: x + torch.tensor([0.12, 0, 0]), 1), (lambda x, middle: middle + 0.3 * (x - middle), 0.3),
+    (lambda x, middle: middle + 2.5 * (x - middle), 2.5), (lambda x, middle: x[:, [1, 0, 2]], 1),
+])  # fmt: skip
+def test_splats_beside_the_object_are_refused(squashed, tmp_path, change, unit):
+    """Inside of the scene's box, in another unit, with other axes, or elsewhere."""
+    settings = build_settings(splats=str(tmp_path / "own.ply"), **QUICK)
+    still = object_windows(squashed, squashed.training_cameras, [0], margin=6)
+    splats = initial_splats(object_hull(squashed, settings), still, count=150, seed=0)
+    save_ply(tmp_path / "own.ply", splats)
+    assert len(pipeline.imported_splats(str(tmp_path / "own.ply"), squashed).splats.means) == 150
+    moved = replace(splats, means=change(splats.means, splats.means.mean(0)), scales=unit * splats.scales)
+    save_ply(tmp_path / "own.ply", moved)
+    with pytest.raises(DataError, match="expected Gaussians where the mattes of frame 0 show the object"):
+        pipeline.imported_splats(str(tmp_path / "own.ply"), squashed)
