@@ -8,6 +8,7 @@ import json
 import logging
 import math
 import os
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ import torch
 from torch import Tensor
 
 from mosa.analysis.tables import markdown
+from mosa.costs import duration
 from mosa.environments.arena import Arena, Simulator, play, play_all, scene_of, simulator_named
 from mosa.environments.pictures import film, write_films
 from mosa.environments.policies import Found, LinearPolicy, Search, by_elites, by_gradient, by_reinforcement
@@ -103,6 +105,41 @@ def train(bench: Bench, simulator: str, seed: int) -> Found:
     return by_reinforcement(s.policy, arena, s.decisions, seed)
 
 
+BACKWARD = 4.0
+"""Time of an episode with its gradient over that of one without."""
+
+
+def expected(bench: Bench, simulator: str) -> str:
+    """What a job takes on this machine, from one step that is played in the simulator: a line for the log."""
+    s = bench.setting
+    arena = bench.arena(simulator, min(s.worlds, s.search.validation), training=True)
+    task, search = arena.task, s.search
+    with torch.no_grad():
+        arena.reset(task.draw(arena.count, torch.Generator().manual_seed(0)))
+        still = torch.zeros(arena.count, len(task.actions))
+        if task.tool is None:
+            arena._begin(still)
+        for _ in range(2):  # of the first, kernels are compiled
+            began = time.perf_counter()
+            arena._advance(None if task.tool is None else task.command(still))
+            arena.view.center.sum().item()  # a GPU is done
+            taken = time.perf_counter() - began
+    looks = search.validation * (1 + math.ceil(search.iterations / search.every))
+    drawn = search.iterations * search.batch
+    episodes = {"gradient": looks + drawn, "cem": looks + drawn * search.candidates}
+    searched = episodes.get(s.policy, s.decisions / (task.steps if task.tool is not None else 1))
+    slower = (BACKWARD - 1) * drawn if s.policy == "gradient" else 0
+    tested = s.trials * (1 if simulator == "truth" else 2)
+    seconds = (searched + slower + tested) * task.steps * taken / arena.count
+    shorter = "; search.iterations=, search.batch=, search.validation= and trials= make it shorter, device=cuda quicker"
+    return (f"{task.name}, {simulator}: about {duration(seconds)}: {searched:.0f} episodes of {task.steps} steps to "
+            f"search, {tested} to test{shorter if seconds > PATIENCE else ''}")  # fmt: skip
+
+
+PATIENCE = 900
+"""[s] from which on the log says what makes a job shorter."""
+
+
 def test(bench: Bench, simulator: str, policy: Callable[[Tensor], Tensor]) -> dict[str, Any]:
     """Success and loss of the drawn trials in that simulator, one by one."""
     s = bench.setting
@@ -115,6 +152,7 @@ def test(bench: Bench, simulator: str, policy: Callable[[Tensor], Tensor]) -> di
 def one(bench: Bench, simulator: str, seed: int, folder: Path, filmed: int = 3) -> dict[str, Any]:
     """Train in one simulator, test there and in the truth where it is known; result.json and films of that many trials in
     `folder`."""
+    log.info(expected(bench, simulator))
     record = _record(bench, simulator, seed)
     tested = dict.fromkeys([simulator, *(["truth"] if record["truth"] is not None else [])])
     for name in tested:
@@ -135,6 +173,8 @@ def make_jobs(bench: Bench, jobs: Sequence[tuple[str, int]], folder: Path) -> di
         file = folder / "jobs" / f"{bench.setting.task}_{name}_{seed}.json"
         record = _read(file, bench.setting)
         if record is None:
+            if name != UNTRAINED:
+                log.info(expected(bench, name))
             record = _record(bench, name, seed)
             _write(file, record)
         log.info("%s, trained in %s, seed %d: %d of %d in the truth", bench.setting.task, name, seed,
