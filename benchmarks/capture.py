@@ -1,6 +1,6 @@
 """Own capture against the truth: six simulated phones with their faults, mosa-capture on what they film, and what it found.
 
-    python benchmarks/capture.py film --folder outputs/capture --name rabbit   # videos, plates, poses as COLMAP writes them
+    python benchmarks/capture.py film --folder outputs/capture --name rabbit [--fps 120 --jobs 6]   # videos, plates, COLMAP's poses
     python benchmarks/capture.py compare --folder outputs/capture              # mosa-capture, and its errors
     python benchmarks/capture.py footage --folder outputs/capture              # perfect footage and held-out drops, train commands
 

@@ -349,6 +349,15 @@ def test_several_processes_share_a_table(tmp_path, monkeypatch):
         study.put_into(document, page, "hanging")
 
 
+def test_what_a_job_takes_is_said_before(tmp_path, monkeypatch):
+    bench = small_bench(tmp_path, monkeypatch)
+    assert study.expected(bench, "learned").endswith(": 6 episodes of 4 steps to search, 6 to test")
+    monkeypatch.setattr(study, "PATIENCE", -1.0)
+    assert "3 to test; search.iterations=" in study.expected(bench, "truth")
+    few = small_bench(tmp_path, monkeypatch, policy="sac", options={"steps": 4})
+    assert ": 2 episodes of 4 steps to search" in study.expected(few, "truth")
+
+
 @pytest.mark.gpu
 @pytest.mark.parametrize("task", ["placement", "pushing"])
 def test_trials_on_a_gpu_are_those_of_a_cpu(task):
