@@ -17,6 +17,8 @@ from scipy.interpolate import BSpline
 from mosa.capture.fall import Fall, Knowledge, row_share
 from mosa.capture.mattes import Matting, Track, matted_frames
 from mosa.capture.phones import Phone
+from mosa.data.agreement import HOLE
+from mosa.data.images import fill_holes
 from mosa.errors import DataError
 
 KINDS = ("flow", "shift", "none")
@@ -262,7 +264,7 @@ def resampled(exposure: Exposure, track: Track, matting: Matting, times: np.ndar
             anchors = [near.index(k) for k in sorted({k0, k1})]
             centre = exposure.path(np.asarray(time))
             picture = blended(list(pictures), np.stack(when), anchors, time, exposure.axis, centre, radius)
-        found.append(straight(picture))
+        found.append(without_tunnels(straight(picture)))
     return np.stack(found)
 
 
@@ -272,3 +274,17 @@ def straight(picture: np.ndarray) -> np.ndarray:
     alpha = np.where(alpha < 0.01, 0, alpha)
     color = np.where(alpha > 0, picture[..., :3] / np.maximum(alpha, 0.01), 1.0)
     return np.round(255 * np.clip(np.concatenate([color, alpha], -1), 0, 1)).astype(np.uint8)
+
+
+def without_tunnels(picture: np.ndarray) -> np.ndarray:
+    """A picture (H, W, 4) of 8 bits whose enclosed holes of up to `HOLE` of its coverage are closed, with the colours around them:
+    to move a picture can close off what had been a thin opening, and a hull is carved through by every hole."""
+    matte = picture[..., 3].astype(np.float32) / 255
+    closed = fill_holes(matte, int(HOLE * (matte > 0.5).sum()))
+    holes = closed > matte
+    if not holes.any():
+        return picture
+    near = cv2.dilate(holes.astype(np.uint8), np.ones((3, 3), np.uint8)) & (matte < 0.9)
+    painted = cv2.inpaint(np.ascontiguousarray(picture[..., :3]), near, 3, cv2.INPAINT_TELEA)
+    colors = np.where(holes[..., None], painted, picture[..., :3])
+    return np.concatenate([colors, np.round(255 * closed)[..., None].astype(np.uint8)], -1)

@@ -130,3 +130,17 @@ def test_weights_of_a_polynomial_through_frames():
     np.testing.assert_allclose(weights.sum(0), 1)
     np.testing.assert_allclose((weights * nodes**3).sum(0), 0.4**3)
     np.testing.assert_allclose(resampling.lagrange(nodes, 0.0)[:, 0], [0, 1, 0, 0], atol=1e-12)
+
+
+def test_a_hole_that_moving_has_made_is_closed_and_an_opening_is_not():
+    still = resampling.straight(squashed(np.zeros(160)))
+    opened = still.copy()
+    opened[78:81, 90:93] = 0
+    opened[60:100, 60:85, 3] = 0  # a handle's
+    found = resampling.without_tunnels(opened)
+    assert (found[78:81, 90:93, 3] == 255).all() and (found[60:100, 60:85, 3] == 0).all()
+    assert np.abs(found[78:81, 90:93, :3].astype(float) - still[78:81, 90:93, :3]).mean() < 12
+    untouched = np.ones((160, 160), bool)
+    untouched[78:81, 90:93] = False
+    np.testing.assert_array_equal(found[untouched], opened[untouched])
+    assert resampling.without_tunnels(still) is still
