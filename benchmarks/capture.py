@@ -1,6 +1,6 @@
 """Own capture against the truth: six simulated phones with their faults, mosa-capture on what they film, and what it found.
 
-    python benchmarks/capture.py film --folder outputs/capture --name rabbit   # videos, plates, poses as COLMAP writes them
+    python benchmarks/capture.py film --folder outputs/capture --name rabbit [--fps 120 --jobs 6]   # videos, plates, COLMAP's poses
     python benchmarks/capture.py compare --folder outputs/capture              # mosa-capture, and its errors
     python benchmarks/capture.py footage --folder outputs/capture              # perfect footage and held-out drops, train commands
 
@@ -160,6 +160,7 @@ def main() -> None:
     parser.add_argument("--fps", type=float, default=60.0)
     parser.add_argument("--rate", type=float, default=None, help="frames per second that mosa-capture writes")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=1, help="phones filmed at a time, each in a process")
     parser.add_argument("--kinds", default=",".join(reversed(KINDS)))
     parser.add_argument("--held", default="test_60,test_40")
     options = parser.parse_args()
@@ -173,6 +174,7 @@ def main() -> None:
             fps=options.fps,
             faults=Faults(),
             seed=options.seed,
+            jobs=options.jobs,
         )
     elif options.what == "compare":
         compare(options.folder, options.kinds.split(","), options.rate)

@@ -8,8 +8,10 @@ the program.
 from __future__ import annotations
 
 import json
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
@@ -205,6 +207,68 @@ def floor_points(rng: np.random.Generator, turn: Rotation, scale: float, move: n
     return [f"{i + 1} {x:.9g} {y:.9g} {z:.9g} 90 110 130 0.6 1 1 2 1" for i, (x, y, z) in enumerate(points)]
 
 
+@dataclass(frozen=True)
+class Take:
+    """What the processes that film one fall have in common."""
+
+    folder: Path
+    name: str
+    material: str
+    size: tuple[int, int]
+    fps: float
+    seconds: float
+    faults: Faults
+    seed: int
+    top: float
+    phone_count: int
+
+    def camera(self, phone: int) -> tuple[np.ndarray, np.ndarray]:
+        rng = np.random.default_rng([self.seed, 11])
+        return phones(self.phone_count, self.size, target=0.5 * self.top, field=0.56 * self.top, rng=rng)[phone]
+
+
+def film_phone(take: Take, v: int) -> dict:
+    """Write the video and the plate of one phone, whose faults are drawn for it alone; what truth.json says of it, and its pose and
+    focal length as COLMAP would have them in the true world."""
+    faults, size, rng = take.faults, take.size, np.random.default_rng([take.seed, 12, v])
+    fall = Fall(take.name, "train", take.material, take.seconds + 0.06)
+    shown = Shown(fall)
+    K, w2c = take.camera(v)
+    phone = f"phone{v}"
+    begin = fall.released - REST - rng.uniform(0, faults.offset)
+    readout = rng.uniform(*faults.readout)
+    gain = 2 ** rng.uniform(-faults.exposure, faults.exposure) * (1 + rng.normal(0, faults.balance, 3))
+    # a pose that is a little wrong
+    wrong = Rotation.from_rotvec(np.radians(rng.normal(0, faults.pose, 3))).as_matrix() @ w2c[:3, :3]
+    centre = -w2c[:3, :3].T @ w2c[:3, 3] + rng.normal(0, faults.place, 3)
+    focal = K[0, 0] * (1 + rng.normal(0, faults.focal))
+    room = Room(K, w2c, size)
+
+    def developed(picture: np.ndarray, gain=gain) -> np.ndarray:
+        seen = np.clip(picture * gain + rng.normal(0, faults.noise, picture.shape), 0, 1)
+        return np.round(255 * seen).astype(np.uint8)
+
+    iio.imwrite(take.folder / "plates" / f"{phone}.png", developed(room.picture, gain * (1 + rng.normal(0, faults.plate))))
+    count = int((take.seconds - begin) * take.fps)
+    with iio.get_writer(
+        take.folder / "videos" / f"{phone}.mp4",
+        fps=take.fps,
+        codec="libx264",
+        quality=None,
+        pixelformat="yuv420p",
+        macro_block_size=2,
+        output_params=["-crf", str(faults.quality)],
+    ) as writer:
+        for k in range(count):
+            t = begin + k / take.fps
+            seen = shown.picture(t, K, w2c, size, readout)
+            behind = room.with_shadow(fall.at(t).mean(0))
+            writer.append_data(developed(seen[..., :3] * seen[..., 3:] + (1 - seen[..., 3:]) * behind))
+    said = {"phone": phone, "begin": begin, "readout": readout, "K": K.tolist(), "w2c": w2c.tolist(), "gain": gain.tolist(),
+            "frames": count}  # fmt: skip
+    return {"said": said, "rotation": wrong, "centre": centre, "focal": focal}
+
+
 def film(
     folder: Path,
     *,
@@ -216,72 +280,36 @@ def film(
     seconds: float = 0.30,
     faults: Faults | None = None,
     seed: int = 0,
+    jobs: int = 1,
 ) -> dict:
     """Write videos/, plates/, sparse/ (a COLMAP model in text, floor points included) and truth.json into a folder; returns
-    what truth.json says."""
-    faults = faults or Faults()
-    rng = np.random.default_rng([seed, 11])
+    what truth.json says. jobs: phones that film at a time, each in a process."""
+    rng = np.random.default_rng([seed, 13])
     fall = Fall(name, "train", material, seconds + 0.06)
-    shown = Shown(fall)
-    top = float((shown.vertices[:, 1] + fall.shift(-10.0)[1]).max())
-    truth_cameras = phones(phone_count, size, target=0.5 * top, field=0.56 * top, rng=rng)
+    top = float((fall.skin.follow(fall.at(0.0))[:, 1] + fall.shift(-10.0)[1]).max())
     for sub in ("videos", "plates", "sparse"):
         (folder / sub).mkdir(parents=True, exist_ok=True)
+    take = Take(folder, name, material, size, fps, seconds, faults or Faults(), seed, top, phone_count)
+    if jobs == 1:
+        filmed = [film_phone(take, v) for v in range(phone_count)]
+    else:
+        with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+            filmed = list(pool.map(film_phone, [take] * phone_count, range(phone_count)))
+    # what COLMAP says: a world of its own
     scale, turn, move = rng.uniform(0.4, 2.5), Rotation.random(random_state=int(rng.integers(1 << 30))), rng.normal(0, 3, 3)
-    records, cameras_text, images_text = [], ["# Camera list"], ["# Image list"]
-    for v, (K, w2c) in enumerate(truth_cameras):
-        phone = f"phone{v}"
-        begin = fall.released - REST - rng.uniform(0, faults.offset)
-        readout = rng.uniform(*faults.readout)
-        gain = 2 ** rng.uniform(-faults.exposure, faults.exposure) * (1 + rng.normal(0, faults.balance, 3))
-        room = Room(K, w2c, size)
-
-        def developed(picture: np.ndarray, gain=gain) -> np.ndarray:
-            seen = np.clip(picture * gain + rng.normal(0, faults.noise, picture.shape), 0, 1)
-            return np.round(255 * seen).astype(np.uint8)
-
-        iio.imwrite(folder / "plates" / f"{phone}.png", developed(room.picture, gain * (1 + rng.normal(0, faults.plate))))
-        count = int((seconds - begin) * fps)
-        with iio.get_writer(
-            folder / "videos" / f"{phone}.mp4",
-            fps=fps,
-            codec="libx264",
-            quality=None,
-            pixelformat="yuv420p",
-            macro_block_size=2,
-            output_params=["-crf", str(faults.quality)],
-        ) as writer:
-            for k in range(count):
-                t = begin + k / fps
-                seen = shown.picture(t, K, w2c, size, readout)
-                behind = room.with_shadow(fall.at(t).mean(0))
-                writer.append_data(developed(seen[..., :3] * seen[..., 3:] + (1 - seen[..., 3:]) * behind))
-        # what COLMAP says: a pose that is a little wrong, in a world of its own
-        wrong = np.eye(4)
-        wrong[:3, :3] = Rotation.from_rotvec(np.radians(rng.normal(0, faults.pose, 3))).as_matrix() @ w2c[:3, :3]
-        centre = -w2c[:3, :3].T @ w2c[:3, 3] + rng.normal(0, faults.place, 3)
-        rotation = wrong[:3, :3] @ turn.as_matrix().T
+    cameras_text, images_text = ["# Camera list"], ["# Image list"]
+    for v, found in enumerate(filmed):
+        rotation = found["rotation"] @ turn.as_matrix().T
         quaternion = np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
-        shift = -rotation @ (turn.apply(centre) / scale + move)
-        focal = K[0, 0] * (1 + rng.normal(0, faults.focal))
-        cameras_text.append(f"{v + 1} SIMPLE_PINHOLE {size[0]} {size[1]} {focal:.6f} {K[0, 2]} {K[1, 2]}")
-        images_text += [f"{v + 1} " + " ".join(f"{x:.12g}" for x in [*quaternion, *shift]) + f" {v + 1} {phone}.jpg", ""]
-        records.append(
-            {
-                "phone": phone,
-                "begin": begin,
-                "readout": readout,
-                "K": K.tolist(),
-                "w2c": w2c.tolist(),
-                "gain": gain.tolist(),
-                "frames": count,
-            }
-        )
+        shift = -rotation @ (turn.apply(found["centre"]) / scale + move)
+        K = found["said"]["K"]
+        cameras_text.append(f"{v + 1} SIMPLE_PINHOLE {size[0]} {size[1]} {found['focal']:.6f} {K[0][2]} {K[1][2]}")
+        images_text += [f"{v + 1} " + " ".join(f"{x:.12g}" for x in [*quaternion, *shift]) + f" {v + 1} phone{v}.jpg", ""]
     (folder / "sparse" / "points3D.txt").write_text("\n".join(["# 3D point list", *floor_points(rng, turn, scale, move)]) + "\n")
     (folder / "sparse" / "cameras.txt").write_text("\n".join(cameras_text) + "\n")
     (folder / "sparse" / "images.txt").write_text("\n".join(images_text) + "\n")
     truth = {"name": name, "material": material, "size": list(size), "fps": fps, "scale": scale, "turn": turn.as_matrix().tolist(),
-             "move": move.tolist(), "gravity": -GRAVITY[1], "phones": records,
+             "move": move.tolist(), "gravity": -GRAVITY[1], "phones": [found["said"] for found in filmed],
              "parameters": fall.hidden.summary()}  # fmt: skip
     (folder / "truth.json").write_text(json.dumps(truth, indent=1))
     return truth

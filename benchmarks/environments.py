@@ -2,7 +2,7 @@
 parameters can be chosen before any comparison.
 
     OMP_NUM_THREADS=1 python benchmarks/environments.py [--task placement hanging pushing] [--scene rabbit] [--device cuda]
-        [--trials 64] [--candidates 32] [--spacing 0.0125] [--set low=0.1 high=0.15 ...]
+        [--trials 64] [--candidates 32] [--spacing 0.0125] [--set low=0.1 high=0.15 ...] [--heights 0.1:0.2 0.15:0.25 --choose FILE]
 
 For each task, over trials drawn as in training:
 - `plain`: share of trials in which the policy that a search begins from succeeds. Near 0 or 1 nothing can be learned.
@@ -10,23 +10,31 @@ For each task, over trials drawn as in training:
 - `told apart`: of the true body against its isotropic twin (the same matrix, without fibres and with one stiffness), both under
   that policy: mean distance of their centres at the end [mm], mean angle between their up axes [degrees], and the share of trials
   in which one succeeds and the other does not. Where it is small no simulator can be better than another.
+
+`--heights` measures each range of dropping heights; `--choose` writes the one that its rule names into a file, as
+`options.low=... options.high=...` of `python -m mosa.environments`: of the ranges with `plain` from 10 to 90 % that which tells
+laws apart in most trials (of all ranges, where none is so), the lower one of equals.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from pathlib import Path
 
 import torch
 
 from mosa.environments.arena import Arena, Simulator, play
 from mosa.environments.policies import LinearPolicy
-from mosa.environments.tasks import TASKS, task_named
+from mosa.environments.tasks import TASKS, Release, task_named
 from mosa.environments.truth import true_twin
 
+CHOSEN = (0.1, 0.9)
+"""Shares of plain success between which a range of heights may be chosen."""
 
-def measured(name: str, options: argparse.Namespace, values: dict[str, float]) -> str:
-    """A row of the table."""
+
+def measured(name: str, options: argparse.Namespace, values: dict[str, float]) -> tuple[str, float, float]:
+    """A row of the table, share of plain success, and share of trials in which the two laws' success differs."""
     began = time.perf_counter()
     made = [Simulator("truth", true_twin(options.scene, material=material, device=options.device, spacing=options.spacing))
             for material in ("anisotropic", "isotropic")]  # fmt: skip
@@ -47,8 +55,17 @@ def measured(name: str, options: argparse.Namespace, values: dict[str, float]) -
             action = 2 * torch.rand(options.trials, len(task.actions), generator=generator) - 1
             won |= play(arena, trials, lambda _, action=action: action).success
         reachable = f"{100 * won.float().mean():.0f} %"
-    return (f"| {name} | {100 * wins[0].float().mean():.0f} % | {reachable} | {apart:.0f} | {angle:.0f} | "
-            f"{100 * (wins[0] != wins[1]).float().mean():.0f} % | {time.perf_counter() - began:.0f} |")  # fmt: skip
+    plain, differs = float(wins[0].float().mean()), float((wins[0] != wins[1]).float().mean())
+    heights = f"{task.low:g} to {task.high:g}" if isinstance(task, Release) else ""
+    row = (f"| {name} | {heights} | {100 * plain:.0f} % | {reachable} | {apart:.0f} | {angle:.0f} | {100 * differs:.0f} % | "
+           f"{time.perf_counter() - began:.0f} |")  # fmt: skip
+    return row, plain, differs
+
+
+def chosen(found: list[tuple[tuple[float, float], float, float]]) -> tuple[float, float]:
+    """The range of heights [m] among (range, plain, differs) that the rule names."""
+    fit = [f for f in found if CHOSEN[0] <= f[1] <= CHOSEN[1]] or found
+    return max(fit, key=lambda f: (f[2], -f[0][0]))[0]
 
 
 def main() -> None:
@@ -60,12 +77,25 @@ def main() -> None:
     parser.add_argument("--candidates", type=int, default=32)
     parser.add_argument("--spacing", type=float)
     parser.add_argument("--set", nargs="+", default=[], metavar="FIELD=NUMBER", help="of the tasks")
+    parser.add_argument("--heights", nargs="+", metavar="LOW:HIGH", help="[m] of placement and hanging")
+    parser.add_argument("--choose", type=Path, metavar="FILE", help="of one task: write the chosen heights")
     options = parser.parse_args()
+    if options.choose and (not options.heights or len(options.task) != 1 or options.task == ["pushing"]):
+        parser.error("--choose: expected --heights, and one of placement, hanging as --task")
     torch.set_num_threads(1)
     values = {key: float(value) for key, value in (item.split("=") for item in options.set)}
-    print("| task | plain | reachable | told apart [mm] | [degrees] | success differs | s |\n|---|---|---|---|---|---|---|")
+    ranges = [tuple(map(float, item.split(":"))) for item in options.heights or ()]
+    print("| task | heights [m] | plain | reachable | told apart [mm] | [degrees] | success differs | s |")
+    print("|---|---|---|---|---|---|---|---|")
     for name in options.task:
-        print(measured(name, options, values), flush=True)
+        found = []
+        for low, high in ranges if ranges and name != "pushing" else [(None, None)]:
+            row, plain, differs = measured(name, options, values | ({} if low is None else {"low": low, "high": high}))
+            found.append(((low, high), plain, differs))
+            print(row, flush=True)
+        if options.choose:
+            low, high = chosen(found)
+            options.choose.write_text(f"options.low={low:g} options.high={high:g}\n")
 
 
 if __name__ == "__main__":

@@ -217,8 +217,8 @@ class Live:
     def positions(self) -> Tensor:
         """(N, 3) [m] of the particles; as the training began where no drop could be made yet."""
         if self.state is None:
-            begun = self.twin.training_start
-            return (self.twin.body.rest - self.twin.body.center) @ begun.rotation.to(self.twin.body.rest).T + begun.center
+            begun, rest = self.twin.training_start, self.twin.body.rest
+            return (rest - self.twin.body.center) @ begun.rotation.to(rest).T + begun.center.to(rest)
         return self.state.positions.detach().to(self.twin.body.rest)
 
     @property

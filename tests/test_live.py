@@ -238,3 +238,30 @@ def test_the_page_drops_steps_pushes_and_outlives_a_divergence():
     finally:
         shown.stop()
     assert not shown.player.is_alive()
+
+
+@pytest.mark.gpu
+def test_it_is_played_with_on_a_gpu_as_on_a_cpu():
+    """Dropped, pushed by the ball, coloured and drawn, and put back; and what stays where no drop could be made."""
+    ends = {}
+    for device in ("cpu", "cuda"):
+        made = twin()
+        made.body.to(device)
+        made.posterior = Drawn()
+        live = Live(made, draws=2)
+        live.uncertain = True
+        live.change(height=0.02)
+        assert live.drop(), live.message
+        live.target = live.hand_position + np.array([0.3, 0.0, 0.0])
+        for _ in range(20):
+            assert live.step(), live.message
+        ends[device] = live.positions.cpu().numpy(), live.hand_position
+        for by in ("appearance", "stretch", "heterogeneity", "uncertainty"):
+            colors, _ = live.paint(by)
+            assert np.isfinite(colors).all() and all(np.isfinite(part).all() for part in live.splats(by, colors))
+        assert live.poses() == [] and "Force on the ball" in live.caption() and live.spread is not None
+        assert live.reset() and not live.running
+        live.state = None
+        assert live.positions.shape == (125, 3)
+    np.testing.assert_allclose(ends["cuda"][0], ends["cpu"][0], atol=1e-4)
+    np.testing.assert_allclose(ends["cuda"][1], ends["cpu"][1], atol=1e-6)

@@ -242,6 +242,8 @@ def fit_fall(
         if attempt >= 2 and narrower == window:
             break
         window, numbers = narrower, None if narrower != window else numbers
+    if flight is None:
+        window = without_release(problem, noise, window, interval)
     problem = Problem(phones, tracks, offsets, window, knowledge)
     solution = problem.solve(problem.begin(), noise)
     return described(problem, solution, noise, count)
@@ -264,6 +266,16 @@ def trimmed(problem: Problem, misses, offsets, noise: float, window, interval: f
         inside = (when >= first) & (when <= last)
         when, off = when[inside], off[inside]
     return first, last
+
+
+def without_release(problem: Problem, noise: float, window, interval: float) -> tuple[float, float]:
+    """The window without its beginning, in which the object may have hung still: it would be off the parabola by g t^2 / 2 only,
+    which for the first hundredths of a second is less than is noticed, and is enough to shift acceleration and readouts."""
+    focal = float(np.mean([phone.camera.K[0, 0] for phone in problem.phones]))
+    size = float(np.linalg.norm(problem.rough[2]))
+    margin = (2 * OUTLIER * noise * problem.depth / focal / size) ** 0.5
+    first, last = window
+    return (first + margin, last) if last - first - margin > (FEWEST + 1) * interval else window
 
 
 def described(problem: Problem, solution, noise: float, count: int) -> Fall:

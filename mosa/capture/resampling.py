@@ -1,7 +1,7 @@
 """Frames of common times from phones that expose at times of their own, row by row.
 
 What a frame shows is first moved along the path of the object's centre in that picture, each row from the time it was read at to
-the wanted one; what is left between the frame before and the frame after, deformation and turning, is interpolated by optical flow.
+the wanted one; what is left, deformation and turning, is interpolated by optical flow between the frames around, row by row too.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from scipy.interpolate import BSpline
 from mosa.capture.fall import Fall, Knowledge, row_share
 from mosa.capture.mattes import Matting, Track, matted_frames
 from mosa.capture.phones import Phone
+from mosa.data.agreement import HOLE
+from mosa.data.images import fill_holes
 from mosa.errors import DataError
 
 KINDS = ("flow", "shift", "none")
@@ -155,14 +157,26 @@ def between(exposure: Exposure, time: float) -> tuple[int, int] | None:
     return after - 1, after
 
 
-def moved(picture: np.ndarray, exposure: Exposure, frame: int, time: float) -> np.ndarray:
+def around(exposure: Exposure, pair: tuple[int, int]) -> list[int]:
+    """The frames of a pair and, where the object is whole in them too, those before and after: what the motion between is read
+    from."""
+    k0, k1 = pair
+    own, usual = exposure.own_times, float(np.median(np.diff(exposure.times)))
+    found = sorted({k0, k1})
+    for k, beside in ((k0 - 1, k0), (k1 + 1, k1)):
+        if 0 <= k < len(own) and np.isfinite(exposure.centres[k, 0]) and abs(own[k] - own[beside]) < 2.5 * usual:
+            found.append(k)
+    return sorted(found)
+
+
+def moved(picture: np.ndarray, exposure: Exposure, frame: int, time: float) -> tuple[np.ndarray, np.ndarray]:
     """A frame (H, W, C) of 8 bits as it would have been exposed at one time, were the object's motion that of its centre in the
-    picture; in [0, 1]."""
+    picture; in [0, 1]. And the times (H or W,) [s] at which what its lines then show was read."""
     height, width = picture.shape[:2]
     wanted = exposure.path(np.asarray(time))
     size = (width, height)[exposure.axis]
     line = np.arange(size) + 0.5
-    source, shift = line, np.zeros((size, 2))
+    source, shift, when = line, np.zeros((size, 2)), np.zeros(size)
     for _ in range(4):  # where a row comes from depends on when it was read: a contraction by velocity times readout over size
         when = exposure.times[frame] + exposure.readout * exposure.sign * (source / size - 0.5)
         shift = exposure.path(when) - wanted
@@ -170,30 +184,58 @@ def moved(picture: np.ndarray, exposure: Exposure, frame: int, time: float) -> n
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     by = shift.astype(np.float32)
     dx, dy = (by[:, 0][:, None], by[:, 1][:, None]) if exposure.axis == 1 else (by[:, 0][None], by[:, 1][None])
-    return cv2.remap(
+    found = cv2.remap(
         picture.astype(np.float32) / 255, x + dx, y + dy, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT, borderValue=0
     )
+    return found, when
 
 
-def blended(one: np.ndarray, two: np.ndarray, share: float, centre: np.ndarray, radius: float) -> np.ndarray:
-    """Between two premultiplied RGBA pictures (H, W, 4), of which `two` counts for `share`: each moved along the flow between."""
-    height, width = one.shape[:2]
+def lagrange(nodes: np.ndarray, at: float) -> np.ndarray:
+    """(n, L) weights of values at nodes (n, L) in the polynomial through them, at one place."""
+    found = np.ones_like(nodes)
+    for j in range(len(nodes)):
+        for k in range(len(nodes)):
+            if k != j:
+                found[j] *= (at - nodes[k]) / (nodes[j] - nodes[k])
+    return found
+
+
+def blended(
+    pictures: list[np.ndarray], when: np.ndarray, anchors: list[int], time: float, axis: int, centre: np.ndarray, radius: float
+) -> np.ndarray:
+    """What premultiplied RGBA pictures (H, W, 4) of n frames, moved along the path, would show at one time.
+
+    when: (n, L) [s] at which their lines were read; anchors: numbers of the one or two pictures around that time, which are drawn
+    along the flows to the others. How far is a polynomial in time through all of them, line by line: what a line shows was read up
+    to some milliseconds before or after the centre, in which a body deforms, and between two frames it does not do so evenly."""
+    height, width = pictures[0].shape[:2]
     reach = (1 + AROUND) * 2 * radius
     x0, y0 = (max(0, int(c - reach)) for c in centre)
     x1, y1 = min(width, int(centre[0] + reach) + 1), min(height, int(centre[1] + reach) + 1)
-    a, b = (np.ascontiguousarray(p[y0:y1, x0:x1]) for p in (one, two))
+    parts = [np.ascontiguousarray(p[y0:y1, x0:x1]) for p in pictures]
+    lines = when[:, y0:y1, None] if axis == 1 else when[:, None, x0:x1]
+    weights = lagrange(lines, time).astype(np.float32)
+    shares = np.ones(1)
+    if len(anchors) == 2:
+        one, two = (lines[a] for a in anchors)
+        late = np.clip((time - one) / (two - one), 0, 1).astype(np.float32)[..., None]
+        shares = [1 - late, late]
 
     def grey(p: np.ndarray) -> np.ndarray:
         return np.round(255 * np.clip(p[..., :3].mean(-1) + 1 - p[..., 3], 0, 1)).astype(np.uint8)
 
-    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(grey(a), grey(b), None)
+    greys = [grey(p) for p in parts]
+    flow_of = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     x, y = np.meshgrid(np.arange(x1 - x0, dtype=np.float32), np.arange(y1 - y0, dtype=np.float32))
-    from_one = cv2.remap(a, x - share * flow[..., 0], y - share * flow[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    from_two = cv2.remap(
-        b, x + (1 - share) * flow[..., 0], y + (1 - share) * flow[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
-    )
-    found = (1 - share) * one + share * two
-    found[y0:y1, x0:x1] = (1 - share) * from_one + share * from_two
+    inside = np.zeros_like(parts[0])
+    for a, share in zip(anchors, shares):
+        by = np.zeros((y1 - y0, x1 - x0, 2), np.float32)
+        for k in range(len(parts)):
+            if k != a:
+                by += weights[k][..., None] * flow_of.calc(greys[a], greys[k], None)
+        inside += share * cv2.remap(parts[a], x - by[..., 0], y - by[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    found = np.zeros_like(pictures[0])
+    found[y0:y1, x0:x1] = inside
     return found
 
 
@@ -201,31 +243,28 @@ def resampled(exposure: Exposure, track: Track, matting: Matting, times: np.ndar
     """(T, H, W, 4) uint8, straight alpha, of a phone at common times (T,) [s]. kind: flow | shift (the nearest frame, moved) | none
     (the nearest frame)."""
     pairs = [between(exposure, float(t)) for t in times]
-    first, last = min(p[0] for p in pairs), max(p[1] for p in pairs)
-    frames, needed = {}, {k for pair in pairs for k in pair}
+    used = [around(exposure, pair) if kind == "flow" else sorted(set(pair)) for pair in pairs]
+    first, last = min(u[0] for u in used), max(u[-1] for u in used)
+    frames, needed = {}, {k for u in used for k in u}
     for i, color, matte in matted_frames(track.clip, matting, first, last):
         if i in needed:  # 8 bits: of slow motion in 4K there are gigabytes of them
             both = np.concatenate([color * matte[..., None], matte[..., None]], -1)
             frames[i] = np.round(255 * both).astype(np.uint8)
     radius = float(np.median(track.radii[track.seen]))
     found = []
-    for time, (k0, k1) in zip(times, pairs):
-        own = exposure.own_times
-        share = 0.0 if k0 == k1 else float((time - own[k0]) / (own[k1] - own[k0]))
-        nearest = k0 if share <= 0.5 else k1
+    for time, (k0, k1), near in zip(times, pairs, used):
+        own, time = exposure.own_times, float(time)
+        nearest = k0 if k0 == k1 or time - own[k0] <= own[k1] - time else k1
         if kind == "none":
             picture = frames[nearest].astype(np.float32) / 255
-        elif kind == "shift" or k0 == k1:
-            picture = moved(frames[nearest], exposure, nearest, float(time))
+        elif kind == "shift" or len(near) == 1:
+            picture, _ = moved(frames[nearest], exposure, nearest, time)
         else:
-            picture = blended(
-                moved(frames[k0], exposure, k0, float(time)),
-                moved(frames[k1], exposure, k1, float(time)),
-                share,
-                exposure.path(np.asarray(time)),
-                radius,
-            )
-        found.append(straight(picture))
+            pictures, when = zip(*(moved(frames[k], exposure, k, time) for k in near))
+            anchors = [near.index(k) for k in sorted({k0, k1})]
+            centre = exposure.path(np.asarray(time))
+            picture = blended(list(pictures), np.stack(when), anchors, time, exposure.axis, centre, radius)
+        found.append(without_tunnels(straight(picture)))
     return np.stack(found)
 
 
@@ -235,3 +274,17 @@ def straight(picture: np.ndarray) -> np.ndarray:
     alpha = np.where(alpha < 0.01, 0, alpha)
     color = np.where(alpha > 0, picture[..., :3] / np.maximum(alpha, 0.01), 1.0)
     return np.round(255 * np.clip(np.concatenate([color, alpha], -1), 0, 1)).astype(np.uint8)
+
+
+def without_tunnels(picture: np.ndarray) -> np.ndarray:
+    """A picture (H, W, 4) of 8 bits whose enclosed holes of up to `HOLE` of its coverage are closed, with the colours around them:
+    to move a picture can close off what had been a thin opening, and a hull is carved through by every hole."""
+    matte = picture[..., 3].astype(np.float32) / 255
+    closed = fill_holes(matte, int(HOLE * (matte > 0.5).sum()))
+    holes = closed > matte
+    if not holes.any():
+        return picture
+    near = cv2.dilate(holes.astype(np.uint8), np.ones((3, 3), np.uint8)) & (matte < 0.9)
+    painted = cv2.inpaint(np.ascontiguousarray(picture[..., :3]), near, 3, cv2.INPAINT_TELEA)
+    colors = np.where(holes[..., None], painted, picture[..., :3])
+    return np.concatenate([colors, np.round(255 * closed)[..., None].astype(np.uint8)], -1)

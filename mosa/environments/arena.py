@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,7 +15,7 @@ from torch import Tensor
 from mosa.environments.task import LAST, Task, Trials, View
 from mosa.environments.truth import true_twin
 from mosa.episode import TwinState
-from mosa.errors import ConfigError, SimulationDiverged
+from mosa.errors import ConfigError, DataError, SimulationDiverged
 from mosa.twin import Twin
 
 SIMULATORS = ("learned", "isotropic", "truth")
@@ -47,13 +48,26 @@ def simulator_named(
         return Simulator(name, learned, "adapted" if name == "learned" else "prior")
     material, seed = "anisotropic", 0
     if scene is None:
-        known = learned.config["cfg"].get("scene")
-        if not isinstance(known, Mapping) or known.get("format") != "builtin" or not isinstance(known.get("name"), str):
-            described = str(known.get("format"))[:80] if isinstance(known, Mapping) else "that its checkpoint does not name"
-            raise ConfigError(f"simulator: expected learned or isotropic for a run on a scene of format {described}: the truth is "
-                              "known for built-in scenes only (truth.scene=<one of them>)")
+        known = scene_of(learned, checkpoint)
         scene, material, seed = known["name"], known.get("material", material), known.get("seed", seed)
     return Simulator(name, true_twin(scene, material=material, seed=seed, device=device, spacing=spacing))
+
+
+def scene_of(learned: Twin, checkpoint: str | Path) -> Mapping[str, Any]:
+    """The configuration of the built-in scene that a twin was learned from. Errors: ConfigError where it was another one, DataError
+    where the checkpoint does not say."""
+    cfg = learned.config.get("cfg")
+    known = cfg.get("scene") if isinstance(cfg, Mapping) else None
+    if not isinstance(known, Mapping) or not isinstance(known.get("format"), str):
+        raise DataError(f"checkpoint: {checkpoint}: cfg.scene: expected the scene that the twin was learned from, found none; "
+                        "name a built-in one with truth.scene=")  # fmt: skip
+    if known["format"] != "builtin":
+        raise ConfigError(f"simulator: expected learned or isotropic for a run on a scene of format {known['format']}: the truth "
+                          "is known for built-in scenes only")  # fmt: skip
+    if not isinstance(known.get("name"), str):
+        raise DataError(f"checkpoint: {checkpoint}: cfg.scene.name: expected the name of a built-in scene, found "
+                        f"{known.get('name')!r}; name one with truth.scene=")  # fmt: skip
+    return known
 
 
 def look(state: TwinState, weights: Tensor, tool: int | None) -> View:

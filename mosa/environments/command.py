@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 from mosa.config import known_keys, plain
 from mosa.environments.arena import SIMULATORS
 from mosa.environments.policies import METHODS, Search
-from mosa.environments.study import Bench, Setting, one, table
+from mosa.environments.study import UNTRAINED, Bench, Setting, make_jobs, one, put_into, table
 from mosa.environments.tasks import TASKS
 from mosa.errors import ConfigError
 from mosa.guards import check_environments
@@ -50,8 +50,15 @@ def train_and_test(cfg: DictConfig) -> None:
     values = plain(cfg)
     setting = setting_of(values)
     names = values["simulator"] if isinstance(values["simulator"], list) else [values["simulator"]]
+    many, known = isinstance(values["simulator"], list), SIMULATORS
+    if values["jobs_only"] and not many:
+        raise ConfigError(f"jobs_only: expected a list of simulators with it, found simulator={values['simulator']!r}")
+    if values["page"] is not None and (not many or values["jobs_only"]):
+        raise ConfigError("page: expected a list of simulators and jobs_only=false with it: it takes the table")
+    if values["jobs_only"]:
+        known = (*SIMULATORS, UNTRAINED)
     for name in names:
-        if name not in SIMULATORS:
+        if name not in known:
             raise ConfigError(f"simulator: expected {', '.join(SIMULATORS)}, or a list of them, found {name!r}")
     if setting.device == "cpu":
         torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
@@ -60,9 +67,14 @@ def train_and_test(cfg: DictConfig) -> None:
     folder = Path(values["out"] or HydraConfig.get().runtime.output_dir)
     folder.mkdir(parents=True, exist_ok=True)  # what cannot be written is said before hours are spent
     bench = Bench(setting)
-    if isinstance(values["simulator"], list):
-        page = table(bench, names, values["seeds"], folder)
+    if values["jobs_only"]:
+        make_jobs(bench, [(name, seed) for seed in values["seeds"] for name in names], folder)
+        return
+    if many:
+        page = table(bench, names, values["seeds"], folder, values["films"])
+        if values["page"] is not None:
+            put_into(Path(values["page"]), page, setting.task)
         log.info("\n%s", page.read_text())
         return
-    one(bench, names[0], values["seed"], folder)
+    one(bench, names[0], values["seed"], folder, values["films"])
     log.info("results in %s", folder)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import logging
 import math
+import os
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,7 +18,8 @@ import torch
 from torch import Tensor
 
 from mosa.analysis.tables import markdown
-from mosa.environments.arena import Arena, Simulator, play, play_all, simulator_named
+from mosa.costs import duration
+from mosa.environments.arena import Arena, Simulator, play, play_all, scene_of, simulator_named
 from mosa.environments.pictures import film, write_films
 from mosa.environments.policies import Found, LinearPolicy, Search, by_elites, by_gradient, by_reinforcement
 from mosa.environments.task import Task
@@ -28,7 +32,6 @@ UNTRAINED = "none"
 """The policy that a search begins from, which knows no simulator."""
 TEST_SEED = 20_000_000
 """Of the tested trials: the same for all policies, and none that a search has drawn."""
-FILMED = 3
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,41 @@ def train(bench: Bench, simulator: str, seed: int) -> Found:
     return by_reinforcement(s.policy, arena, s.decisions, seed)
 
 
+BACKWARD = 4.0
+"""Time of an episode with its gradient over that of one without."""
+
+
+def expected(bench: Bench, simulator: str) -> str:
+    """What a job takes on this machine, from one step that is played in the simulator: a line for the log."""
+    s = bench.setting
+    arena = bench.arena(simulator, min(s.worlds, s.search.validation), training=True)
+    task, search = arena.task, s.search
+    with torch.no_grad():
+        arena.reset(task.draw(arena.count, torch.Generator().manual_seed(0)))
+        still = torch.zeros(arena.count, len(task.actions))
+        if task.tool is None:
+            arena._begin(still)
+        for _ in range(2):  # of the first, kernels are compiled
+            began = time.perf_counter()
+            arena._advance(None if task.tool is None else task.command(still))
+            arena.view.center.sum().item()  # a GPU is done
+            taken = time.perf_counter() - began
+    looks = search.validation * (1 + math.ceil(search.iterations / search.every))
+    drawn = search.iterations * search.batch
+    episodes = {"gradient": looks + drawn, "cem": looks + drawn * search.candidates}
+    searched = episodes.get(s.policy, s.decisions / (task.steps if task.tool is not None else 1))
+    slower = (BACKWARD - 1) * drawn if s.policy == "gradient" else 0
+    tested = s.trials * (1 if simulator == "truth" else 2)
+    seconds = (searched + slower + tested) * task.steps * taken / arena.count
+    shorter = "; search.iterations=, search.batch=, search.validation= and trials= make it shorter, device=cuda quicker"
+    return (f"{task.name}, {simulator}: about {duration(seconds)}: {searched:.0f} episodes of {task.steps} steps to "
+            f"search, {tested} to test{shorter if seconds > PATIENCE else ''}")  # fmt: skip
+
+
+PATIENCE = 900
+"""[s] from which on the log says what makes a job shorter."""
+
+
 def test(bench: Bench, simulator: str, policy: Callable[[Tensor], Tensor]) -> dict[str, Any]:
     """Success and loss of the drawn trials in that simulator, one by one."""
     s = bench.setting
@@ -111,8 +149,10 @@ def test(bench: Bench, simulator: str, policy: Callable[[Tensor], Tensor]) -> di
     return {"success": success.tolist(), "loss": [round(v, 5) for v in loss.tolist()]}
 
 
-def one(bench: Bench, simulator: str, seed: int, folder: Path) -> dict[str, Any]:
-    """Train in one simulator, test there and in the truth where it is known; policy.json, result.json and films in `folder`."""
+def one(bench: Bench, simulator: str, seed: int, folder: Path, filmed: int = 3) -> dict[str, Any]:
+    """Train in one simulator, test there and in the truth where it is known; result.json and films of that many trials in
+    `folder`."""
+    log.info(expected(bench, simulator))
     record = _record(bench, simulator, seed)
     tested = dict.fromkeys([simulator, *(["truth"] if record["truth"] is not None else [])])
     for name in tested:
@@ -121,29 +161,38 @@ def one(bench: Bench, simulator: str, seed: int, folder: Path) -> dict[str, Any]
     _write(folder / "result.json", record)
     if record["policy"] is not None:
         films(bench, {f"trained in {simulator}": LinearPolicy.read(bench.task(simulator), record["policy"])},
-              "truth" if record["truth"] is not None else simulator, folder)
+              "truth" if record["truth"] is not None else simulator, folder, filmed)
     return record
 
 
-def table(bench: Bench, simulators: Sequence[str], seeds: Sequence[int], folder: Path) -> Path:
-    """Every simulator and seed, then the untrained policy; what lies in `folder`/jobs from the same setting is not made again.
-    Writes <task>.md, .csv and films of the first trials into `folder`; the page's path."""
-    jobs = [(UNTRAINED, 0), *((name, seed) for seed in seeds for name in simulators)]
+def make_jobs(bench: Bench, jobs: Sequence[tuple[str, int]], folder: Path) -> dict[tuple[str, int], dict[str, Any]]:
+    """The records of (simulator or `UNTRAINED`, seed); what lies in `folder`/jobs from the same setting is not made again. Several
+    processes may make jobs of one folder."""
     records = {}
     for name, seed in jobs:
         file = folder / "jobs" / f"{bench.setting.task}_{name}_{seed}.json"
         record = _read(file, bench.setting)
         if record is None:
+            if name != UNTRAINED:
+                log.info(expected(bench, name))
             record = _record(bench, name, seed)
             _write(file, record)
         log.info("%s, trained in %s, seed %d: %d of %d in the truth", bench.setting.task, name, seed,
                  sum(record["truth"]["success"]), bench.setting.trials)
         records[name, seed] = record
-    page = write_table(bench.setting, records, bench.task("truth"), folder)
+    return records
+
+
+def table(bench: Bench, simulators: Sequence[str], seeds: Sequence[int], folder: Path, filmed: int = 3) -> Path:
+    """Every simulator and seed, and the untrained policy. Writes <task>.md, .csv and films of that many trials into `folder`; the
+    page's path."""
+    simulators = [name for name in simulators if name != UNTRAINED]
+    records = make_jobs(bench, [(UNTRAINED, 0), *((name, seed) for seed in seeds for name in simulators)], folder)
+    page = write_table(bench.setting, records, bench.task("truth"), folder, about_twin(bench))
     shown = {f"trained in {name}": records[name, seeds[0]] for name in simulators}
     policies = {title: LinearPolicy.read(bench.task("truth"), r["policy"]) for title, r in shown.items() if r["policy"] is not None}
     if policies:
-        films(bench, policies, "truth", folder)
+        films(bench, policies, "truth", folder, filmed)
     return page
 
 
@@ -170,7 +219,9 @@ def _of_builtin(bench: Bench) -> bool:
 
 
 def _plain(setting: Setting) -> dict[str, Any]:
-    return json.loads(json.dumps(asdict(setting)))
+    """The setting, of the checkpoint its content in place of its path: a study may go on on another machine."""
+    content = None if setting.checkpoint is None else hashlib.sha256(Path(setting.checkpoint).read_bytes()).hexdigest()[:16]
+    return json.loads(json.dumps(asdict(setting) | {"checkpoint": content}))
 
 
 FREE = ("device", "worlds")
@@ -196,15 +247,19 @@ def _read(file: Path, setting: Setting) -> dict[str, Any] | None:
 def _write(file: Path, record: Mapping[str, Any]) -> None:
     """Whole or not at all: its presence says that the job is complete."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    partial = file.with_suffix(".partial")
+    partial = file.with_suffix(f".{os.getpid()}.partial")
     partial.write_text(json.dumps(record))
     partial.replace(file)
 
 
-def films(bench: Bench, policies: Mapping[str, Callable[[Tensor], Tensor]], simulator: str, folder: Path) -> list[Path]:
+def films(
+    bench: Bench, policies: Mapping[str, Callable[[Tensor], Tensor]], simulator: str, folder: Path, filmed: int
+) -> list[Path]:
     """The first tested trials under each policy, in that simulator: one strip and one video a trial."""
     task = bench.task(simulator)
-    count = min(FILMED, bench.setting.trials)
+    count = min(filmed, bench.setting.trials)
+    if count == 0:
+        return []
     arena = bench.arena(simulator, count)
     # the same numbers as in the test: trials are drawn column by column
     drawn = task.draw(bench.setting.trials, torch.Generator().manual_seed(TEST_SEED)).select(slice(count))
@@ -217,8 +272,19 @@ def films(bench: Bench, policies: Mapping[str, Callable[[Tensor], Tensor]], simu
     return written
 
 
-def write_table(setting: Setting, records: Mapping[tuple[str, int], Mapping[str, Any]], task: Task, folder: Path) -> Path:
-    """<task>.md and <task>.csv. Every row is one simulator to train in."""
+def about_twin(bench: Bench) -> str:
+    """What the learned and the isotropic simulator are, in a sentence; empty without a run."""
+    if bench.setting.checkpoint is None:
+        return ""
+    twin = bench.simulator("learned").twin
+    return (f"Twin: learned from scene {scene_of(twin, bench.setting.checkpoint)['name']}, prior {twin.body.material.law}, "
+            f"{len(twin.body.rest)} particles on a grid of {1e3 * twin.body.settings.dx:.1f} mm.")  # fmt: skip
+
+
+def write_table(
+    setting: Setting, records: Mapping[tuple[str, int], Mapping[str, Any]], task: Task, folder: Path, about: str = ""
+) -> Path:
+    """<task>.md and <task>.csv. Every row is one simulator to train in. about: a sentence on the twin."""
     names = list(dict.fromkeys(name for name, _ in records))
     header = ["trained in", "success in the truth", "mean", "in its own simulator", "mean loss in the truth", "seconds of training"]
     lines = []
@@ -236,9 +302,10 @@ def write_table(setting: Setting, records: Mapping[tuple[str, int], Mapping[str,
         f"{setting.policy}. `none`: the policy that the search begins from. ±: standard deviation over seeds; of one seed's "
         f"{setting.trials} trials alone it is up to {100 * 0.5 / math.sqrt(setting.trials):.0f} in 100.",
         markdown(header, lines),
-        "Setting: " + ", ".join(f"{k} {v}" for k, v in _plain(setting).items() if k != "search") + "; search "
-        + ", ".join(f"{k} {v}" for k, v in asdict(setting.search).items()) + ".",
-        "Task: " + ", ".join(f"{k} {v}" for k, v in asdict(task).items()) + ".",
+        *([about] if about else []),
+        "Setting: " + _listed({k: v for k, v in _plain(setting).items() if k not in UNSAID}) + "; search "
+        + _listed(asdict(setting.search)) + ".",
+        "Task: " + _listed(asdict(task)) + ".",
     ]  # fmt: skip
     folder.mkdir(parents=True, exist_ok=True)
     page = folder / f"{task.name}.md"
@@ -253,6 +320,28 @@ def write_table(setting: Setting, records: Mapping[tuple[str, int], Mapping[str,
                     for trial, (won, loss) in enumerate(zip(result["success"], result["loss"])):
                         writer.writerow([task.name, name, seed, where, trial, int(won), loss])
     return page
+
+
+UNSAID = ("search", "options", "checkpoint", *FREE)
+"""Of a setting: what a page says elsewhere, or what is a place on one machine."""
+
+
+def _listed(values: Mapping[str, Any]) -> str:
+    return ", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items())
+
+
+def put_into(page: Path, table: Path, task: str) -> None:
+    """The table of a task, without its title, into a Markdown file, between its lines `<!-- table: <task> -->` and `<!-- end -->`.
+
+    Errors: DataError where the file has no such lines."""
+    begin, end = f"<!-- table: {task} -->\n", "<!-- end -->"
+    text = page.read_text() if page.is_file() else ""
+    head, found, rest = text.partition(begin)
+    _, closed, tail = rest.partition(end)
+    if not found or not closed:
+        raise DataError(f"page: {page}: expected a line '{begin.strip()}' and after it a line '{end}', found none")
+    content = table.read_text().split("\n", 2)[2]
+    page.write_text(f"{head}{begin}{content}{end}{tail}")
 
 
 def _mean(counts: Sequence[int], trials: int) -> str:

@@ -86,3 +86,61 @@ def test_the_common_path_sees_an_impact_between_two_frames_of_a_phone(made):
     true = np.array([film.camera.project((BODY.mean(0) + lifted(t))[None])[0] for t in times])
     off = exposure.path(times) - true
     assert np.abs(off - off.mean(0)).max() < 2.5
+
+
+def squashed(when: np.ndarray, radius: float = 30.0) -> np.ndarray:
+    """(160, 160, 4) premultiplied: a coloured disc, squashed and stretched along y with a period of five frames of 1/120 s, line
+    y as it is at when[y] [s]."""
+    x, y = np.meshgrid(np.arange(160) + 0.5 - 80, np.arange(160) + 0.5 - 80)
+    scale = 1 + 0.2 * np.cos(2 * np.pi * when * 120 / 5)[:, None]
+    u, v = x / radius, y / (radius * scale)
+    alpha = np.clip(radius * (1 - np.hypot(u, v)) + 0.5, 0, 1)
+    color = np.stack([0.5 + 0.4 * np.sin(7 * u) * np.cos(6 * v), 0.5 + 0.3 * np.cos(9 * v), 0.4 + 0.3 * np.sin(8 * u + 5 * v)], -1)
+    return np.concatenate([color * alpha[..., None], alpha[..., None]], -1).astype(np.float32)
+
+
+def test_a_deformation_is_read_line_by_line_and_bends_between_frames():
+    """A body that vibrates as it is read: its outline at a common time, from its neighbours as they were read; taken as read at one
+    time and even between two frames, it is wrong by more than twice as much."""
+    readout, time = 0.02, 0.0043
+    lines = readout * ((np.arange(160) + 0.5) / 160 - 0.5)
+    frames = np.arange(-1, 3) / 120
+    when = frames[:, None] + lines
+    pictures = [squashed(w) for w in when]
+    true = squashed(np.full(160, time))
+
+    def wrong(found):
+        return np.abs(found[..., 3] - true[..., 3]).sum()
+
+    middle = np.array([80.0, 80.0])
+    whole = resampling.blended(pictures, when, [1, 2], time, 1, middle, 30.0)
+    plain = resampling.blended(pictures[1:3], np.repeat(frames[1:3, None], 160, 1), [0, 1], time, 1, middle, 30.0)
+    across = [np.ascontiguousarray(p.transpose(1, 0, 2)) for p in pictures]
+    turned = resampling.blended(across, when, [1, 2], time, 0, middle, 30.0).transpose(1, 0, 2)
+    assert wrong(whole) < 0.45 * wrong(plain) and wrong(turned) < 0.45 * wrong(plain), (wrong(whole), wrong(turned), wrong(plain))
+    # a time that is one of the frames' own: its centre line stays, the others are brought to it
+    own = resampling.blended(pictures[:3], when[:3], [1], 0.0, 1, middle, 30.0)
+    still = squashed(np.zeros(160))
+    assert np.abs(own - still)[..., 3].sum() < 0.55 * np.abs(pictures[1] - still)[..., 3].sum()
+
+
+def test_weights_of_a_polynomial_through_frames():
+    nodes = np.array([[-1.0, -1.2], [0.0, 0.1], [1.0, 1.0], [2.5, 2.0]])
+    weights = resampling.lagrange(nodes, 0.4)
+    np.testing.assert_allclose(weights.sum(0), 1)
+    np.testing.assert_allclose((weights * nodes**3).sum(0), 0.4**3)
+    np.testing.assert_allclose(resampling.lagrange(nodes, 0.0)[:, 0], [0, 1, 0, 0], atol=1e-12)
+
+
+def test_a_hole_that_moving_has_made_is_closed_and_an_opening_is_not():
+    still = resampling.straight(squashed(np.zeros(160)))
+    opened = still.copy()
+    opened[78:81, 90:93] = 0
+    opened[60:100, 60:85, 3] = 0  # a handle's
+    found = resampling.without_tunnels(opened)
+    assert (found[78:81, 90:93, 3] == 255).all() and (found[60:100, 60:85, 3] == 0).all()
+    assert np.abs(found[78:81, 90:93, :3].astype(float) - still[78:81, 90:93, :3]).mean() < 12
+    untouched = np.ones((160, 160), bool)
+    untouched[78:81, 90:93] = False
+    np.testing.assert_array_equal(found[untouched], opened[untouched])
+    assert resampling.without_tunnels(still) is still

@@ -3,6 +3,7 @@ twin."""
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from small_bodies import small_body, start
 from mosa.data.builtin.drop import simulate
 from mosa.data.builtin.objects import object_named
 from mosa.data.builtin.takes import built
+from mosa.environments import arena as arenas
 from mosa.environments import command, study
 from mosa.environments.arena import LOST, Arena, Simulator, play, play_all, simulator_named, world_of
 from mosa.environments.pictures import film
@@ -309,3 +311,65 @@ def test_without_gymnasium_the_message_says_what_to_install(monkeypatch):
         by_reinforcement("sac", arena(), 8, 0)
     with pytest.raises(ConfigError, match="policy: expected one of gradient, cem, sac, ppo"):
         by_reinforcement("magic", arena(), 8, 0)
+
+
+def test_a_checkpoint_that_does_not_say_its_scene_is_named(monkeypatch):
+    """One line that names file and field; with a scene that is named it is not asked."""
+    learned = SimpleNamespace(config={"cfg": {}})
+    monkeypatch.setattr(arenas.Twin, "load", lambda *a: learned)
+    with pytest.raises(DataError, match=r"old\.ckpt: cfg\.scene: expected the scene that the twin was learned from, found none"):
+        simulator_named("truth", "old.ckpt")
+    for scene, error, message in (({"format": "builtin"}, DataError, r"old\.ckpt: cfg\.scene\.name: expected the name"),
+                                  ({"format": "transforms", "name": "x"}, ConfigError, "truth is known for built-in")):
+        learned.config["cfg"]["scene"] = scene
+        with pytest.raises(error, match=message):
+            simulator_named("truth", "old.ckpt")
+    learned.config.clear()
+    assert len(simulator_named("truth", "old.ckpt", scene="tiny", spacing=0.03).twin.body.rest) < 300
+
+
+def test_several_processes_share_a_table(tmp_path, monkeypatch):
+    """Jobs without a page; the page from them; and its table in a document, in place of the one that was there."""
+    bench = small_bench(tmp_path, monkeypatch)
+    study.make_jobs(bench, [("none", 0), ("learned", 0)], tmp_path)
+    assert not (tmp_path / "pushing.md").exists()
+    made = []
+    record = study._record
+    monkeypatch.setattr(study, "_record", lambda bench, name, seed: made.append(name) or record(bench, name, seed))
+    page = study.table(bench, ["learned", "isotropic"], [0], tmp_path, filmed=0)
+    assert made == ["isotropic"] and not list(tmp_path.glob("*.png"))
+    document = tmp_path / "doc.md"
+    document.write_text("before\n<!-- table: pushing -->\nold\n<!-- end -->\nafter\n")
+    for _ in range(2):
+        study.put_into(document, page, "pushing")
+    text = document.read_text()
+    assert text.startswith("before\n<!-- table: pushing -->\nOf 3 drawn trials") and text.endswith("<!-- end -->\nafter\n")
+    assert "old" not in text and text.count("\n| isotropic ") == 1
+    with pytest.raises(DataError, match=r"doc\.md: expected a line '<!-- table: hanging -->'"):
+        study.put_into(document, page, "hanging")
+
+
+def test_what_a_job_takes_is_said_before(tmp_path, monkeypatch):
+    bench = small_bench(tmp_path, monkeypatch)
+    assert study.expected(bench, "learned").endswith(": 6 episodes of 4 steps to search, 6 to test")
+    monkeypatch.setattr(study, "PATIENCE", -1.0)
+    assert "3 to test; search.iterations=" in study.expected(bench, "truth")
+    few = small_bench(tmp_path, monkeypatch, policy="sac", options={"steps": 4})
+    assert ": 2 episodes of 4 steps to search" in study.expected(few, "truth")
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("task", ["placement", "pushing"])
+def test_trials_on_a_gpu_are_those_of_a_cpu(task):
+    """Observations, losses and the slope of a policy's numbers."""
+    found = {}
+    for device in ("cpu", "cuda"):
+        made = simulator(precision=64)
+        made.twin.body.to(device)
+        check = Arena(made, task_named(task, made.twin.body.rest.cpu(), steps=4), 2)
+        policy = LinearPolicy(check.task).double()
+        played = play(check, drawn(check, 2), policy, differentiable=True)
+        slope = torch.autograd.grad(played.loss.mean(), policy.bias)[0]
+        found[device] = played.loss.detach().cpu(), slope.cpu()
+    for a, b in zip(*found.values()):
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-7)
