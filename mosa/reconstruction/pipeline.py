@@ -372,13 +372,15 @@ class SecondLook:
     device: torch.device | str = "cpu"
     progress: bool = True
 
-    def about(self, predicted: Tensor) -> MotionCues:
-        """predicted: (T, N, 3) [m] of the particles in the training frames."""
+    def about(self, predicted: Tensor, seen: Tensor | None = None) -> MotionCues:
+        """predicted: (T, N, 3) [m] of the particles in the training frames; seen: what was found of them before, None for the
+        reconstruction's own."""
         found, scene, settings = self.reconstruction, self.scene, self.settings
         splats, static = found.splats.to(self.device), found.static.to(self.device)
         windows = object_windows(scene, scene.training_cameras, scene.training_frames, margin=settings.margin).to(self.device)
         centres, scaffold, carried, reach = _moving_parts(scene, splats, static, settings)
-        seen, background = found.cues.positions.to(centres), scene.background.to(centres)
+        seen = (found.cues.positions if seen is None else seen).to(centres)
+        background = scene.background.to(centres)
         title = f"motion of {scene.sequence} about the prediction"
         with tqdm(total=settings.informed.iterations, desc=title, disable=not self.progress, leave=False) as steps:
             motion = informed_motion(scaffold, carried, windows, centres, background, predicted.to(seen), seen, settings.informed,

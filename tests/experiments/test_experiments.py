@@ -20,6 +20,7 @@ from mosa.experiments.collecting import Cell, best_of, records_of, table
 from mosa.experiments.page import verdict
 from mosa.experiments.printed import printed_table
 from mosa.experiments.specification import (
+    CROWD,
     Claim,
     Experiment,
     Figure,
@@ -142,17 +143,36 @@ def test_a_folder_s_name_does_not_depend_on_the_order_of_different_keys():
 
 
 def test_an_experiment_is_narrowed_to_options_and_seeds(tmp_path):
-    found = narrowed(experiment(), pairs(["method=ours", "scene=b"], ["method", "scene"]), (3,))
+    found = narrowed(experiment(), pairs(["method=ours", "scene=b"], [experiment()]), (3,))
     jobs = jobs_of(found, tmp_path)
     assert [job.overrides for job in jobs] == [("adapter=operator", "scene=b", "seed=3")]
 
 
+def test_what_is_said_of_one_experiment_holds_for_that_one(tmp_path):
+    both = [experiment(), experiment(name="other")]
+    only = pairs(["method=box", "other:method=ours", "scene=a"], both)
+    assert [[job.overrides[0] for job in jobs_of(narrowed(each, only, (0,)), tmp_path)] for each in both] == [
+        ["adapter=direct"], ["adapter=operator"]]  # fmt: skip
+    with pytest.raises(ConfigError, match=r"--only: expected AXIS=NAME,NAME with an axis of method, scene, or EXPERIMENT:AXIS"):
+        pairs(["nothing:method=ours"], both)
+
+
 def test_the_estimate_learns_from_the_jobs_that_are_complete(tmp_path):
     jobs = jobs_of(experiment(), tmp_path)
-    assert estimate(jobs, gpu=False, slots=1)[-1] == "8 jobs, 8 to run, about 36 minutes with 1 side by side"  # 4 of 3, 4 of 6
-    assert "about 6 minutes with 2" in estimate(jobs, gpu=True, slots=2)[-1]
+    assert estimate(jobs, [None], 1)[-1] == "8 jobs, 8 to run, about 36.0 minutes with 1 side by side"  # 4 of 3, 4 of 6
+    assert "about 6.0 minutes with 2" in estimate(jobs, [0, 1], 1)[-1]
     write_metrics(jobs[0], **{"time/fit_s": 300.0})  # six minutes in place of three
-    assert estimate(jobs, gpu=False, slots=1)[-1] == "8 jobs, 7 to run, about 66 minutes with 1 side by side"
+    assert estimate(jobs, [None], 1)[-1] == "8 jobs, 7 to run, about 66.0 minutes with 1 side by side"
+
+
+def test_the_estimate_knows_the_longest_job_and_what_shares_a_gpu(tmp_path):
+    jobs = jobs_of(experiment(), tmp_path)
+    assert "about 6.0 minutes with 8" in estimate(jobs, [None], 8)[-1]  # none is shorter for the others
+    assert f"about {2 * (1 + 3 * CROWD):.1f} minutes with 8" in estimate(jobs, [0, 1], 4)[-1]
+    assert f"about {2 * (1 + 3 * CROWD):.1f} minutes with 40" in estimate(jobs, [0, 1], 20)[-1]  # there are four on each
+    own = experiment(axes={**experiment().axes, "method": (Option("box", ("adapter=direct",), cost={"gpu": 5.0}),)})
+    one = jobs_of(narrowed(own, {"scene": ["a"]}, (0,)), tmp_path / "own")
+    assert "about 3.0 minutes" in estimate(one, [None], 1)[-1] and "about 5.0 minutes" in estimate(one, [0], 1)[-1]
 
 
 FAKE = """
