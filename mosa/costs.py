@@ -243,7 +243,9 @@ def seconds_of_fit(module: LitMosa, speeds: Speeds, frames: int, processes: int 
     networks = body.adapter is not None and not body.adapter.steady
     step = (BACKWARD * rollout + views * frames * speeds.picture) * -(-len(module.takes) // processes)
     again = module.config["cfg"]["reconstruction"].get("informed") or {}
-    total = KERNELS + 0.7 * again.get("iterations", 0) * again.get("views", 1) * len(module.takes) * (frames - 1) * speeds.picture
+    looks = max(1, sum(stage.looks_again for stage in module.stages))
+    each = 0.7 * again.get("iterations", 0) * again.get("views", 1) * len(module.takes) * (frames - 1) * speeds.picture
+    total = KERNELS + looks * each
     for stage in module.stages:
         adapted = ADAPTER_COST if stage.learns_adapter and networks else 1.0
         stiff = STIFFNESS_COST if stage.learns_adapter and body.adapter is not None else 1.0

@@ -310,7 +310,7 @@ class LitMosa(Restorable, L.LightningModule):
         columns = sum(b.size for b in planned.newton.blocks)
         together = SIDE_BY_SIDE if self.body.rest.is_cuda else planned.threads(columns)
         each = columns / together + 5  # the residuals, the noise, one or two steps that are tried, the distance
-        return len(planned.pairs) * (stage.iterations * each + (24 if planned.calibrating else 0))
+        return len(planned.pairs) * (stage.iterations * each + (24 if planned.calibrating and not stage.looks_again else 0))
 
     def report_newton(self, found: dict[str, float]) -> None:
         """Scalars of one iteration: cost, step, what the evidence found, parameters."""
