@@ -372,7 +372,7 @@ def test_a_claim_holds_only_by_more_than_the_spread_of_the_seeds():
     ):
         assert verdict(found, claim, {"rms [mm]": rows}).startswith(begins)
     one = verdict(found, claim, {"rms [mm]": cells(ours=(10.0, None, 1), prior=(20.0, None, 1), box=None)})
-    assert one == "holds, 10.0 against 20.0 (prior); not run: box; one seed"
+    assert one == "holds against those that were run, 10.0 against 20.0 (prior); not run: box; one seed"
     best = Claim("more is better", "PSNR", row="ours", against=("prior",))
     assert verdict(found, best, {"PSNR": cells(ours=(30.0, None, 1), prior=(31.0, None, 1))}).startswith("does not hold")
 
@@ -383,7 +383,9 @@ def test_a_bound_excuses_what_the_posterior_says_is_not_determined():
     said = verdict(experiment(), claim, {"PSNR": rows, "rms [mm]": cells(a=(1.0, None, 1), b=(25.0, None, 1), c=(1.0, None, 1))})
     assert said == ("does not hold, 1 of 3 within 5; not determined, and the posterior says so: b (40.0); beyond it: c (9.0)")
     alone = {"PSNR": cells(b=(40.0, None, 1)), "rms [mm]": cells(b=(25.0, None, 1))}
-    assert verdict(experiment(), claim, alone).startswith("holds where it is determined, 0 of 1")
+    assert verdict(experiment(), claim, alone).startswith("none is determined, 0 of 1")
+    both = {name: rows | cells(a=(3.0, None, 1)) for name, rows in alone.items()}
+    assert verdict(experiment(), claim, both).startswith("holds where it is determined, 1 of 2")
     assert verdict(experiment(), claim, {}) == "not run"
 
 
@@ -401,7 +403,8 @@ def test_the_page_has_what_was_run_and_says_what_was_not(tmp_path):
     assert "31.35 / 92.3" in text and "`the command`" in text and "](results/table_generalisation.png)" in text
     row = next(line for line in text.splitlines() if line.startswith("| NCLaw"))
     assert row.count("not run") >= 2
-    assert "our default has the smallest error of all: **holds, 10.0 against 20.0 (prior only), 30.0 (NeuMA); not run:" in text
+    least = "our default has the smallest error of all"
+    assert f"{least}: **holds against those that were run, 10.0 against 20.0 (prior only), 30.0 (NeuMA); not run:" in text
     assert "Ours: not run. `mosa-experiment table_ablation`" in text
     with pytest.raises(ConfigError, match="--results: expected a folder"):
         run(arguments(["--page", "--results", str(tmp_path / "nothing")]))
