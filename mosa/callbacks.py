@@ -57,10 +57,10 @@ class FitProgress(L.Callback):
         self.bar, self.shown = None, None
 
     def on_train_batch_start(self, trainer, module, batch, batch_idx) -> None:
-        if module.stage is not None and self.shown != module.stage.name:
+        if module.stage is not None and self.shown != module.stage_index:
             self._close()
-            self.shown = module.stage.name
-            self.bar = tqdm(total=module.stage.iterations, initial=len(module.losses), desc=f"fit {self.shown}", unit="it",
+            self.shown = module.stage_index
+            self.bar = tqdm(total=module.stage.iterations, initial=len(module.losses), desc=f"fit {module.stage.name}", unit="it",
                             dynamic_ncols=True, mininterval=2.0)
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:

@@ -20,6 +20,7 @@ from mosa.errors import ConfigError, DataError
 from mosa.keys import BODY
 from mosa.limits import machine_memory
 from mosa.modules.material import RIVALS
+from mosa.modules.retreat import MOST_HALVINGS
 from mosa.physics.constitutive.laws import law_named
 from mosa.rendering.lighting import LIGHT
 from mosa.rendering.spherical_harmonics import DEGREES
@@ -356,6 +357,19 @@ def check_identification(found: Any) -> None:
             raise ConfigError(f"mosa.identification.{name}: expected null, or for each rollout three tensors of finite numbers")
 
 
+def check_retreat(found: Any) -> None:
+    """Of a running stage of Adam: halvings of its steps, and the numbers before the last; None where none is kept. Errors:
+    ConfigError."""
+    if found is None:
+        return
+    parts(found, ("halvings", "before"), "mosa.retreat")
+    check({"mosa": {"retreat": {"halvings": found["halvings"]}}}, {"mosa.retreat.halvings": whole(0, MOST_HALVINGS)})
+    before = found["before"]
+    if before is not None and not (isinstance(before, list) and all(
+        isinstance(t, Tensor) and t.is_floating_point() and bool(torch.isfinite(t).all()) for t in before)):  # fmt: skip
+        raise ConfigError("mosa.retreat.before: expected null, or a list of finite tensors")
+
+
 def check_resumed(checkpoint: Mapping[str, Any], path: str | Path) -> None:
     """What a fit goes on from is there. Errors: DataError naming what is missing."""
     try:
@@ -368,6 +382,7 @@ def check_resumed(checkpoint: Mapping[str, Any], path: str | Path) -> None:
               {f"mosa.{name}": kind for name, kind in GOING_ON.items()})
         check_cues(saved.get("cues"))
         check_identification(saved.get("identification"))
+        check_retreat(saved.get("retreat"))
         if saved.get("compared"):
             law = saved["config"]["cfg"]["prior"]["law"] if "config" in saved else None
             if not isinstance(law, str):

@@ -19,7 +19,7 @@ from mosa.modules.criteria import Criterion
 from mosa.modules.heterogeneity import HeterogeneityField, HeterogeneitySettings
 from mosa.modules.identification import IdentificationSettings, few_numbers
 from mosa.modules.material import Material
-from mosa.modules.stages import STAGES, Stage
+from mosa.modules.stages import STAGES, Stage, recalibrations
 from mosa.modules.stiffness_modes import StiffnessModes
 from mosa.modules.terms import check_terms
 from mosa.physics.constitutive.laws import law_named
@@ -179,7 +179,7 @@ def build_stages(
     stages = [known_keys(f"fit.{name}", Stage, fit[name], name) for name in STAGES]
     learned = {s.name: s.learns(heterogeneity, adapter) for s in stages}
     wanted = [s for s in stages if s.iterations > 0 and (s.calibrates or any(part is not None for part in learned[s.name]))]
-    stages = [s.resolved(all(map(few_numbers, learned[s.name]))) for s in wanted]
+    stages = recalibrations([s.resolved(all(map(few_numbers, learned[s.name]))) for s in wanted])
     if searching and stages and not stages[0].newton:
         raise ConfigError("prior=auto: expected fit.prior.optimizer=auto or gauss_newton, which compares candidates; found adam")
     if not stages or not stages[0].calibrates:

@@ -246,7 +246,7 @@ def newton_rollouts(module: LitMosa, stage: Stage) -> float:
     columns = sum(b.size for b in planned.newton.blocks)
     together = SIDE_BY_SIDE if module.body.rest.is_cuda else planned.threads(columns)
     each = columns / together + 5  # the residuals, the noise, one or two steps that are tried, the distance
-    return len(planned.pairs) * (stage.iterations * each + (24 if planned.calibrating else 0))
+    return len(planned.pairs) * (stage.iterations * each + (24 if planned.calibrating and not stage.looks_again else 0))
 
 
 def seconds_of_fit(module: LitMosa, speeds: Speeds, frames: int, processes: int = 1) -> float:
@@ -256,7 +256,9 @@ def seconds_of_fit(module: LitMosa, speeds: Speeds, frames: int, processes: int 
     networks = body.adapter is not None and not body.adapter.steady
     step = (BACKWARD * rollout + views * frames * speeds.picture) * -(-len(module.takes) // processes)
     again = module.config["cfg"]["reconstruction"].get("informed") or {}
-    total = KERNELS + 0.7 * again.get("iterations", 0) * again.get("views", 1) * len(module.takes) * (frames - 1) * speeds.picture
+    looks = max(1, sum(stage.looks_again for stage in module.stages))
+    each = 0.7 * again.get("iterations", 0) * again.get("views", 1) * len(module.takes) * (frames - 1) * speeds.picture
+    total = KERNELS + looks * each
     for stage in module.stages:
         adapted = ADAPTER_COST if stage.learns_adapter and networks else 1.0
         stiff = STIFFNESS_COST if stage.learns_adapter and body.adapter is not None else 1.0

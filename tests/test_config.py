@@ -107,6 +107,14 @@ def test_a_stage_takes_gauss_newton_where_all_it_learns_has_few_numbers(adapter,
     assert {s.optimizer for s in build_stages(adam, heterogeneity=None, adapter=build_adapter({"name": adapter}))} == {"adam"}
 
 
+@pytest.mark.parametrize("override, adapter, expected", [(None, None, 3), ("fit.prior.looks=0", None, 0), ("fit=adam", None, 0),
+                                                         (None, "hyperelastic", 0)])  # fmt: skip
+def test_a_calibration_looks_again_where_it_is_all_there_is(override, adapter, expected):
+    fit = composed(*([override] if override else []))["fit"]
+    stages = build_stages(fit, heterogeneity=None, adapter=build_adapter({"name": adapter}))
+    assert [stage.name for stage in stages if stage.looks_again] == ["prior"] * expected and not stages[0].looks_again
+
+
 @pytest.mark.parametrize("group_name", ["adapter", "ablation", "criterion", "debug", "experiment", "fit", "logger", "prior",
                                         "reconstruction", "rendering", "scene", "simulation", "trainer"])  # fmt: skip
 def test_every_option_passes_the_checks_before_a_run(group_name):

@@ -30,7 +30,8 @@ def arguments(words: list[str]) -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=1, help="jobs side by side, on each device where there are devices")
     parser.add_argument("--devices", default=None, help="GPUs by number, as 0,1; default: the CPU")
     parser.add_argument("--seeds", default=None, help="instead of the experiment's, as 0,1,2")
-    parser.add_argument("--only", action="append", default=[], metavar="AXIS=NAME,NAME", help="these of an axis")
+    parser.add_argument("--only", action="append", default=[], metavar="AXIS=NAME,NAME",
+                        help="these of an axis; EXPERIMENT:AXIS=NAME,NAME of one experiment's alone")
     parser.add_argument(
         "--set",
         action="append",
@@ -85,14 +86,13 @@ def run(options: argparse.Namespace) -> int:
     experiments = [load_experiment(folder, name, quick=options.quick) for name in names]
     seeds = None if options.seeds is None else tuple(whole_numbers("--seeds", options.seeds))
     experiments = [
-        narrowed(e, pairs(options.only, [axis for each in experiments for axis in each.axes]), seeds) for e in experiments
+        narrowed(e, pairs(options.only, experiments), seeds) for e in experiments
     ]
     more = [*options.overrides, *(["trainer=gpu"] if devices != [None] else [])]
     planned = {e.name: jobs_of(e, options.runs, more) for e in experiments}
     jobs = list({job.folder: job for found in planned.values() for job in found}.values())
     check_overrides(options.overrides, list(jobs[0].overrides) if jobs else [])
-    slots = len(devices) * options.jobs
-    for line in estimate(jobs, gpu=devices != [None], slots=slots):
+    for line in estimate(jobs, devices, options.jobs):
         print(line, flush=True)
     results = options.results or (options.runs / "results" if options.quick else RESULTS)
     if options.dry_run:

@@ -121,10 +121,10 @@ def ahead(figure: Figure, claim: Claim, rows: Mapping[str, Mapping[str, Cell | N
     behind = [row for row, cell in known.items() if not sign * (mine.mean - cell.mean) > 0]
     close = [row for row, cell in known.items() if row not in behind and mine.sd is not None and cell.sd is not None
              and abs(mine.mean - cell.mean) <= math.hypot(mine.sd, cell.sd)]  # fmt: skip
-    word = "does not hold" if behind else "within the spread" if close else "holds"
+    missing = [row for row in claim.against if row not in known]
+    word = "does not hold" if behind else "within the spread" if close else "holds" + bool(missing) * " against those that were run"
     text = f"{word}, {mine.text(figure.decimals)} against " + ", ".join(
         f"{cell.text(figure.decimals)} ({row})" for row, cell in known.items())
-    missing = [row for row in claim.against if row not in known]
     return text + (f"; {NOT_RUN}: {', '.join(missing)}" if missing else "") + ("; one seed" if mine.sd is None else "")
 
 
@@ -138,7 +138,8 @@ def within(claim: Claim, rows: Mapping[str, Mapping[str, Cell | None]], tables: 
         row for row, cell in above.items()
         if (sd := place_of(tables.get(claim.unless, {}).get(row, {}), claim.column)) is not None and 2 * sd.mean >= cell.mean]
     wrong = {row: cell for row, cell in above.items() if row not in unsure}
-    text = f"{'holds' if not above else 'does not hold' if wrong else 'holds where it is determined'}, "
+    undetermined = "none is determined" if len(unsure) == len(known) else "holds where it is determined"
+    text = f"{'holds' if not above else 'does not hold' if wrong else undetermined}, "
     text += f"{len(known) - len(above)} of {len(known)} within {claim.most:g}"
     if unsure:
         text += "; not determined, and the posterior says so: " + ", ".join(f"{row} ({above[row].text(1)})" for row in unsure)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,13 +22,17 @@ SHARED = "_shared"
 @dataclass(frozen=True)
 class Option:
     """A place on an axis. overrides: of train.py; prefix: of the figures to read (`prior/`: the calibrated prior of the same run);
-    cost: of a job over the experiment's minutes; value: of a numeric axis."""
+    cost: of a job over the experiment's minutes, where it differs {cpu: , gpu: }; value: of a numeric axis."""
 
     name: str
     overrides: tuple[str, ...] = ()
     prefix: str = ""
-    cost: float = 1.0
+    cost: float | Mapping[str, float] = 1.0
     value: float | None = None
+
+    def cost_on(self, device: str) -> float:
+        """device: cpu | gpu."""
+        return float(self.cost.get(device, 1.0)) if isinstance(self.cost, Mapping) else float(self.cost)
 
 
 @dataclass(frozen=True)
@@ -59,8 +64,8 @@ class Claim:
 @dataclass(frozen=True)
 class Experiment:
     """rows, columns: axes of the table (every other one but the seed is a table of its own); printed: entry of printed.yaml; note:
-    how the data differ from the paper's; minutes: of a job on cpu and gpu; analysis: a function of `analyses`, or None; claims:
-    for the page of results."""
+    how the data differ from the paper's; minutes: of a job that runs alone, on cpu and gpu; analysis: a function of `analyses`, or
+    None; claims: for the page of results."""
 
     name: str
     title: str
@@ -189,20 +194,24 @@ def chosen(where: str, options: tuple[Option, ...], only: Sequence[str] | None) 
     return tuple(known[str(name)] for name in only)
 
 
-def pairs(words: Sequence[str], axes: Sequence[str]) -> dict[str, list[str]]:
-    """{axis: names} of words AXIS=NAME,NAME. Errors: ConfigError."""
+def pairs(words: Sequence[str], experiments: Sequence[Experiment]) -> dict[str, list[str]]:
+    """{axis: names} of words AXIS=NAME,NAME, {experiment:axis: names} of words EXPERIMENT:AXIS=NAME,NAME. Errors: ConfigError."""
+    axes = dict.fromkeys(axis for each in experiments for axis in each.axes)
+    known = [*axes, *(f"{each.name}:{axis}" for each in experiments for axis in each.axes)]
     found = {}
     for word in words:
         axis, mark, names = word.partition("=")
-        if not mark or axis not in axes:
-            raise ConfigError(f"--only: expected AXIS=NAME,NAME with an axis of {', '.join(dict.fromkeys(axes))}, found {word!r}")
+        if not mark or axis not in known:
+            raise ConfigError(f"--only: expected AXIS=NAME,NAME with an axis of {', '.join(axes)}, or EXPERIMENT:AXIS=NAME,NAME, "
+                              f"found {word!r}")
         found[axis] = names.split(",")
     return found
 
 
 def narrowed(experiment: Experiment, only: Mapping[str, Sequence[str]], seeds: tuple[int, ...] | None) -> Experiment:
-    """With these options and seeds alone."""
-    axes = {axis: chosen(f"--only {axis}", options, only.get(axis)) for axis, options in experiment.axes.items()}
+    """With these options (of `pairs`; those that name the experiment go first) and seeds alone."""
+    axes = {axis: chosen(f"--only {axis}", options, only.get(f"{experiment.name}:{axis}", only.get(axis)))
+            for axis, options in experiment.axes.items()}
     return replace(experiment, axes=axes, seeds=experiment.seeds if seeds is None else seeds)
 
 
@@ -216,9 +225,6 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
         for seed in experiment.seeds:
             overrides = (*experiment.common, *(each for option in options for each in option.overrides), *more, f"seed={seed}")
             folder = runs / folder_name(overrides)
-            cost = 1.0
-            for option in options:
-                cost *= option.cost
             known = found.get(folder)
             if known is not None:
                 found[folder] = replace(known, places=(*known.places, place))
@@ -227,7 +233,8 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
             rest = [
                 each for each in overrides if each.split(".")[0].split("=")[0] in ("scene", "reconstruction", "seed", "simulation")
             ]
-            minutes = {device: value * cost for device, value in experiment.minutes.items()}
+            minutes = {device: value * math.prod(option.cost_on(device) for option in options)
+                       for device, value in experiment.minutes.items()}
             found[folder] = Job(folder, overrides, seed, (place,), minutes, " ".join([scene, *rest]))
     return list(found.values())
 
@@ -269,21 +276,29 @@ def total_minutes(jobs: Sequence[Job]) -> float:
     return sum(minutes_taken(job) or 0.0 for job in jobs)
 
 
-def estimate(jobs: Sequence[Job], gpu: bool, slots: int) -> list[str]:
-    """A line for each job and one for all of them. Minutes of jobs to come are scaled by those that are complete."""
-    device = "gpu" if gpu else "cpu"
+CROWD = 0.15
+"""By how much each further job on a GPU makes all of them slower: of what takes 1.0 to 1.6 minutes alone, twelve side by side on an
+H200 took 1.5 to 4.3."""
+
+
+def estimate(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: int) -> list[str]:
+    """A line for each job and one for all of them, in the order and places that they run in (`running.run_jobs`). Minutes of jobs
+    to come are scaled by those that are complete; a GPU's also by how many jobs it has at a time."""
+    device, slots = "cpu" if list(devices) == [None] else "gpu", len(devices) * side_by_side
     taken = {job.folder: minutes_taken(job) for job in jobs}
     done = [(taken[job.folder], job.minutes[device]) for job in jobs if taken[job.folder] is not None]
-    scale = sum(t for t, _ in done) / sum(m for _, m in done) if done else 1.0
-    lines, total = [], 0.0
+    left = sum(1 for job in jobs if taken[job.folder] is None)
+    crowd = 1 + CROWD * (min(side_by_side, -(-left // len(devices))) - 1) if device == "gpu" and left else 1.0
+    scale = sum(t for t, _ in done) / sum(m for _, m in done) if done else crowd
+    lines, ends = [], [0.0] * slots
     for job in jobs:
         known = taken[job.folder]
         expected = job.minutes[device] * scale
-        total += 0.0 if known is not None else expected
+        if known is None:
+            ends[ends.index(min(ends))] += expected
         state = f"complete, {known:.1f} min" if known is not None else f"about {expected:.1f} min"
         lines.append(f"{job.folder.name}: {state}: {' '.join(job.overrides)}")
-    left = sum(1 for job in jobs if taken[job.folder] is None)
-    return [*lines, f"{len(jobs)} jobs, {left} to run, about {total / slots:.0f} minutes with {slots} side by side"]
+    return [*lines, f"{len(jobs)} jobs, {left} to run, about {max(ends):.1f} minutes with {slots} side by side"]
 
 
 def read_job(job: Job) -> dict[str, float | str] | None:

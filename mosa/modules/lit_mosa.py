@@ -22,6 +22,7 @@ from mosa.modules.observer import deformed_covariances, observe
 from mosa.modules.penalties import MISFIT, pool
 from mosa.modules.residuals import SAMPLES
 from mosa.modules.restorable import Restorable
+from mosa.modules.retreat import Retreat
 from mosa.modules.stages import Stage
 from mosa.modules.takes import Take, seen_again, with_positions
 from mosa.modules.terms import Step, check_terms, evaluate_terms
@@ -62,6 +63,7 @@ class LitMosa(Restorable, L.LightningModule):
         self.identification: Identification | None = None  # of the running stage, where it is Gauss-Newton's
         self.saved_identification: dict | None = None  # its state in the checkpoint that the fit goes on from
         self.posterior: Posterior | None = None
+        self.retreat, self.saved_retreat = Retreat(), None  # of the running stage, where it is Adam's
         self.informed = False  # whether the takes have the cues about the calibrated backbone
         self.compared: dict[str, float] = {}  # mean distance [m] of the calibrated candidates for the backbone
 
@@ -71,6 +73,8 @@ class LitMosa(Restorable, L.LightningModule):
         what it learns from, none where it is only used. Errors: ConfigError naming the key."""
         cfg = config["cfg"]
         stages = build_stages(cfg["fit"], body.heterogeneity, body.adapter)
+        if not (cfg["reconstruction"].get("informed") or {}).get("iterations", 0):
+            stages = [stage for stage in stages if not stage.looks_again]
         return cls(body, takes=takes, world=build_world(config["world"]), background=background, stages=stages,
                    weights=cfg["losses"], clip=cfg["fit"]["clip"], config=config, criterion=build_criterion(cfg),
                    settings=build_identification(cfg))
@@ -86,7 +90,7 @@ class LitMosa(Restorable, L.LightningModule):
                               "steps_done": self.steps_done, "particles": len(self.body.rest), "misfit": self.misfit,
                               "start": self.takes[0].start.written(),
                               "identification": self.identification.state() if self.identification else None,
-                              "compared": self.compared,
+                              "compared": self.compared, "retreat": self.retreat.written(),
                               "cues": [take.cues.positions.cpu() for take in self.takes] if self.informed else None,
                               "posterior": self.posterior.written() if self.posterior else None,
                               "splats": self.body.splats.written() if self.body.splats is not None else None}
@@ -101,6 +105,7 @@ class LitMosa(Restorable, L.LightningModule):
         self.stage_index, self.losses, self.steps_done = saved["stage"], list(saved["losses"]), saved["steps_done"]
         self.misfit = saved.get("misfit", MISFIT)
         self.saved_identification = saved.get("identification")
+        self.saved_retreat = saved.get("retreat")
         self.compared = dict(saved.get("compared") or {})
         if self.compared and (candidates := self.body.material.candidates):
             if (law := saved["config"]["cfg"]["prior"]["law"]) not in candidates:
@@ -112,7 +117,8 @@ class LitMosa(Restorable, L.LightningModule):
         self.posterior = Posterior.read(saved["posterior"]) if saved.get("posterior") else None
         if saved.get("cues") is not None and self.takes:
             self.takes, self.informed = with_positions(self.takes, saved["cues"]), True
-        elif self.losses and self.stage is not None and not self.stage.calibrates and any(take.again for take in self.takes):
+        elif (self.losses and self.stage is not None and (self.stage.looks_again or not self.stage.calibrates)
+              and any(take.again for take in self.takes)):  # fmt: skip
             raise ConfigError("ckpt_path: expected the motion that reconstruction.informed finds, as this stage began after it, "
                               "found none in the checkpoint: set reconstruction.informed.iterations=0, as the run had it")
 
@@ -146,8 +152,12 @@ class LitMosa(Restorable, L.LightningModule):
             return
         optimizer = self.optimizers()
         optimizer = optimizer[self.stage_index] if isinstance(optimizer, list) else optimizer
+        learned = [p for group in optimizer.param_groups for p in group["params"]]
+        if self.saved_retreat is not None:
+            self.retreat.read(self.saved_retreat, learned)
+            self.saved_retreat = None
         for group in optimizer.param_groups:
-            group["lr"] = group["rate"] * stage.decay(iteration)
+            group["lr"] = group["rate"] * stage.decay(iteration) * self.retreat.share
         optimizer.zero_grad()
         figures, failure = {}, None
         try:
@@ -156,17 +166,45 @@ class LitMosa(Restorable, L.LightningModule):
                     figures[name] = figures.get(name, 0.0) + weight * value
         except MosaError as error:
             failure = error
-        parallel.agree(failure)
-        terms = parallel.exchange((p for group in optimizer.param_groups for p in group["params"]), figures)
-        loss = terms.pop("loss")
-        norms = self.gradient_norms(optimizer, stage, iteration)
-        optimizer.step()
-        self.body.contact.project()
-        self.losses.append(float(loss))
-        self.steps_done += 1
-        self.report(stage, iteration, terms, loss, norms)
+        try:
+            parallel.agree(failure)
+            terms = parallel.exchange(learned, figures)
+            norms = self.gradient_norms(optimizer, stage, iteration)
+        except SimulationDiverged as error:  # on every rank alike
+            if not self.retreat.back(optimizer, learned):
+                raise
+            log.warning("stage %s, iteration %d: the step before is taken back, and steps are half as long from here: %s",
+                        stage.name, iteration, error)
+            self.losses.append(self.losses[-1])
+            self.steps_done += 1
+        else:
+            loss = terms.pop("loss")
+            self.retreat.note(learned)
+            optimizer.step()
+            self.body.contact.project()
+            self.losses.append(float(loss))
+            self.steps_done += 1
+            self.report(stage, iteration, terms, loss, norms)
         if stage.ended(self.losses):
+            self.try_last_step(stage, optimizer, learned)
             self.finish(stage)
+
+    def try_last_step(self, stage: Stage, optimizer: torch.optim.Optimizer, learned: Sequence[Tensor]) -> None:
+        """Take the last step of a stage back where the body cannot be simulated after it: no other one would find out."""
+        failure = None
+        try:
+            model = self.body.model().only(heterogeneity=stage.learns_heterogeneity, adapter=stage.learns_adapter)
+            with torch.no_grad():
+                for take in self.takes:
+                    self.body.simulate(take.start, self.world, len(take.cues.positions), take.frame_dt, model=model)
+        except MosaError as error:
+            failure = error
+        try:
+            parallel.agree(failure)
+        except SimulationDiverged as error:
+            if not self.retreat.back(optimizer, learned):
+                raise
+            log.warning("stage %s: its last step is taken back: %s", stage.name, error)
 
     def newton_step(self, stage: Stage, iteration: int) -> None:
         """One iteration of Gauss-Newton: of all numbers on all takes, without images."""
@@ -196,7 +234,7 @@ class LitMosa(Restorable, L.LightningModule):
         identification = self.identifying(stage)
         if saved is not None:
             self.go_on(identification, saved)
-        elif stage.calibrates and not searched:
+        elif stage.calibrates and not searched and not stage.looks_again:
             identification.search()
         return identification
 
@@ -327,7 +365,7 @@ class LitMosa(Restorable, L.LightningModule):
         """What a stage starts from."""
         if stage.start is not None:
             self.body.thaw(stage.start)
-        if not stage.calibrates:
+        if stage.looks_again or not (stage.calibrates or self.informed):
             self.inform()
         adapter, material = self.body.adapter, self.body.material
         if stage.learns_adapter and adapter is not None:
@@ -340,7 +378,7 @@ class LitMosa(Restorable, L.LightningModule):
 
     def inform(self) -> None:
         """The cues of the takes once more, about what the calibrated backbone predicts."""
-        if not self.informed and any(take.again for take in self.takes):
+        if any(take.again for take in self.takes):
             self.takes, self.informed = [seen_again(take, self.body, self.world) for take in self.takes], True
 
     @torch.no_grad()
@@ -364,6 +402,7 @@ class LitMosa(Restorable, L.LightningModule):
         for name in stage.keeps:
             self.body.freeze(name)
         self.stage_index, self.losses, self.identification = self.stage_index + 1, [], None
+        self.retreat = Retreat()
 
     def on_train_start(self) -> None:
         if self.stage is None:  # a run that was stopped after its fit

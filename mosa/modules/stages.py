@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import MISSING, dataclass, replace
+from dataclasses import MISSING, dataclass, fields, replace
 
 from mosa.errors import ConfigError
 from mosa.schema import COUNT, WEIGHT, check_knobs, knob, one_of, or_null, whole
@@ -19,7 +19,8 @@ class Stage:
     newton_iterations: of Gauss-Newton, at most. The rates are Adam's. lr: global parameters; lr_networks: heterogeneity field;
     lr_adapter: adapter; lr_contact [cells]: contact offset;
     converged: relative change of the mean loss of 10 iterations below which the stage ends (0: run all iterations);
-    start: backbone whose parameters the stage starts from (joint: prior | prior_eta).
+    start: backbone whose parameters the stage starts from (joint: prior | prior_eta); looks: of prior, where nothing else is
+    learned and Gauss-Newton does: how often it goes on from the motion found once more about its own result (`Recalibration`).
     """
 
     name: str
@@ -32,6 +33,7 @@ class Stage:
     start: str | None = knob(None, or_null(one_of("prior", "prior_eta")))
     optimizer: str = knob("auto", one_of("auto", "gauss_newton", "adam"))
     newton_iterations: int = knob(8, COUNT)
+    looks: int = knob(0, whole(0))
 
     def __post_init__(self) -> None:
         if self.name not in STAGES:
@@ -42,6 +44,11 @@ class Stage:
     def calibrates(self) -> bool:
         """Whether the stage learns the global parameters alone, from free rollouts of which more and more frames count."""
         return self.name == "prior"
+
+    @property
+    def looks_again(self) -> bool:
+        """Whether it is a calibration that begins with the motion found once more, each time anew."""
+        return False
 
     @property
     def learns_heterogeneity(self) -> bool:
@@ -98,3 +105,21 @@ class Stage:
             return False
         last, before = sum(losses[-10:]) / 10, sum(losses[-20:-10]) / 10
         return abs(last - before) < self.converged * abs(before)
+
+
+@dataclass(frozen=True)
+class Recalibration(Stage):
+    """A calibration that goes on from the one before, with the motion found once more about that one's result. What flows or yields
+    is seen too poorly by a reconstruction that knows no mechanics; each look lets the calibrated law say what images do not."""
+
+    @property
+    def looks_again(self) -> bool:
+        return True
+
+
+def recalibrations(stages: list[Stage]) -> list[Stage]:
+    """With those that follow a calibration which is all there is, as many as it asks for."""
+    if len(stages) != 1 or not stages[0].newton:
+        return stages
+    own = {f.name: getattr(stages[0], f.name) for f in fields(Stage)}
+    return stages + [Recalibration(**own) for _ in range(stages[0].looks)]

@@ -39,7 +39,7 @@ def seen_again(take: Take, body: Body, world: World) -> Take:
     model = body.model().only(heterogeneity=False, adapter=False)
     with torch.no_grad():
         rollout = body.simulate(take.start, world, len(take.cues.positions), take.frame_dt, model=model)
-    cues = take.again.about(rollout.x)
+    cues = take.again.about(rollout.x, take.cues.positions)
     moved = float((cues.positions - take.cues.positions).square().sum(-1).mean().sqrt())
     log.info("motion of %s once more, about the calibrated backbone's: moved by %.2g mm (root mean square)",
              take.again.scene.sequence, 1e3 * moved)

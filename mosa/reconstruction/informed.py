@@ -28,6 +28,9 @@ WORSE, SLACK = 1.2, 0.005
 the gorilla, whose images tell least, both are 0.017; flattened and inverted predictions of a block end at 0.11 and 0.13."""
 COMPARED = 2
 """Views of every frame on which the two are compared."""
+AS_IT_IS = 0.8
+"""A frame of a prediction stays where it is if its loss of images there is so many times that of the frame laid onto what was seen:
+what was seen of a liquid's late frames may be a tenth of a metre off."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +86,21 @@ def informed_motion(
     predicted, seen: (T, N, 3) [m] positions of the particles, a simulation's and those that were found without one.
     """
     motion = ModalMotion(offsets, scaffold.modes.energy, reach=reach)
-    project(motion, scaffold, laid_onto(predicted, seen))
     every = torch.arange(len(offsets), device=offsets.device)
+    chosen = torch.cat([(windows.frame == t).nonzero()[:COMPARED, 0] for t in every[1:].tolist()])
+    compared, alone = windows.select(chosen), replace(dynamic, elastic=0.0, bending=0.0)
+
+    @torch.no_grad()
+    def losses(positions: Tensor) -> Tensor:
+        """(T,) of images, 0 for the first frame, with the particles near `positions`."""
+        project(motion, scaffold, positions)
+        objective = Objective(motion, carried, scaffold, background, alone)
+        found = [objective(t[None], each := compared.of_frame(int(t)), torch.zeros_like(each.frame)) for t in every[1:]]
+        return torch.stack([torch.zeros_like(found[0]), *found])
+
+    laid = laid_onto(predicted, seen)
+    better = losses(predicted) < AS_IT_IS * losses(laid)
+    project(motion, scaffold, torch.where(better[:, None, None], predicted, laid))
     with torch.no_grad():
         deformation = motion.displacement(every, scaffold.modes)[1]
         about = Predicted(motion.coefficients(every).clone(), torch.linalg.inv(deformation))
@@ -96,8 +112,6 @@ def informed_motion(
              progress)
     first = ModalMotion(offsets, scaffold.modes.energy, reach=reach)
     project(first, scaffold, seen)
-    chosen = torch.cat([(windows.frame == t).nonzero()[:COMPARED, 0] for t in every[1:].tolist()])
-    compared, alone = windows.select(chosen), replace(weights, elastic=0.0, bending=0.0)
 
     @torch.no_grad()
     def loss(of: ModalMotion) -> float:

@@ -116,12 +116,14 @@ class SecondLook:
     device: torch.device | str = "cpu"
     progress: bool = True
 
-    def about(self, predicted: Tensor) -> MotionCues:
-        """predicted: (T, N, 3) [m] of the particles in the training frames."""
+    def about(self, predicted: Tensor, seen: Tensor | None = None) -> MotionCues:
+        """predicted: (T, N, 3) [m] of the particles in the training frames; seen: what was found of them before, None for the
+        reconstruction's own."""
         found, scene, settings = self.reconstruction, self.scene, self.settings
         parts = found.moving
         windows = object_windows(scene, scene.training_cameras, scene.training_frames, margin=settings.margin).to(self.device)
-        seen, background = found.cues.positions.to(parts.centres), scene.background.to(parts.centres)
+        seen = (found.cues.positions if seen is None else seen).to(parts.centres)
+        background = scene.background.to(parts.centres)
         title = f"motion of {scene.sequence} about the prediction"
         with tqdm(total=settings.informed.iterations, desc=title, disable=not self.progress, leave=False) as steps:
             motion = informed_motion(parts.scaffold, parts.carried, windows, parts.centres, background, predicted.to(seen), seen,

@@ -20,6 +20,7 @@ from mosa.experiments.collecting import Cell, best_of, records_of, table
 from mosa.experiments.page import verdict
 from mosa.experiments.printed import printed_table
 from mosa.experiments.specification import (
+    CROWD,
     Claim,
     Experiment,
     Figure,
@@ -142,17 +143,36 @@ def test_a_folder_s_name_does_not_depend_on_the_order_of_different_keys():
 
 
 def test_an_experiment_is_narrowed_to_options_and_seeds(tmp_path):
-    found = narrowed(experiment(), pairs(["method=ours", "scene=b"], ["method", "scene"]), (3,))
+    found = narrowed(experiment(), pairs(["method=ours", "scene=b"], [experiment()]), (3,))
     jobs = jobs_of(found, tmp_path)
     assert [job.overrides for job in jobs] == [("adapter=operator", "scene=b", "seed=3")]
 
 
+def test_what_is_said_of_one_experiment_holds_for_that_one(tmp_path):
+    both = [experiment(), experiment(name="other")]
+    only = pairs(["method=box", "other:method=ours", "scene=a"], both)
+    assert [[job.overrides[0] for job in jobs_of(narrowed(each, only, (0,)), tmp_path)] for each in both] == [
+        ["adapter=direct"], ["adapter=operator"]]  # fmt: skip
+    with pytest.raises(ConfigError, match=r"--only: expected AXIS=NAME,NAME with an axis of method, scene, or EXPERIMENT:AXIS"):
+        pairs(["nothing:method=ours"], both)
+
+
 def test_the_estimate_learns_from_the_jobs_that_are_complete(tmp_path):
     jobs = jobs_of(experiment(), tmp_path)
-    assert estimate(jobs, gpu=False, slots=1)[-1] == "8 jobs, 8 to run, about 36 minutes with 1 side by side"  # 4 of 3, 4 of 6
-    assert "about 6 minutes with 2" in estimate(jobs, gpu=True, slots=2)[-1]
+    assert estimate(jobs, [None], 1)[-1] == "8 jobs, 8 to run, about 36.0 minutes with 1 side by side"  # 4 of 3, 4 of 6
+    assert "about 6.0 minutes with 2" in estimate(jobs, [0, 1], 1)[-1]
     write_metrics(jobs[0], **{"time/fit_s": 300.0})  # six minutes in place of three
-    assert estimate(jobs, gpu=False, slots=1)[-1] == "8 jobs, 7 to run, about 66 minutes with 1 side by side"
+    assert estimate(jobs, [None], 1)[-1] == "8 jobs, 7 to run, about 66.0 minutes with 1 side by side"
+
+
+def test_the_estimate_knows_the_longest_job_and_what_shares_a_gpu(tmp_path):
+    jobs = jobs_of(experiment(), tmp_path)
+    assert "about 6.0 minutes with 8" in estimate(jobs, [None], 8)[-1]  # none is shorter for the others
+    assert f"about {2 * (1 + 3 * CROWD):.1f} minutes with 8" in estimate(jobs, [0, 1], 4)[-1]
+    assert f"about {2 * (1 + 3 * CROWD):.1f} minutes with 40" in estimate(jobs, [0, 1], 20)[-1]  # there are four on each
+    own = experiment(axes={**experiment().axes, "method": (Option("box", ("adapter=direct",), cost={"gpu": 5.0}),)})
+    one = jobs_of(narrowed(own, {"scene": ["a"]}, (0,)), tmp_path / "own")
+    assert "about 3.0 minutes" in estimate(one, [None], 1)[-1] and "about 5.0 minutes" in estimate(one, [0], 1)[-1]
 
 
 FAKE = """
@@ -352,7 +372,7 @@ def test_a_claim_holds_only_by_more_than_the_spread_of_the_seeds():
     ):
         assert verdict(found, claim, {"rms [mm]": rows}).startswith(begins)
     one = verdict(found, claim, {"rms [mm]": cells(ours=(10.0, None, 1), prior=(20.0, None, 1), box=None)})
-    assert one == "holds, 10.0 against 20.0 (prior); not run: box; one seed"
+    assert one == "holds against those that were run, 10.0 against 20.0 (prior); not run: box; one seed"
     best = Claim("more is better", "PSNR", row="ours", against=("prior",))
     assert verdict(found, best, {"PSNR": cells(ours=(30.0, None, 1), prior=(31.0, None, 1))}).startswith("does not hold")
 
@@ -363,7 +383,9 @@ def test_a_bound_excuses_what_the_posterior_says_is_not_determined():
     said = verdict(experiment(), claim, {"PSNR": rows, "rms [mm]": cells(a=(1.0, None, 1), b=(25.0, None, 1), c=(1.0, None, 1))})
     assert said == ("does not hold, 1 of 3 within 5; not determined, and the posterior says so: b (40.0); beyond it: c (9.0)")
     alone = {"PSNR": cells(b=(40.0, None, 1)), "rms [mm]": cells(b=(25.0, None, 1))}
-    assert verdict(experiment(), claim, alone).startswith("holds where it is determined, 0 of 1")
+    assert verdict(experiment(), claim, alone).startswith("none is determined, 0 of 1")
+    both = {name: rows | cells(a=(3.0, None, 1)) for name, rows in alone.items()}
+    assert verdict(experiment(), claim, both).startswith("holds where it is determined, 1 of 2")
     assert verdict(experiment(), claim, {}) == "not run"
 
 
@@ -381,7 +403,8 @@ def test_the_page_has_what_was_run_and_says_what_was_not(tmp_path):
     assert "31.35 / 92.3" in text and "`the command`" in text and "](results/table_generalisation.png)" in text
     row = next(line for line in text.splitlines() if line.startswith("| NCLaw"))
     assert row.count("not run") >= 2
-    assert "our default has the smallest error of all: **holds, 10.0 against 20.0 (prior only), 30.0 (NeuMA); not run:" in text
+    least = "our default has the smallest error of all"
+    assert f"{least}: **holds against those that were run, 10.0 against 20.0 (prior only), 30.0 (NeuMA); not run:" in text
     assert "Ours: not run. `mosa-experiment table_ablation`" in text
     with pytest.raises(ConfigError, match="--results: expected a folder"):
         run(arguments(["--page", "--results", str(tmp_path / "nothing")]))

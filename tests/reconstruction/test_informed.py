@@ -92,6 +92,15 @@ def test_images_correct_a_wrong_prediction_wherever_it_is(bent):
     assert near < 0.65 * before and abs(far - near) < 0.02
 
 
+def test_a_frame_that_was_seen_in_a_wrong_place_does_not_draw_the_prediction_there(bent):
+    """One frame was seen 60 mm beside the body: there the prediction stays, and the other is laid onto what was seen."""
+    _, _, true = bent
+    seen = true + torch.tensor([0.0, 0.0, 0.06]) * torch.tensor([0.0, 0.0, 1.0])[:, None, None]
+    predicted = true + torch.tensor([0.0, 0.03, 0.0]) * torch.tensor([0.0, 1.0, 0.0])[:, None, None]
+    found = fitted(bent, predicted, seen, iterations=1)
+    assert away(laid_onto(predicted, seen), true) > 30 and away(found, true) < 3
+
+
 @pytest.mark.parametrize("share", [0.1, -0.3])
 def test_a_prediction_that_is_no_body_is_not_followed(bent, share):
     """Flattened, and turned inside out: the first motion stays. The true shapes are followed."""

@@ -185,12 +185,12 @@ OBJECTS |= {
                       spacing=0.011),
     "toothpaste": replace(
         stand_in("toothpaste", 0.051, "herschel_bulkley_hencky", mu=5e3, kappa=1e5, yield_stress=200.0, viscosity=10.0, remesh=True,
-                 spacing=0.0013),
+                 spacing=0.0011),
         drops={"train": Drop(speed=0.2, contact=0.1)},
         footage=Footage(cameras=11, frames=14, size=400, fps=50.0, field=0.075, target=0.058, distance=0.45), pitch=0.0008,
     ),
     "trophy": stand_in("trophy", 0.418, "drucker_prager", E=1e6, nu=0.3, friction_angle=40.0, cohesion=0.0,
-                       held=("E", "nu", "cohesion"), remesh=True),
+                       held=("E", "nu", "cohesion"), remesh=True, spacing=0.011),
 }  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from mosa.data.builtin.drop import simulate
 from mosa.data.builtin.objects import OBJECTS, BuiltinObject, drop_named, object_named
 from mosa.data.builtin.renderer import render_surface, ring_of_cameras
 from mosa.data.builtin.shapes import SHAPES
-from mosa.data.builtin.surface import Skin, Surface, bind, extract_surface, fill, flowing_surface
+from mosa.data.builtin.surface import LEVEL, Skin, Surface, bind, extract_surface, fill, flowing_surface
 from mosa.data.footage import WHITE
 from mosa.data.images import composite, resize
 from mosa.errors import ConfigError, DataError
@@ -63,7 +63,10 @@ def cameras_of(body: BuiltinObject, seed: int) -> Cameras:
 def take_file(name: str, sequence: str, material: str, seed: int, cache: str | Path | None = None) -> Path:
     """Where a take lies once it has been made."""
     hidden = object_named(name).material.variant(material)
-    key = hashlib.sha256(repr((VERSION, object_named(name), hidden, drop_named(name, sequence), seed)).encode()).hexdigest()[:12]
+    made_of: tuple = (VERSION, object_named(name), hidden, drop_named(name, sequence), seed)
+    if object_named(name).remesh:
+        made_of += (LEVEL,)
+    key = hashlib.sha256(repr(made_of).encode()).hexdigest()[:12]
     folder = Path(cache) if cache is not None else default_cache()
     return folder / "builtin" / f"{name}-{sequence}-{material}-{seed}-{key}.npz"
 
