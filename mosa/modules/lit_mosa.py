@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -28,6 +29,8 @@ from mosa.modules.takes import Take, seen_again, with_positions
 from mosa.modules.terms import Step, check_terms, evaluate_terms
 from mosa.progress import tqdm
 from mosa.types import Rollout
+
+log = logging.getLogger(__name__)
 
 
 class LitMosa(Restorable, L.LightningModule):
