@@ -52,7 +52,7 @@ class Prepared:
 
     def __post_init__(self) -> None:
         self.held, self.chains = {"parameters": self.packed, **dict.fromkeys(ANSWER)}, None
-        alone = len(self.lanes.solvers) == 1 and self.stride is not None and not hasattr(self.adapter, "flow")
+        alone = len(self.lanes.solvers) == 1 and self.stride is not None and getattr(self.adapter, "flow", None) is None
         if self.gathers and alone and isinstance(self.adapter, nn.Module):
             self.chains = Chains(self.lanes, self.adapter, self.ask, self.packed, self.collect)
 
