@@ -16,6 +16,7 @@ from mosa.modules.gauss_newton import Seat
 from mosa.modules.hyperelastic import anisotropic_basis
 from mosa.modules.identification import (
     COARSER,
+    EVIDENCE_ITERATIONS,
     Identification,
     IdentificationSettings,
     as_rival,
@@ -146,6 +147,16 @@ def test_rivals_explain_the_drop_with_their_own_numbers(monkeypatch):
     assert body.material.law == "corotated" and torch.equal(read_numbers(body), here)
     monkeypatch.setattr(identification_module, "IMPLAUSIBLE", 1e-9)
     assert not found.rivals()
+
+
+def test_the_sizes_of_the_numbers_are_settled_after_a_few_iterations(monkeypatch):
+    """Found anew in each of the first ones but the very first, and kept from then on: costs can be compared."""
+    found = identification(small_body(), [take_and_turn(small_body(numbers=fibres(0.3)), 0.5)])
+    sizes, learn = [], found.newton._evidence
+    monkeypatch.setattr(found.newton, "_evidence", lambda *given: (learn(*given), sizes.append(found.iteration)))
+    for _ in range(EVIDENCE_ITERATIONS + 2):
+        found.iterate()
+    assert sizes == list(range(1, EVIDENCE_ITERATIONS))
 
 
 def test_an_isotropic_body_stays_isotropic():
