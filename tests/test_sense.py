@@ -52,15 +52,17 @@ def test_a_strangers_body_can_be(tmp_path, name, change, message):
         Twin.load(checkpoint(tmp_path / "bad.ckpt", change=changed))
 
 
-@pytest.mark.parametrize("scene", [..., None, 5, {"format": "builtin"}, {"format": "transforms", "name": "x"}])
-def test_a_run_without_a_built_in_scene_has_no_truth(tmp_path, scene):
+@pytest.mark.parametrize("scene, error", [
+    (..., DataError), (None, DataError), (5, DataError), ({"format": "builtin"}, DataError),
+    ({"format": "transforms", "name": "x"}, ConfigError)])
+def test_a_run_without_a_built_in_scene_has_no_truth(tmp_path, scene, error):
     def change(stored):
         cfg = stored["mosa"]["config"]["cfg"]
         cfg.pop("scene", None)
         if scene is not ...:
             cfg["scene"] = scene
 
-    with pytest.raises(ConfigError, match="simulator: expected learned or isotropic for a run on a scene of format"):
+    with pytest.raises(error, match=r"cfg\.scene|simulator: expected learned or isotropic for a run on a scene of format transforms"):
         simulator_named("truth", checkpoint(tmp_path / "bad.ckpt", change=change))
 
 

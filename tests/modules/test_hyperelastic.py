@@ -291,5 +291,7 @@ def test_what_it_refuses_and_what_a_copy_holds():
         small_body(on=False).adapter(None)
     adapter = adapter_of(0.1 * torch.ones(NUMBERS), 0.3)
     adapter.follow(torch.tensor(0.4, requires_grad=True) * 1.0)
-    copied = copy.deepcopy(adapter)  # the graph of the prior's number is no part of it
-    assert torch.equal(copied.stiffness(), adapter_of(0.1 * torch.ones(NUMBERS), 0.3).stiffness())
+    copied, same = copy.deepcopy(adapter), adapter_of(0.1 * torch.ones(NUMBERS), 0.3)
+    same.follow(torch.tensor(0.4))
+    assert torch.equal(copied.stiffness(), same.stiffness())  # the same law; the graph of the prior's number is no part of it
+    assert not copied.requires_grad_(False).stiffness().requires_grad and adapter.stiffness().requires_grad
