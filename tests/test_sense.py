@@ -62,7 +62,7 @@ def test_a_run_without_a_built_in_scene_has_no_truth(tmp_path, scene, error):
         if scene is not ...:
             cfg["scene"] = scene
 
-    with pytest.raises(error, match=r"cfg\.scene|simulator: expected learned or isotropic for a run on a scene of format transforms"):
+    with pytest.raises(error, match=r"cfg\.scene|expected learned or isotropic for a run on a scene of format transforms"):
         simulator_named("truth", checkpoint(tmp_path / "bad.ckpt", change=change))
 
 

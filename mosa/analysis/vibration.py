@@ -74,7 +74,7 @@ def vibration_growth(
     parameters = {name: value.detach().double().cpu() for name, value in material.per_particle().items()}
     held = None if adapter is None else adapter.in_double()
     if held is not None:
-        held.follow(material.poisson().double().cpu())  # a copy has forgotten which prior it followed
+        held.follow(material.poisson().double().cpu())  # whatever it followed last
     try:
         rollout = simulator.rollout(
             ParticleState(x, v, C, F, F), parameters, torch.full((n,), spacing**3).double(), density, periods * FRAMES + 1,
