@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import logging
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields, replace
@@ -34,8 +33,6 @@ from mosa.rendering.covariance import covariance_from, matrix_to_quaternion, qua
 from mosa.rendering.rasterizer import rasterize
 from mosa.rendering.spherical_harmonics import constant_coefficients
 from mosa.types import Appearance, Reconstruction, Scene, Splats
-
-log = logging.getLogger(__name__)
 
 CACHE_VERSION = 3
 """Raised when a stage computes something else from the same settings."""
