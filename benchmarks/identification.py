@@ -27,15 +27,14 @@ from mosa.analysis.stiffness import angle_between, stiffest
 from mosa.assembly import assemble
 from mosa.config import build_body
 from mosa.data.builtin.floor import floor_rollout, hidden_of
-from mosa.errors import MosaError
 from mosa.evaluation import true_motion
 from mosa.modules.body import Start
 from mosa.modules.gauss_newton import Posterior
-from mosa.modules.identification import Identification, each_law
+from mosa.modules.identification import Identification
 from mosa.modules.lit_mosa import LitMosa
 from mosa.modules.residuals import sampled
 from mosa.modules.takes import Take
-from mosa.prediction import DRAWS, LEAST_DRAWS, among_forms, determined, rival_motions, total_spread
+from mosa.prediction import DRAWS, LEAST_DRAWS, among_forms, determined, drawn_motions, rival_motions, total_spread
 from mosa.types import MotionCues
 
 CONF = Path(__file__).parents[1] / "conf"
@@ -141,20 +140,13 @@ def held_out(by_sequence: dict[str, float]) -> float:
 def coverage(case: SimpleNamespace, found: dict[str, Tensor], posterior: Posterior) -> float | None:
     """Share of held-out particle errors after contact within two predicted standard deviations, as `predicted_spread` has them;
     None without held-out sequences or draws that can be simulated."""
-    drawn: dict[str, list[Tensor]] = {prefix: [] for prefix in found if prefix.startswith("test")}
-    for _ in each_law(case.body, posterior.draws(DRAWS, torch.Generator().manual_seed(0))):
-        try:
-            moved = motions(case)
-        except MosaError:
-            continue
-        for prefix in drawn:
-            drawn[prefix].append(moved[prefix])
-    within, others = [], rival_motions(case.body, posterior, lambda: motions(case))
-    for prefix, each in drawn.items():
-        if len(each) >= LEAST_DRAWS:
-            s = case.problem["sequences"][prefix]
-            sd = total_spread(torch.stack(each), posterior.model_error, among_forms(found[prefix], [x[prefix] for x in others]))
-            within.append(((found[prefix] - s["truth"]).norm(dim=-1) <= 2 * sd)[s["contact"] :].double().mean())
+    drawn = drawn_motions(case.body, posterior.draws(DRAWS, torch.Generator().manual_seed(0)), lambda: motions(case))
+    others, within = rival_motions(case.body, posterior, lambda: motions(case)), []
+    for prefix in (name for name in found if name.startswith("test") and len(drawn) >= LEAST_DRAWS):
+        s = case.problem["sequences"][prefix]
+        sd = total_spread(torch.stack([x[prefix] for x in drawn]), posterior.model_error,
+                          among_forms(found[prefix], [x[prefix] for x in others]))  # fmt: skip
+        within.append(((found[prefix] - s["truth"]).norm(dim=-1) <= 2 * sd)[s["contact"] :].double().mean())
     return float(sum(within) / len(within)) if within else None
 
 

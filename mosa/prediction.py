@@ -41,23 +41,20 @@ def predicted_spread(
     posterior/<prefix>/coverage: the share of the particles' errors within two standard deviations.
     """
     generator = torch.Generator().manual_seed(seed)
-    found: dict[str, list[Tensor]] = {s.prefix: [] for s in sequences}
-    base = {s.prefix: _positions(body, s, world) for s in sequences}
-    for _ in tqdm(each_law(body, posterior.draws(draws, generator)), "draws of the posterior", total=draws, leave=False):
-        try:
-            rollouts = {s.prefix: _positions(body, s, world) for s in sequences}
-        except MosaError:
-            continue
-        for prefix, x in rollouts.items():
-            found[prefix].append(x)
-    others = rival_motions(body, posterior, lambda: {s.prefix: _positions(body, s, world) for s in sequences})
-    figures: dict[str, float] = {"posterior/draws": float(len(found[sequences[0].prefix])),
-                                 "posterior/rivals": float(len(others)), "posterior/model_error_m": posterior.model_error}
+
+    def positions() -> dict[str, Tensor]:
+        return {s.prefix: _positions(body, s, world) for s in sequences}
+
+    base = positions()
+    drawn = drawn_motions(body, posterior.draws(draws, generator), positions)
+    others = rival_motions(body, posterior, positions)
+    figures: dict[str, float] = {"posterior/draws": float(len(drawn)), "posterior/rivals": float(len(others)),
+                                 "posterior/model_error_m": posterior.model_error}
     spreads: dict[str, Tensor] = {}
     if figures["posterior/draws"] < LEAST_DRAWS:
         return figures, spreads
     for s in sequences:
-        sd = total_spread(torch.stack(found[s.prefix]), posterior.model_error, among_forms(base[s.prefix],
+        sd = total_spread(torch.stack([each[s.prefix] for each in drawn]), posterior.model_error, among_forms(base[s.prefix],
                           [each[s.prefix] for each in others]))  # fmt: skip
         spreads[s.prefix] = sd.cpu()
         figures[f"posterior/{s.prefix}/sd_m"] = float(sd[s.contact :].square().mean().sqrt())
@@ -69,6 +66,18 @@ def predicted_spread(
 
 
 Predicted = TypeVar("Predicted")
+
+
+@torch.no_grad()
+def drawn_motions(body: Body, laws: Tensor, predict: Callable[[], Predicted]) -> list[Predicted]:
+    """What predict() says of `body` under each of the laws (D, numbers) in turn; those that cannot be simulated are left out."""
+    found = []
+    for _ in tqdm(each_law(body, laws), "draws of the posterior", total=len(laws), leave=False):
+        try:
+            found.append(predict())
+        except MosaError:
+            continue
+    return found
 
 
 @torch.no_grad()
