@@ -3,6 +3,10 @@
 Minimises 1/2 |r(theta)|^2 + 1/2 sum ((theta - mean)/sd)^2 with columns of the Jacobian by one-sided differences. The standard
 deviations of whole blocks are found from the data (MacKay, Bayesian interpolation, Neural Computation 4, 1992), and the inverse of
 the last matrix is the Laplace approximation of the posterior.
+
+A Jacobian costs a rollout for every number, a step one. So several steps are taken with one Jacobian, which each of them puts right
+along its own direction (Broyden, A class of methods for solving nonlinear simultaneous equations, 1965): where columns are a little
+wrong and residuals are not small, Gauss-Newton alone stops short of the minimum.
 """
 
 from __future__ import annotations
@@ -18,6 +22,8 @@ from torch import Tensor
 
 from mosa.errors import MosaError, SimulationDiverged
 
+SHORTER, SHORTEST = 0.4, 0.05
+"""A step that does not improve is tried again so much shorter; one of fewer standard deviations of the posterior is not tried."""
 EVIDENCE_PASSES = 20
 """Of the fixed point for the sizes of the blocks: each costs one inverse of a matrix of all numbers."""
 
@@ -96,20 +102,26 @@ class Posterior:
         return self.mean + torch.randn(count, len(self.mean), generator=generator, dtype=torch.float64) @ L.T
 
 
+def _length(step: Tensor, matrix: Tensor) -> float:
+    """Of a step (D,), in standard deviations of the posterior with that matrix (D, D)."""
+    return float((step @ matrix @ step).clamp(min=0).sqrt())
+
+
 @dataclass
 class GaussNewton:
-    """One or more seats of the same model; the first one holds the result. progress: called after every column; many: (K, R)
-    residuals of K rows of numbers (K, D) at once, where the columns of a Jacobian shall not be asked for one by one."""
+    """One or more seats of the same model; the first one holds the result. steps: tried with one Jacobian at most; progress: called
+    after every column; many: (K, R) residuals of K rows of numbers (K, D) at once, where the columns of a Jacobian shall not be
+    asked for one by one."""
 
     blocks: list[Block]
     seats: list[Seat]
-    halvings: int = 4
+    steps: int = 6
     progress: Callable[[], None] | None = None
     many: Callable[[Tensor], Tensor] | None = None
     matrix: Tensor | None = field(default=None, init=False)
     data: Tensor | None = field(default=None, init=False)
     columns: Tensor | None = field(default=None, init=False)
-    """The last iteration's Jacobian (R, D)."""
+    """The last iteration's Jacobian (R, D), as its steps have put it right."""
 
     def _vector(self, get: Callable[[Block], Tensor | float]) -> Tensor:
         return torch.cat([torch.as_tensor(get(b), dtype=torch.float64).expand(b.size) for b in self.blocks])
@@ -172,10 +184,11 @@ class GaussNewton:
         return J.T
 
     @torch.no_grad()
-    def iterate(self, learn: bool = True) -> dict[str, float]:
-        """One iteration from where the first seat stands. learn: update the blocks' factors by the evidence first.
+    def iterate(self, learn: bool = True, settled: bool = True) -> dict[str, float]:
+        """One iteration from where the first seat stands. learn: update the blocks' factors by the evidence first; settled: whether
+        what is compared stays as it is, so that steps after the first that improves are worth their while.
 
-        Returns cost before and after, the share of the step that was taken (0: no part of it improved), the step's length in
+        Returns cost before and after, the way that was gone over the length of the first step (0: no step improved), that length in
         standard deviations of the posterior, and each learned block's factor. Errors: SimulationDiverged where a column fails.
         """
         seat = self.seats[0]
@@ -191,28 +204,42 @@ class GaussNewton:
         away = numbers - self.mean()
         if learn:
             self._evidence(away, H, g)
-        precision = self.precision()
-        M = H + torch.diag(precision)
-        direction = torch.linalg.solve(M, -(g + precision * away))
+        precision, begun = self.precision(), numbers
         before = after = self.cost(numbers, r)
-        share, taken = 1.0, 0.0
-        for _ in range(self.halvings):
-            moved = self.clamped(numbers + share * direction)
+        first = M = H + torch.diag(precision)
+        length, trust = 0.0, 1.0
+        for i in range(self.steps):
+            direction = torch.linalg.solve(M, -(g + precision * (numbers - self.mean())))
+            proposed = _length(direction, M)
+            length = proposed if i == 0 else length
+            moved = self.clamped(numbers + trust * direction)
+            step = moved - numbers
+            if trust * proposed < SHORTEST or not bool(step.any()):
+                break
             seat.write(moved)
             try:
-                after = self.cost(moved, seat.residuals())
+                there = seat.residuals()
             except MosaError:
-                after = math.inf
-            if after < before:
-                taken = share
+                there = None
+            if there is None or not math.isfinite(cost := self.cost(moved, there)):
+                trust *= SHORTER
+                continue
+            improved = cost < after
+            if improved and not settled:
+                numbers, after = moved, cost
                 break
-            share *= 0.4
-        if taken == 0.0:
-            seat.write(numbers)
-            after = before
+            weights = M @ step
+            J += torch.outer(there - r - J @ step.to(r), (weights / (step @ weights)).to(r))
+            if improved:
+                numbers, r, after, trust = moved, there, cost, min(1.0, 2 * trust)
+            else:
+                trust *= SHORTER
+            H, g = (J.T @ J).double().cpu(), (J.T @ r).double().cpu()
+            M = H + torch.diag(precision)
+        seat.write(numbers)
         self.matrix, self.data = M, H
-        length = float((direction @ M @ direction).clamp(min=0).sqrt())
-        return {"before": before, "after": after, "share": taken, "length": length} | {
+        share = _length(numbers - begun, first) / length if length > 0 else 0.0
+        return {"before": before, "after": after, "share": share, "length": length} | {
             f"sd/{b.name}": b.factor * float(b.sd.mean()) for b in self.blocks if b.learned}
 
     @torch.no_grad()
