@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import imageio.v2 as imageio
 import numpy as np
 import torch
 from torch import Tensor
@@ -115,7 +116,7 @@ def film(arena: Arena, states: tuple[Tensor, Tensor, Tensor | None], world: int,
 
 def write_films(folder: Path, films: Mapping[str, list[np.ndarray]], name: str) -> list[Path]:
     """`<name>.png`, a row of pictures for each film, and `<name>.mp4` with the films beside each other; where no ffmpeg is
-    installed only the former. The paths written."""
+    installed its frames, `<name>/00.png` and so on. The paths written."""
     count = min(len(pictures) for pictures in films.values())
     rows = {title: np.stack(pictures[:count]) for title, pictures in films.items()}
     written = [write_strip(folder / f"{name}.png", rows, frames=6)]
@@ -124,4 +125,8 @@ def write_films(folder: Path, films: Mapping[str, list[np.ndarray]], name: str) 
         written.append(write_video(folder / f"{name}.mp4", frames, fps=12))
     except (ImportError, RuntimeError, ValueError, OSError):  # imageio without ffmpeg says it in several ways
         (folder / f"{name}.mp4").unlink(missing_ok=True)
+        (folder / name).mkdir(exist_ok=True)
+        for t, frame in enumerate(frames):
+            written.append(folder / name / f"{t:02d}.png")
+            imageio.imwrite(written[-1], frame)
     return written
