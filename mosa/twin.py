@@ -23,14 +23,14 @@ from mosa.checkpoints import TENSORS, check_kinds, checked, checked_posterior, c
 from mosa.config import build_body, build_world
 from mosa.data.splat_files import check_formats, save_frames
 from mosa.episode import Episode, Stepped, TwinState
-from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
+from mosa.errors import ConfigError, DataError, MosaError
 from mosa.limits import named_device
 from mosa.modules.body import Body, Start, World
 from mosa.modules.carried_splats import CarriedSplats, seen
 from mosa.modules.gauss_newton import Posterior
-from mosa.modules.identification import each_law, read_numbers
+from mosa.modules.identification import read_numbers
 from mosa.physics.contact.colliders import Collider, colliders_from_config, reach
-from mosa.prediction import DRAWS, among_forms, rival_motions, total_spread
+from mosa.prediction import DRAWS, among_forms, drawn_motions, rival_motions, total_spread
 from mosa.progress import tqdm
 from mosa.rendering.cameras import look_at
 from mosa.rollout_file import poses, save_rollout
@@ -82,12 +82,8 @@ class Twin:
         """
         if self.posterior is None:
             raise ConfigError("predict: this run kept no posterior; a fit by Gauss-Newton does (fit.joint.optimizer=auto)")
-        rollout, found = self.simulate(**start), []
-        for _ in each_law(self.body, self.posterior.draws(draws, torch.Generator().manual_seed(seed))):
-            try:
-                found.append(self.simulate(**start).x)
-            except SimulationDiverged:
-                continue
+        rollout, laws = self.simulate(**start), self.posterior.draws(draws, torch.Generator().manual_seed(seed))
+        found = drawn_motions(self.body, laws, lambda: self.simulate(**start).x, quiet=True)
         if len(found) < 2:
             raise ConfigError(f"predict: expected at least two of {draws} draws of the law that can be simulated from this start, "
                               f"found {len(found)}")
