@@ -19,6 +19,7 @@ laws apart in most trials (of all ranges, where none is so), the lower one of eq
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from pathlib import Path
 
@@ -83,7 +84,7 @@ def main() -> None:
     if options.choose and (not options.heights or len(options.task) != 1 or options.task == ["pushing"]):
         parser.error("--choose: expected --heights, and one of placement, hanging as --task")
     torch.set_num_threads(1)
-    values = {key: float(value) for key, value in (item.split("=") for item in options.set)}
+    values = {key: json.loads(value) for key, value in (item.split("=") for item in options.set)}  # a count stays whole
     ranges = [tuple(map(float, item.split(":"))) for item in options.heights or ()]
     print("| task | heights [m] | plain | reachable | told apart [mm] | [degrees] | success differs | s |")
     print("|---|---|---|---|---|---|---|---|")

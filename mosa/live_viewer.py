@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mosa.live import COLORS, Live
-from mosa.viewing import add_ground, add_solid, aim, cell, open_server, turn, view_of
+from mosa.viewing import add_ground, add_solid, aim, beside_panel, cell, open_server, turn, view_of
 
 log = logging.getLogger(__name__)
 
@@ -82,7 +82,7 @@ class LiveViewer:
         ground = live.twin.world.ground
         around = np.concatenate([x, x + 1.5 * live.size * live.across, x - 1.5 * live.size * live.across, live.hand_position[None]])
         eye, target = view_of(around, live.up, live.across, None if ground is None else live.ground)
-        aim(eye, target, self.server.initial_camera)
+        aim(*beside_panel(eye, target, live.up), self.server.initial_camera)
         if ground is not None:
             add_ground(scene, live.up, live.across, live.ground, live.size, target, float(np.linalg.norm(eye - target)))
 

@@ -69,10 +69,10 @@ Predicted = TypeVar("Predicted")
 
 
 @torch.no_grad()
-def drawn_motions(body: Body, laws: Tensor, predict: Callable[[], Predicted]) -> list[Predicted]:
+def drawn_motions(body: Body, laws: Tensor, predict: Callable[[], Predicted], *, quiet: bool = False) -> list[Predicted]:
     """What predict() says of `body` under each of the laws (D, numbers) in turn; those that cannot be simulated are left out."""
     found = []
-    for _ in tqdm(each_law(body, laws), "draws of the posterior", total=len(laws), leave=False):
+    for _ in tqdm(each_law(body, laws), "draws of the posterior", total=len(laws), leave=False, disable=quiet):
         try:
             found.append(predict())
         except MosaError:

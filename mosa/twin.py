@@ -17,24 +17,26 @@ import torch
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
-from mosa.analysis.figures import side_by_side, write_video
+from mosa.analysis.comparison import ground_lines, on_ground
+from mosa.analysis.figures import side_by_side, to_uint8, write_video
 from mosa.checkpoints import TENSORS, check_kinds, checked, checked_posterior, checked_splats, read_checkpoint
 from mosa.config import build_body, build_world
 from mosa.data.splat_files import check_formats, save_frames
 from mosa.episode import Episode, Stepped, TwinState
-from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
+from mosa.errors import ConfigError, DataError, MosaError
 from mosa.limits import named_device
 from mosa.modules.body import Body, Start, World
 from mosa.modules.carried_splats import CarriedSplats, seen
 from mosa.modules.gauss_newton import Posterior
-from mosa.modules.identification import each_law, read_numbers
-from mosa.physics.contact.colliders import Collider
-from mosa.prediction import DRAWS, among_forms, rival_motions, total_spread
+from mosa.modules.identification import read_numbers
+from mosa.physics.contact.colliders import Collider, colliders_from_config, reach
+from mosa.prediction import DRAWS, among_forms, drawn_motions, rival_motions, total_spread
 from mosa.progress import tqdm
 from mosa.rendering.cameras import look_at
-from mosa.rollout_file import save_rollout
+from mosa.rollout_file import poses, save_rollout
 from mosa.shown_body import FILE as BODY_FILE
 from mosa.shown_body import save_body
+from mosa.shown_solids import with_solids
 from mosa.twin_start import check_differentiable, check_frames, check_variant, checked_dt, checked_substeps, start_in
 from mosa.twin_worlds import TwinWorlds
 from mosa.types import Cameras, Rollout
@@ -80,12 +82,8 @@ class Twin:
         """
         if self.posterior is None:
             raise ConfigError("predict: this run kept no posterior; a fit by Gauss-Newton does (fit.joint.optimizer=auto)")
-        rollout, found = self.simulate(**start), []
-        for _ in each_law(self.body, self.posterior.draws(draws, torch.Generator().manual_seed(seed))):
-            try:
-                found.append(self.simulate(**start).x)
-            except SimulationDiverged:
-                continue
+        rollout, laws = self.simulate(**start), self.posterior.draws(draws, torch.Generator().manual_seed(seed))
+        found = drawn_motions(self.body, laws, lambda: self.simulate(**start).x, quiet=True)
         if len(found) < 2:
             raise ConfigError(f"predict: expected at least two of {draws} draws of the law that can be simulated from this start, "
                               f"found {len(found)}")
@@ -112,8 +110,8 @@ class Twin:
         of the body's centre, None for a number that is left as it is; height [m] of the lowest point above the ground, in place
         of the position along `up`; velocity [m/s]; angular_velocity [rad/s]; what is left out is taken from the training
         sequence. colliders: rigid solids instead of the world's, or entries as a configuration has them; `reactions` of the result
-        holds the forces on them. Errors: ConfigError naming the argument (also a solid that the body starts in),
-        SimulationDiverged (the body leaves the box of the scene).
+        holds the forces on them. No gradients: `reset(differentiable=True)` and `step` have them. Errors: ConfigError naming the
+        argument (also a solid that the body starts in), SimulationDiverged (the body leaves the box of the scene).
         """
         check_frames(frames, len(self.body.rest))
         check_variant(variant)
@@ -196,10 +194,16 @@ class Twin:
         return TwinWorlds(self.body, self.world, self.frame_dt, self.training_start, count, laws)
 
     @torch.no_grad()
-    def render(self, rollout: Rollout, size: int = 400) -> Tensor:
-        """(T, size, size, 3) images from one camera that sees the whole motion."""
+    def render(self, rollout: Rollout, size: int = 400, colliders: Sequence[Collider | Mapping] | None = None) -> Tensor:
+        """(T, size, size, 3) images from one camera that sees the whole motion, on the ground and among `colliders`, those that the
+        rollout was simulated with (None: the world's). Half spaces and meshes are not drawn."""
         body, up = self.body, self.world.up.to(self.body.rest)
+        solids = self._met(rollout, colliders)
         low, high = rollout.x.amin((0, 1)), rollout.x.amax((0, 1))
+        # solids about as large as the body are in the picture as a whole, tables and walls as far as they reach into it
+        for at, solid in zip(poses(solids, rollout.times)[0].unbind(1) if solids else (), solids):
+            if 0 < (far := reach(solid.shape)) < body.size:
+                low, high = torch.minimum(low, at.amin(0).to(low) - far), torch.maximum(high, at.amax(0).to(high) + far)
         target = 0.5 * (low + high)
         side = torch.tensor([0.9, 0.0, 1.0]).to(body.rest)
         side = side - (side @ up) * up if float((side - (side @ up) * up).norm()) > 1e-3 else torch.roll(up, 1)
@@ -208,31 +212,46 @@ class Twin:
         eye = target + distance * (side / side.norm() + 0.25 * up)
         K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
         camera = Cameras(K[None].to(body.rest), look_at(eye, target, up)[None].to(body.rest), size, size, ("view",))
-        return seen(body, rollout.x, rollout.F_tot).images(camera, torch.ones(3).to(body.rest))[0].clamp(0, 1).cpu()
+        shown = with_solids(seen(body, rollout.x, rollout.F_tot), solids, rollout.times, up, body.size / 30)
+        images = shown.images(camera, torch.ones(3).to(body.rest))[0].clamp(0, 1).cpu()
+        lines = ground_lines(self.world, camera, body.size)
+        drawn = [on_ground(to_uint8(image), lines, 1, torch.ones(3)) for image in images] if lines else []
+        return torch.from_numpy(np.stack(drawn)).float() / 255 if lines else images
+
+    def _met(self, rollout: Rollout, colliders: Sequence[Collider | Mapping] | None) -> tuple[Collider, ...]:
+        """The solids of a rollout, None for the world's. Errors: ConfigError where they are not as many as it has reactions of."""
+        met = 0 if rollout.reactions is None else rollout.reactions.shape[-2]
+        solids = self.world.colliders if met and colliders is None else colliders_from_config(colliders or (), "colliders")
+        if met != len(solids):
+            raise ConfigError(f"colliders: expected the {met} that the rollout was simulated with, as simulate takes them, found "
+                              f"{len(solids)}")
+        return tuple(solids)
 
     def export(
         self, rollout: Rollout, folder: str | Path, *, video: bool = True, title: str = "learned twin",
-        formats: Sequence[str] = ("ply",), colliders: Sequence[Collider] = (),
+        formats: Sequence[str] = ("ply",), colliders: Sequence[Collider | Mapping] | None = None,
     ) -> Path:  # fmt: skip
-        """Write into `folder`: `body.npz`, which the viewer shows the motion with; `rollout.npz` (with the poses of `colliders`,
-        those of the rollout, where they are given); one PLY a frame (x y z red green blue); `simulation.mp4`; and the Gaussians
-        that its images show in `formats` (`data.splat_files.FORMATS`: 3DGS PLY, splat, spz, usd) below `splats/`."""
+        """Write into `folder`: `body.npz`, which the viewer shows the motion with; `rollout.npz`, with the poses of `colliders`;
+        one PLY a frame (x y z red green blue); `simulation.mp4`, with them and the ground; and the Gaussians of the body that its
+        images show in `formats` (`data.splat_files.FORMATS`: 3DGS PLY, splat, spz, usd) below `splats/`. colliders: those that
+        the rollout was simulated with, None for the world's. Errors: ConfigError where they are not."""
         if not isinstance(formats, (list, tuple)):
             raise ConfigError(f"formats: expected a list like ['ply'], found {str(formats)[:80]!r}")
         check_formats(formats)
+        solids = self._met(rollout, colliders)
         try:
             folder = Path(folder)
             (folder / "ply").mkdir(parents=True, exist_ok=True)
         except (OSError, TypeError, ValueError) as error:
             raise ConfigError(f"export: expected a folder that can be written, found {str(folder)[:100]!r} ({error})") from error
         save_body(folder / BODY_FILE, self.body, self.world)
-        save_rollout(folder / "rollout.npz", {"simulation": rollout}, colliders)
+        save_rollout(folder / "rollout.npz", {"simulation": rollout}, solids)
         for t, x in enumerate(rollout.x.cpu().numpy()):
             write_ply(folder / "ply" / f"{t:03d}.ply", x, self.body.colors.cpu().numpy())
         save_frames(seen(self.body, rollout.x, rollout.F_tot), folder / "splats", formats, rate=1 / self.frame_dt, up=self.world.up)
         if video:
             moments = [f"frame {t}, {time:.3f} s" for t, time in enumerate(rollout.times.tolist())]
-            frames = side_by_side({title: self.render(rollout)}, footer=moments)
+            frames = side_by_side({title: self.render(rollout, colliders=solids)}, footer=moments)
             write_video(folder / "simulation.mp4", frames, fps=max(5.0, 0.3 / self.frame_dt))
         return folder
 

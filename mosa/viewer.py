@@ -21,7 +21,7 @@ from mosa.limits import named_device
 from mosa.live import Live
 from mosa.live_viewer import LiveViewer
 from mosa.twin import Twin
-from mosa.viewing import add_ground, aim, open_server, view_of
+from mosa.viewing import add_ground, aim, beside_panel, open_server, view_of
 
 GEOMETRY = ("splats", "particles")
 
@@ -88,7 +88,7 @@ class Viewer:
 
     def look(self, *cameras) -> None:
         """The current sequence's first view, for what viser calls cameras."""
-        aim(*first_view(self.clip), *cameras)
+        aim(*beside_panel(*first_view(self.clip), self.clip.up), *cameras)
 
     @property
     def clip(self) -> Clip:

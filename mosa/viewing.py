@@ -12,11 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from mosa.errors import ConfigError
 from mosa.physics.contact.colliders import Box, Capsule, Cylinder, Shape, Sphere
+from mosa.shown_solids import SOLID
 
+PANEL = 0.12
+"""Of the window's height, by which the first view's contents stand left of the middle: viser's panel covers its right."""
 FIELD_OF_VIEW = math.radians(40)
 """Vertical, of the first view: less distorted at the rim than viser's 75 degrees."""
-SOLID = (150, 160, 175)
-"""8-bit colour of rigid solids."""
 
 
 def open_server(host: str, port: int) -> Any:
@@ -66,6 +67,14 @@ def aim(eye: np.ndarray, target: np.ndarray, *cameras: Any) -> None:
         camera.position = eye  # first: it takes a connected client's look_at along
         camera.look_at, camera.fov = target, FIELD_OF_VIEW
         camera.near = 1e-3 * float(np.linalg.norm(eye - target))
+
+
+def beside_panel(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A first view (camera (3,), point looked at (3,)) moved to the right by `PANEL`, so that the panel covers nothing of it in a
+    window of 1280 x 800."""
+    right = np.cross(target - eye, up)
+    move = PANEL * 2 * math.tan(FIELD_OF_VIEW / 2) * np.linalg.norm(target - eye) * right / np.linalg.norm(right)
+    return eye + move, target + move
 
 
 def cell(size: float) -> float:

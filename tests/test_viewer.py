@@ -23,7 +23,7 @@ from mosa.physics.contact.colliders import domain_walls
 from mosa.rollout_file import save_observed, save_rollout
 from mosa.twin import Twin
 from mosa.types import Appearance, MotionCues, Rollout, Splats
-from mosa.viewing import FIELD_OF_VIEW
+from mosa.viewing import FIELD_OF_VIEW, beside_panel, view_of
 
 N, T, SEEN = 27, 5, 3
 GROUND = -0.2
@@ -219,6 +219,21 @@ def test_the_first_view_holds_all_bodies_and_the_ground(run, up):
     tangent = np.abs(points @ np.stack([right / np.linalg.norm(right), upward], axis=1)) / (points @ forward)[:, None]
     inside = tangent / np.tan(FIELD_OF_VIEW / 2)  # 1 at the rim of a square window
     assert 0.5 < inside.max() < 1 and forward @ clip.up < 0
+
+
+def test_the_panel_covers_nothing_of_the_first_view():
+    """A row of bodies in a window of 1280 x 800, whose right 335 px are under viser's panel."""
+    across, up = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
+    row = np.random.default_rng(0).uniform([-0.5, 0.0, -0.1], [0.5, 0.3, 0.1], (500, 3))
+
+    def pixels(eye, target):
+        forward = (target - eye) / np.linalg.norm(target - eye)
+        return 640 + 400 * ((row - eye) @ across) / ((row - eye) @ forward) / np.tan(FIELD_OF_VIEW / 2)
+
+    view = view_of(row, up, across, 0.0)
+    assert pixels(*view).max() > 1280 - 335
+    moved = pixels(*beside_panel(*view, up))
+    assert 0 < moved.min() and moved.max() < 1280 - 335
 
 
 def test_colours_say_what_they_are_by(run):

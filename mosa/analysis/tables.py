@@ -36,12 +36,15 @@ def _sequences(figures: Mapping[str, float]) -> list[str]:
 
 
 def parameter_table(figures: Mapping[str, float]) -> str:
-    """Markdown table of identified parameters: after calibration, after the joint stage, relative error where truth is known."""
+    """Markdown table of identified parameters: after calibration, after the joint stage, each with its relative error where the
+    truth is known."""
     names = [k.split("/", 1)[1] for k in figures
              if k.startswith("id_prior/") and k.count("/") == 1 and not k.endswith(("_relative_error", "_ratio"))]
-    rows = [[n, f"{figures[f'id_prior/{n}']:.5g}", f"{figures.get(f'id/{n}', float('nan')):.5g}",
-             f"{figures[f'id_prior/{n}_relative_error']:.1%}" if f"id_prior/{n}_relative_error" in figures else ""] for n in names]
-    return markdown(["parameter", "prior", "joint", "error of prior"], rows)
+    stages = ("id_prior", "id")
+    rows = [[n, *(f"{figures.get(f'{stage}/{n}', float('nan')):.5g}" for stage in stages),
+             *(f"{figures[key]:.1%}" if (key := f"{stage}/{n}_relative_error") in figures else "" for stage in stages)]
+            for n in names]  # fmt: skip
+    return markdown(["parameter", "prior", "joint", "error of prior", "error of joint"], rows)
 
 
 SURE_DEGREES = 30.0

@@ -46,11 +46,13 @@ def simulator_named(
     learned = None if checkpoint is None else Twin.load(checkpoint, device)
     if name != "truth":
         return Simulator(name, learned, "adapted" if name == "learned" else "prior")
-    material, seed = "anisotropic", 0
-    if scene is None:
-        known = scene_of(learned, checkpoint)
-        scene, material, seed = known["name"], known.get("material", material), known.get("seed", seed)
-    return Simulator(name, true_twin(scene, material=material, seed=seed, device=device, spacing=spacing))
+    known = {"name": scene} if scene is not None else scene_of(learned, checkpoint)
+    return Simulator(name, true_twin(**truth_of(known), device=device, spacing=spacing))
+
+
+def truth_of(known: Mapping[str, Any]) -> dict[str, Any]:
+    """What tells the hidden truths of built-in scenes apart, of a scene's configuration: arguments of `true_twin`."""
+    return {"name": known["name"], "material": known.get("material", "anisotropic"), "seed": known.get("seed", 0)}
 
 
 def scene_of(learned: Twin, checkpoint: str | Path) -> Mapping[str, Any]:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import imageio.v2 as imageio
 import numpy as np
 import torch
 from torch import Tensor
@@ -13,9 +14,11 @@ from torch import Tensor
 from mosa.analysis.figures import label, to_uint8, write_strip, write_video
 from mosa.environments.arena import Arena
 from mosa.modules.carried_splats import Seen, seen
-from mosa.physics.contact.motion import exponential
+from mosa.physics.contact.colliders import Collider, colliders_from_config
 from mosa.rendering.cameras import look_at
 from mosa.rendering.spherical_harmonics import constant_coefficients
+from mosa.rollout_file import pose
+from mosa.shown_solids import OPACITY, WIDTH, lattice, shaded, surface
 from mosa.types import Cameras
 
 PITCH = 0.011
@@ -27,40 +30,10 @@ COLORS = {"box": (0.96, 0.96, 0.95), "paddle": (0.25, 0.45, 0.75), "arm left": (
 SKY = (0.80, 0.86, 0.92)
 
 
-def lattice(a: float, b: float, pitch: float) -> Tensor:
-    """(K, 2) points of a rectangle with edges a and b [m] about 0."""
-    ends = [max(2, round(edge / pitch)) for edge in (a, b)]
-    return torch.cartesian_prod(*(torch.linspace(-0.5 * edge, 0.5 * edge, n) for edge, n in zip((a, b), ends)))
-
-
-def box_surface(size: Sequence[float]) -> Tensor:
-    """(K, 3) points on a box with these edges [m]."""
-    faces = []
-    for axis in range(3):
-        u, v = (i for i in range(3) if i != axis)
-        flat = lattice(size[u], size[v], PITCH)
-        for side in (-0.5, 0.5):
-            face = torch.zeros(len(flat), 3)
-            face[:, u], face[:, v], face[:, axis] = flat[:, 0], flat[:, 1], side * size[axis]
-            faces.append(face)
-    return torch.cat(faces)
-
-
-def capsule_surface(radius: float, length: float) -> Tensor:
-    """(K, 3) points on a capsule along z [m]; its ends are left open."""
-    around = torch.linspace(0, 2 * torch.pi, max(8, round(2 * torch.pi * radius / PITCH)) + 1)[:-1]
-    along = torch.linspace(-0.5 * length - 0.6 * radius, 0.5 * length + 0.6 * radius, max(2, round(length / PITCH)))
-    angle, z = torch.cartesian_prod(around, along).unbind(1)
-    return torch.stack([radius * angle.cos(), radius * angle.sin(), z], 1)
-
-
-def solid_surface(solid: Mapping[str, Any], place: Tensor | None) -> Tensor:
-    """(K, 3) [m], where the solid is described, or at `place`. Rotations are (axis, degrees)."""
-    points = box_surface(solid["size"]) if solid["type"] == "box" else capsule_surface(solid["radius"], solid["length"])
-    if (turn := solid.get("rotation")) is not None:
-        axis = torch.tensor(turn[:3], dtype=torch.float64)
-        points = points @ exponential(torch.deg2rad(torch.tensor(turn[3], dtype=torch.float64)) * axis / axis.norm()).float().T
-    return points + (torch.tensor(solid["position"], dtype=torch.float32) if place is None else place.float())
+def solid_surface(collider: Collider, place: Tensor | None) -> Tensor:
+    """(K, 3) [m], where the solid is described, or at `place`."""
+    at, turned = pose(collider.motion, 1, 1.0)
+    return surface(collider.shape, PITCH) @ turned[0].float().T + (at[0] if place is None else place).float()
 
 
 def scenery(solids: Sequence[Mapping[str, Any]], tool: int | None, place: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
@@ -69,12 +42,10 @@ def scenery(solids: Sequence[Mapping[str, Any]], tool: int | None, place: Tensor
     ground = torch.stack([flat[:, 0], torch.full((len(flat),), -0.5 * TILE), flat[:, 1]], 1)
     tiles = ((flat / 0.12).floor().sum(1) % 2)[:, None] * torch.tensor([0.08, 0.08, 0.08]) + torch.tensor([0.66, 0.65, 0.62])
     parts = [(ground, torch.full((len(ground),), 0.5 * TILE), tiles)]
-    for k, solid in enumerate(solids):
+    for k, solid in enumerate(colliders_from_config(solids, "solids")):
         points = solid_surface(solid, place if k == tool else None)
-        color = torch.tensor(COLORS.get(solid["name"], (0.5, 0.5, 0.5)))
-        # a little darker below: edges then show without a light
-        shade = 0.8 + 0.2 * (points[:, 1:2] - points[:, 1].min()) / (points[:, 1].max() - points[:, 1].min()).clamp_min(1e-6)
-        parts.append((points, torch.full((len(points),), 0.45 * PITCH), color * shade))
+        color = torch.tensor(COLORS.get(solid.name, (0.5, 0.5, 0.5)))
+        parts.append((points, torch.full((len(points),), WIDTH * PITCH), shaded(points, torch.tensor([0.0, 1.0, 0.0]), color)))
     return tuple(torch.cat(values) for values in zip(*parts))
 
 
@@ -99,7 +70,7 @@ def picture(arena: Arena, x: Tensor, F_tot: Tensor, tool: Tensor | None, size: i
     round_ = widths.square()[:, None, None] * torch.eye(3, device=device)
     everything = Seen(
         torch.cat([body.means[0], means])[None], torch.cat([body.covariances[0], round_])[None],
-        torch.cat([body.opacities, torch.full_like(widths, 0.95)]),
+        torch.cat([body.opacities, torch.full_like(widths, OPACITY)]),
         constant_coefficients(torch.cat([body.colors()[0], colors])),
     )  # fmt: skip
     image = everything.images(camera_of(arena, size), torch.tensor(SKY).to(arena.rest))[0, 0]
@@ -115,7 +86,7 @@ def film(arena: Arena, states: tuple[Tensor, Tensor, Tensor | None], world: int,
 
 def write_films(folder: Path, films: Mapping[str, list[np.ndarray]], name: str) -> list[Path]:
     """`<name>.png`, a row of pictures for each film, and `<name>.mp4` with the films beside each other; where no ffmpeg is
-    installed only the former. The paths written."""
+    installed its frames, `<name>/00.png` and so on. The paths written."""
     count = min(len(pictures) for pictures in films.values())
     rows = {title: np.stack(pictures[:count]) for title, pictures in films.items()}
     written = [write_strip(folder / f"{name}.png", rows, frames=6)]
@@ -124,4 +95,8 @@ def write_films(folder: Path, films: Mapping[str, list[np.ndarray]], name: str) 
         written.append(write_video(folder / f"{name}.mp4", frames, fps=12))
     except (ImportError, RuntimeError, ValueError, OSError):  # imageio without ffmpeg says it in several ways
         (folder / f"{name}.mp4").unlink(missing_ok=True)
+        (folder / name).mkdir(exist_ok=True)
+        for t, frame in enumerate(frames):
+            written.append(folder / name / f"{t:02d}.png")
+            imageio.imwrite(written[-1], frame)
     return written

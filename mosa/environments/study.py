@@ -19,7 +19,7 @@ from torch import Tensor
 
 from mosa.analysis.tables import markdown
 from mosa.costs import duration
-from mosa.environments.arena import Arena, Simulator, play, play_all, scene_of, simulator_named
+from mosa.environments.arena import Arena, Simulator, play, play_all, scene_of, simulator_named, truth_of
 from mosa.environments.pictures import film, write_films
 from mosa.environments.policies import Found, LinearPolicy, Search, by_elites, by_gradient, by_reinforcement
 from mosa.environments.task import Task
@@ -171,7 +171,7 @@ def make_jobs(bench: Bench, jobs: Sequence[tuple[str, int]], folder: Path) -> di
     records = {}
     for name, seed in jobs:
         file = folder / "jobs" / f"{bench.setting.task}_{name}_{seed}.json"
-        record = _read(file, bench.setting)
+        record = _read(file, _identity(bench, name))
         if record is None:
             if name != UNTRAINED:
                 log.info(expected(bench, name))
@@ -206,8 +206,10 @@ def _record(bench: Bench, simulator: str, seed: int) -> dict[str, Any]:
     own = None if simulator in (UNTRAINED, "truth") else test(bench, simulator, found.policy)
     truth = test(bench, "truth", found.policy) if known else None
     written = found.policy.written() if isinstance(found.policy, LinearPolicy) else None
-    return {"setting": _plain(s), "simulator": simulator, "seed": seed, "policy": written, "history": found.history[-200:],
-            "seconds": round(found.seconds, 1), "played": found.trials, "own": own, "truth": truth}  # fmt: skip
+    return {
+        "setting": _identity(bench, simulator), "simulator": simulator, "seed": seed, "policy": written,
+        "history": found.history[-200:], "seconds": round(found.seconds, 1), "played": found.trials, "own": own, "truth": truth,
+    }  # fmt: skip
 
 
 def _of_builtin(bench: Bench) -> bool:
@@ -228,7 +230,17 @@ FREE = ("device", "worlds")
 """Of a setting: where it is computed, which does not make a result another one."""
 
 
-def _read(file: Path, setting: Setting) -> dict[str, Any] | None:
+def _identity(bench: Bench, simulator: str) -> dict[str, Any]:
+    """The setting of a job. One that reads no learned twin has its hidden truth in place of checkpoint and scene: it can be made
+    before the twin is learned, and is the same for all twins of a scene."""
+    s, found = bench.setting, _plain(bench.setting)
+    if simulator not in (UNTRAINED, "truth"):
+        return found
+    known = {"name": s.scene} if s.scene is not None else scene_of(bench.simulator("learned").twin, s.checkpoint)
+    return found | {"checkpoint": None, "scene": None, "truth": truth_of(known)}
+
+
+def _read(file: Path, wanted: Mapping[str, Any]) -> dict[str, Any] | None:
     """A kept job of the same setting. Errors: DataError for one of another setting: a folder holds one study."""
     if not file.is_file():
         return None
@@ -237,7 +249,7 @@ def _read(file: Path, setting: Setting) -> dict[str, Any] | None:
         kept = {k: v for k, v in record["setting"].items() if k not in FREE}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(f"{file}: expected the result of a job, found a damaged one ({error}); remove it and try again") from error
-    wanted = {k: v for k, v in _plain(setting).items() if k not in FREE}
+    wanted = {k: v for k, v in wanted.items() if k not in FREE}
     if kept != wanted:
         other = ", ".join(f"{k}={kept.get(k)!r} instead of {wanted[k]!r}" for k in wanted if kept.get(k) != wanted[k])
         raise DataError(f"{file}: expected a job of the same setting, found {other}; choose another folder with out=")

@@ -5,6 +5,7 @@ import json
 from dataclasses import replace
 from types import SimpleNamespace
 
+import imageio.v2 as imageio
 import numpy as np
 import pytest
 import torch
@@ -15,7 +16,7 @@ from mosa.data.builtin.drop import simulate
 from mosa.data.builtin.objects import object_named
 from mosa.data.builtin.takes import built
 from mosa.environments import arena as arenas
-from mosa.environments import command, study
+from mosa.environments import command, pictures, study
 from mosa.environments.arena import LOST, Arena, Simulator, play, play_all, simulator_named, world_of
 from mosa.environments.pictures import film
 from mosa.environments.policies import LinearPolicy, Search, _side_by_side, by_elites, by_gradient, by_reinforcement
@@ -347,6 +348,36 @@ def test_several_processes_share_a_table(tmp_path, monkeypatch):
     assert "old" not in text and text.count("\n| isotropic ") == 1
     with pytest.raises(DataError, match=r"doc\.md: expected a line '<!-- table: hanging -->'"):
         study.put_into(document, page, "hanging")
+
+
+def test_the_truths_jobs_do_not_wait_for_a_twin(tmp_path, monkeypatch):
+    """What is trained in the truth is made by the scene's name and taken by the table of a twin of that scene, and of no other."""
+    before = small_bench(tmp_path, monkeypatch)
+    study.make_jobs(before, [("none", 0), ("truth", 0)], tmp_path)
+    checkpoint = tmp_path / "last.ckpt"
+    checkpoint.write_bytes(b"a twin")
+    bench = small_bench(tmp_path, monkeypatch, checkpoint=str(checkpoint), scene=None)
+    bench.simulator("learned").twin.config["cfg"] = {"scene": {"format": "builtin", "name": "tiny"}}
+    made, record = [], study._record
+    monkeypatch.setattr(study, "_record", lambda bench, name, seed: made.append(name) or record(bench, name, seed))
+    study.table(bench, ["learned", "truth"], [0], tmp_path, filmed=0)
+    assert made == ["learned"]
+    bench.simulator("learned").twin.config["cfg"]["scene"]["seed"] = 3
+    with pytest.raises(DataError, match=r"pushing_truth_0.json: expected a job of the same setting, .*'seed': 0.*'seed': 3"):
+        study.make_jobs(bench, [("truth", 0)], tmp_path)
+
+
+def test_a_film_without_ffmpeg_is_its_frames(tmp_path, monkeypatch):
+    def absent(*a, **k):
+        raise RuntimeError("no ffmpeg")
+
+    monkeypatch.setattr(pictures, "write_video", absent)
+    shown = [np.full((16, 16, 3), 100 * t, dtype=np.uint8) for t in range(2)]
+    written = pictures.write_films(tmp_path, {"a": shown, "b": shown}, "trial_0")
+    frames = [tmp_path / "trial_0" / f"{t:02d}.png" for t in range(2)]
+    assert written == [tmp_path / "trial_0.png", *frames] and not list(tmp_path.glob("*.mp4"))
+    for t, frame in enumerate(frames):
+        assert (np.asarray(imageio.imread(frame))[-1, -1] == 100 * t).all()
 
 
 def test_what_a_job_takes_is_said_before(tmp_path, monkeypatch):
