@@ -20,7 +20,6 @@ from types import SimpleNamespace
 import fits
 import numpy as np
 import torch
-import yaml
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
@@ -30,6 +29,7 @@ from mosa.data.builtin.drop import GRAVITY, simulate
 from mosa.data.builtin.objects import object_named
 from mosa.data.builtin.shapes import SHAPES
 from mosa.data.builtin.surface import bind, extract_surface, fill
+from mosa.experiments.specification import SHARED, options_of, read_yaml
 from mosa.metrics import identification_errors
 from mosa.modules.body import Start
 from mosa.modules.identification import Identification
@@ -45,8 +45,8 @@ WAVES = 24
 
 def overrides_of(name: str) -> list[str]:
     """Of a stand-in, as the table of system identification has them."""
-    found = yaml.safe_load((CONF / "experiment" / "paper" / "_shared.yaml").read_text())["stand-ins"]
-    return [str(each) for each in found[name]]
+    stand_ins = options_of("stand-ins", "stand-ins", read_yaml(CONF / "experiment" / "paper" / f"{SHARED}.yaml"))
+    return list(next(option.overrides for option in stand_ins if option.name == name))
 
 
 def configuration(name: str, more: list[str]) -> dict:
