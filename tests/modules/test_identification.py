@@ -372,3 +372,6 @@ def test_a_calibration_whose_residuals_are_a_few_patterns_is_less_sure():
         sure.append((found.independent(), found.posterior().covariance[0, 0], found.newton.posterior().covariance[0, 0]))
     assert sure[0][0] == 1.0 and sure[0][1] == sure[0][2]
     assert sure[1][0] < 0.1 and sure[1][1] > 5 * sure[1][2]
+    # the bend is one pattern in all frames, and not one in each
+    counted = 100 / 30 * found.settings.count * (FRAMES - bent.first_contact)
+    assert 1 <= sure[1][0] * counted < 3
