@@ -146,15 +146,26 @@ def fit(
     }  # fmt: skip
 
 
+def deviations(name: str, found: dict) -> float:
+    """Error in standard deviations of the posterior; of moduli, whose deviations are relative, that of the logarithm."""
+    if name in ("nu", "friction_angle"):
+        return abs(found["found"] - found["true"]) / found["sd"]
+    return abs(math.log(found["found"] / found["true"])) / found["sd"]
+
+
 def table(records: list[dict]) -> str:
     heads = ("scene", "set", "particles", "parameter", "true", "from the search", "found", "error %", "sd of the noise",
-             "posterior sd", "rms mm", "s")  # fmt: skip
+             "posterior sd", "error / posterior sd", "rms mm", "s")  # fmt: skip
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    off = []
     for r in records:
         for name, p in r["parameters"].items():
+            off.append(deviations(name, p))
             numbers = f"{p['true']:.4g} | {p['start']:.4g} | {p['found']:.4g} | {100 * p['error']:.1f} | {p['sd_of_noise']:.3g}"
             lines.append(f"| {r['scene']} | {' '.join(r['set'])} | {r['particles']} | {name} | {numbers} | {p['sd']:.3g} | "
-                         f"{r['rms_mm']:.1f} | {r['seconds']:.0f} |")  # fmt: skip
+                         f"{off[-1]:.2f} | {r['rms_mm']:.1f} | {r['seconds']:.0f} |")  # fmt: skip
+    size = np.sqrt(np.mean(np.square(off)))
+    lines += ["", f"root mean square of error / posterior sd, 1 where that is honest: {size:.2f} ({len(off)} numbers)"]
     return "\n".join(lines)
 
 
