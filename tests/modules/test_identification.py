@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small_bodies import NU, WORLD, E, cues_of, small_body, start, take_of
+from small_bodies import FRAME_DT, NU, WORLD, E, cues_of, small_body, start, take_of
 
 from mosa.analysis.anisotropy import dyads
 from mosa.analysis.stiffness import angle_between, stiffest
@@ -281,6 +281,16 @@ def test_what_it_refuses():
                        ("threads", 1.5), ("grid_error", -1.0), ("model_error", 2)):  # fmt: skip
         with pytest.raises(ConfigError, match=rf"identification\.{key}: expected"):
             IdentificationSettings(**{key: value})
+
+
+def test_a_body_whose_grid_is_changed_is_simulated_on_that_one():
+    """Its simulator is kept between rollouts, and kept the grid that it was made with."""
+    body, fresh = small_body(adapter=False), small_body(adapter=False)
+    body.simulate(start(), WORLD, FRAMES, FRAME_DT, substeps=40)
+    for each in (body, fresh):
+        each.settings = replace(each.settings, dx=COARSER * each.settings.dx)
+    moved = [each.simulate(start(), WORLD, FRAMES, FRAME_DT, substeps=40).x for each in (body, fresh)]
+    assert torch.equal(*moved)
 
 
 def seen_on_a_coarser_grid(truth, angle=0.5):
