@@ -20,7 +20,6 @@ from types import SimpleNamespace
 import fits
 import numpy as np
 import torch
-import yaml
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
@@ -30,6 +29,7 @@ from mosa.data.builtin.drop import GRAVITY, simulate
 from mosa.data.builtin.objects import object_named
 from mosa.data.builtin.shapes import SHAPES
 from mosa.data.builtin.surface import bind, extract_surface, fill
+from mosa.experiments.specification import SHARED, options_of, read_yaml
 from mosa.metrics import identification_errors
 from mosa.modules.body import Start
 from mosa.modules.identification import Identification
@@ -45,8 +45,8 @@ WAVES = 24
 
 def overrides_of(name: str) -> list[str]:
     """Of a stand-in, as the table of system identification has them."""
-    found = yaml.safe_load((CONF / "experiment" / "paper" / "_shared.yaml").read_text())["stand-ins"]
-    return [str(each) for each in found[name]]
+    stand_ins = options_of("stand-ins", "stand-ins", read_yaml(CONF / "experiment" / "paper" / f"{SHARED}.yaml"))
+    return list(next(option.overrides for option in stand_ins if option.name == name))
 
 
 def configuration(name: str, more: list[str]) -> dict:
@@ -146,15 +146,26 @@ def fit(
     }  # fmt: skip
 
 
+def deviations(name: str, found: dict) -> float:
+    """Error in standard deviations of the posterior; of moduli, whose deviations are relative, that of the logarithm."""
+    if name in ("nu", "friction_angle"):
+        return abs(found["found"] - found["true"]) / found["sd"]
+    return abs(math.log(found["found"] / found["true"])) / found["sd"]
+
+
 def table(records: list[dict]) -> str:
     heads = ("scene", "set", "particles", "parameter", "true", "from the search", "found", "error %", "sd of the noise",
-             "posterior sd", "rms mm", "s")  # fmt: skip
+             "posterior sd", "error / posterior sd", "rms mm", "s")  # fmt: skip
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    off = []
     for r in records:
         for name, p in r["parameters"].items():
+            off.append(deviations(name, p))
             numbers = f"{p['true']:.4g} | {p['start']:.4g} | {p['found']:.4g} | {100 * p['error']:.1f} | {p['sd_of_noise']:.3g}"
             lines.append(f"| {r['scene']} | {' '.join(r['set'])} | {r['particles']} | {name} | {numbers} | {p['sd']:.3g} | "
-                         f"{r['rms_mm']:.1f} | {r['seconds']:.0f} |")  # fmt: skip
+                         f"{off[-1]:.2f} | {r['rms_mm']:.1f} | {r['seconds']:.0f} |")  # fmt: skip
+    size = np.sqrt(np.mean(np.square(off)))
+    lines += ["", f"root mean square of error / posterior sd, 1 where that is honest: {size:.2f} ({len(off)} numbers)"]
     return "\n".join(lines)
 
 

@@ -105,4 +105,18 @@ def test_the_errors_of_a_calibration_s_cues_are_smooth_and_as_large_as_asked(mon
     assert np.abs(errors[0]).max() == 0 and errors[1:].std() == pytest.approx(0.002, rel=0.1)
     assert np.corrcoef(errors[1:, 0, 0], errors[1:, 1, 0])[0, 1] > 0.8
     assert abs(np.corrcoef(errors[1:-1, 0, 0], errors[2:, 0, 0])[0, 1]) < 0.5
-    assert calibration.overrides_of("trophy")[0] == "scene=standin"
+    for name in ("torus", "trophy"):  # one with a cost in the table's file, and one without
+        assert calibration.overrides_of(name)[:2] == ["scene=standin", f"scene.name={name}"]
+
+
+def test_a_calibration_s_table_says_whether_its_posteriors_are_honest(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    calibration = importlib.import_module("calibration")
+    numbers = {
+        "E": {"true": 1e5, "start": 2e5, "found": 1e5 * np.exp(0.2), "error": 0.22, "sd_of_noise": 0.01, "sd": 0.1},  # relative
+        "nu": {"true": 0.3, "start": 0.2, "found": 0.34, "error": 0.13, "sd_of_noise": 0.002, "sd": 0.04},
+    }
+    record = {"scene": "ball", "set": [], "particles": 9, "parameters": numbers, "rms_mm": 1.0, "seconds": 2.0}
+    *rows, _, last = calibration.table([record, record]).splitlines()
+    assert [row.split(" | ")[-3] for row in rows[2:]] == ["2.00", "1.00"] * 2
+    assert last.endswith("1.58 (4 numbers)") and len({row.count("|") for row in rows}) == 1

@@ -50,7 +50,8 @@ def run_jobs(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: i
             ready = next((job for job in waiting if job.first not in making), None)
             if free and ready is not None:
                 waiting.remove(ready)
-                device = free.pop(0)
+                device = max(devices, key=free.count)  # of several the one with the fewest jobs
+                free.remove(device)
                 running[begin(ready, device)] = (ready, device, time.perf_counter())
             else:
                 time.sleep(WAIT)

@@ -240,7 +240,7 @@ class Body(nn.Module):
         """The simulator of `law` in `world`, one per time step (kernels are compiled once per law and precision).
 
         strain: of an adapter whose operator is a stiffness (`Simulator`)."""
-        key = (law, substeps, frame_dt, str(self.rest.device), strain)
+        key = (law, substeps, frame_dt, str(self.rest.device), strain, self.settings.dx)
         if getattr(self, "_simulator_key", None) != key or self._simulator_world is not world:
             dtype = torch.float64 if self.settings.precision == 64 else torch.float32
             self._simulator = Simulator(

@@ -486,10 +486,13 @@ class Identification:
         """Share of the data that a calibration counts which its residuals bear out, in (0, 1].
 
         What a free rollout leaves beyond the cues' own noise is what grid, contact and the law's form get wrong: a few smooth
-        patterns (`residuals.patterns`), and not `count` independent errors in every frame."""
-        counted = 100 / 30 * self.settings.count
-        cues = 3 * residuals.floors(self.body.settings.dx, 0.0)[0] ** 2
-        wrong = [1 - cues / float(scales[0][min(take.first_contact, len(scales[0])) - 1 :].square().mean())
-                 for take, scales in zip(self.takes, self.noise)]  # fmt: skip
-        each = max(1.0, residuals.patterns(self._fields(self.body)))
-        return 1 / (1 + max(0.0, sum(wrong) / len(wrong)) * max(0.0, counted / each - 1))
+        patterns in all the frames together (`residuals.patterns`), and not `count` independent errors in every one of them."""
+        each, cues = 100 / 30 * self.settings.count, 3 * residuals.floors(self.body.settings.dx, 0.0)[0] ** 2
+        counted, wrong, late = 0.0, 0.0, []
+        for take, scales, found in zip(self.takes, self.noise, self._fields(self.body)):
+            frames = slice(min(take.first_contact, len(scales[0])) - 1, None)
+            wrong += (1 - cues / float(scales[0][frames].square().mean())) / len(self.takes)
+            counted += each * len(scales[0][frames])
+            late.append(residuals.Fields(*(field[frames] for field in found)))
+        borne = len(late) * max(1.0, residuals.patterns(late))
+        return 1 / (1 + max(0.0, wrong) * max(0.0, counted / borne - 1))

@@ -232,6 +232,16 @@ def test_every_gpu_has_its_own_jobs(tmp_path, monkeypatch):
     assert {json.loads((job.folder / "metrics.json").read_text())["gpu"] for job in jobs} == {"4", "7"}
 
 
+def test_jobs_are_spread_over_the_gpus_where_there_are_places_for_more(tmp_path, monkeypatch):
+    monkeypatch.setattr(running, "command_of", lambda job: [sys.executable, "-c", FAKE, str(job.folder)])
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    scenes = tuple(Option(name, (f"scene={name}",)) for name in "abcd")
+    jobs = jobs_of(experiment(axes={"method": (Option("ours", ("adapter=operator",)),), "scene": scenes}, seeds=(0,)), tmp_path)
+    assert running.run_jobs(jobs, [0, 1], 4) == {}
+    taken = [json.loads((job.folder / "metrics.json").read_text())["gpu"] for job in jobs]
+    assert sorted(taken) == ["0", "0", "1", "1"]
+
+
 # ------------------------------------------------------------------------------------------------ tables of made-up figures
 def made_up(tmp_path) -> tuple[Experiment, list]:
     found = experiment()

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small_bodies import NU, WORLD, E, cues_of, small_body, start, take_of
+from small_bodies import FRAME_DT, NU, WORLD, E, cues_of, small_body, start, take_of
 
 from mosa.analysis.anisotropy import dyads
 from mosa.analysis.stiffness import angle_between, stiffest
@@ -283,6 +283,16 @@ def test_what_it_refuses():
             IdentificationSettings(**{key: value})
 
 
+def test_a_body_whose_grid_is_changed_is_simulated_on_that_one():
+    """Its simulator is kept between rollouts, and kept the grid that it was made with."""
+    body, fresh = small_body(adapter=False), small_body(adapter=False)
+    body.simulate(start(), WORLD, FRAMES, FRAME_DT, substeps=40)
+    for each in (body, fresh):
+        each.settings = replace(each.settings, dx=COARSER * each.settings.dx)
+    moved = [each.simulate(start(), WORLD, FRAMES, FRAME_DT, substeps=40).x for each in (body, fresh)]
+    assert torch.equal(*moved)
+
+
 def seen_on_a_coarser_grid(truth, angle=0.5):
     """What the law of `truth` does on a grid 1.25 times as coarse, as if it had been seen."""
     other = copy.deepcopy(truth)
@@ -372,3 +382,6 @@ def test_a_calibration_whose_residuals_are_a_few_patterns_is_less_sure():
         sure.append((found.independent(), found.posterior().covariance[0, 0], found.newton.posterior().covariance[0, 0]))
     assert sure[0][0] == 1.0 and sure[0][1] == sure[0][2]
     assert sure[1][0] < 0.1 and sure[1][1] > 5 * sure[1][2]
+    # the bend is one pattern in all frames, and not one in each
+    counted = 100 / 30 * found.settings.count * (FRAMES - bent.first_contact)
+    assert 1 <= sure[1][0] * counted < 3
