@@ -20,6 +20,8 @@ GAINED = 1.5
 """A window has room for particles that come to move faster by this factor along the axes on which they move,"""
 TURNED = 0.5
 """and in any direction at this times the largest speed: what hits the ground spreads."""
+_OUTWARDS = np.repeat([-1.0, 1.0], 3)
+"""Of lowest and highest velocities: what moves a body's lower and its upper ends away from it."""
 
 
 def extent(x: Tensor, v: Tensor) -> Tensor:
@@ -72,11 +74,9 @@ def grid_window(
 def window_of(bounds: np.ndarray, dx: float, time: float, margin: int) -> tuple[np.ndarray, np.ndarray]:
     """As `grid_window`, of extents (..., 12) and of any size."""
     bounds = np.asarray(bounds, dtype=np.float64)
-    turned = TURNED * np.abs(bounds[..., 6:]).max(-1, keepdims=True)  # by the largest component of a velocity
-
-    def nodes(speed: np.ndarray) -> np.ndarray:
-        return np.ceil(np.maximum(GAINED * speed, turned) * time / dx) + margin
-
-    low = np.floor(bounds[..., :3] / dx - 0.5) - nodes(-bounds[..., 6:9])
-    high = np.floor(bounds[..., 3:6] / dx - 0.5) + 2 + nodes(bounds[..., 9:])
+    speeds = _OUTWARDS * bounds[..., 6:]
+    turned = TURNED * np.abs(speeds).max(-1, keepdims=True)  # by the largest component of a velocity
+    ahead = np.ceil(np.maximum(GAINED * speeds, turned) * time / dx) + margin
+    cells = np.floor(bounds[..., :6] / dx - 0.5)
+    low, high = cells[..., :3] - ahead[..., :3], cells[..., 3:] + 2 + ahead[..., 3:]
     return low.astype(np.int64), (high - low + 1).astype(np.int64)
