@@ -55,14 +55,14 @@ def grid_window(
         raise SimulationDiverged(f"{name(world)}particle {bad} has a non-finite position or velocity before the substep")
     low, dims = window_of(bounds, dx, time, margin)
     far = np.abs(low).max(-1) + dims.max(-1)
-    if (far > FARTHEST).any():
+    if far.max() > FARTHEST:
         world = int(np.argmax(far))
         raise SimulationDiverged(
             f"{name(world)}a particle is {np.abs(rows[world, :6]).max():.3g} m from the origin, more than {FARTHEST} nodes of {dx} "
             "m: use more substeps, or a box"
         )
     nodes = dims.prod(-1)
-    if (nodes > MAX_NODES).any() or nodes.sum() > MOST_NODES:
+    if nodes.max() > MAX_NODES or nodes.sum() > MOST_NODES:
         world = int(np.argmax(nodes))
         raise SimulationDiverged(
             f"{name(world)}particles spread over {dims.reshape(-1, 3)[world].tolist()} grid nodes of {dx} m (speeds to "
