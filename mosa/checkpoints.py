@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError, DataError
+from mosa.extensions import registered_keys
 from mosa.keys import BODY
 from mosa.limits import machine_memory
 from mosa.modules.material import RIVALS
@@ -172,7 +173,7 @@ def checked(checkpoint: Mapping[str, Any], path: str | Path) -> tuple[dict, dict
         stored = {name: config[name] for name in ("density", "dx", "frame_dt", "world")}
         check(stored | {"starts": {"fit": saved["start"], **starts}}, STORED)
         used = {name: config["cfg"][name] for name in ("seed", "simulation", "prior", "heterogeneity", "adapter")}
-        check(used | {"world": config["cfg"].get("world") or {}}, BODY)
+        check(used | {"world": config["cfg"].get("world") or {}}, BODY, registered_keys(used))
     except ConfigError as error:
         raise DataError(f"ckpt_path: {path}: stored configuration: {error}") from error
     if not isinstance(state, Mapping):

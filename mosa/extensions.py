@@ -7,14 +7,13 @@ checkpoint of a run that had some imports them before (docs/extending.md).
 from __future__ import annotations
 
 import importlib
-import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mosa.errors import ConfigError, MosaError
 from mosa.modules.adapters import adapter_class
 from mosa.modules.terms import term_names
-from mosa.schema import NAMES, WEIGHT, Kind
+from mosa.schema import NAMES, WEIGHT, Kind, arguments_of
 
 
 def load_extensions(names: Sequence[str] | None) -> None:
@@ -35,7 +34,8 @@ def load_extensions(names: Sequence[str] | None) -> None:
 
 
 def registered_keys(values: Mapping[str, Any]) -> dict[str, Kind]:
-    """Keys of the configuration that what is registered brings: a weight for each loss term, the arguments of the chosen adapter.
+    """Keys of the configuration that what is registered brings, and what each may be: a weight for each loss term, the arguments
+    of the chosen adapter.
 
     Errors: ConfigError for an adapter that is not known."""
     section = values.get("adapter")
@@ -43,5 +43,5 @@ def registered_keys(values: Mapping[str, Any]) -> dict[str, Kind]:
     keys = {f"losses.{name}": WEIGHT for name in term_names(build)}
     if build is not None:
         anything = Kind("a value", lambda value: True)  # which the adapter checks itself
-        keys |= {f"adapter.{name}": anything for name in inspect.signature(build).parameters}
+        keys |= {f"adapter.{name}": build.knobs.get(name, anything) for name in arguments_of(build)}
     return keys

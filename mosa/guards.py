@@ -34,9 +34,10 @@ FEWEST = 8
 def check_configuration(values: Mapping[str, Any], conf: Path | None = None) -> None:
     """All that train.py's configuration says by itself; a warning for each key that was set and does nothing. conf: the folder of
     its YAML files, None for the running program's. Errors: ConfigError naming the key."""
+    schemas = TRAINING, EVALUATION, registered_keys(values)
     if (conf := conf or conf_folder()) is not None:
-        check_known(values, conf, "train", TRAINING, EVALUATION, registered_keys(values))
-    check(values, TRAINING, EVALUATION)
+        check_known(values, conf, "train", *schemas)
+    check(values, *schemas)
     if values["simulation"]["particles"] != "auto":
         check_particles("simulation.particles", values["simulation"]["particles"])
     stages = rehearse(values)
@@ -53,9 +54,10 @@ def check_evaluation(values: Mapping[str, Any]) -> None:
 
 def check_splats(values: Mapping[str, Any]) -> None:
     """All that the configuration of `python -m mosa.splats` says by itself. Errors: ConfigError naming the key."""
+    schemas = SPLATS, registered_keys(values)
     if (conf := conf_folder()) is not None:
-        check_known(values, conf, "splats", SPLATS, registered_keys(values))
-    check(values, SPLATS)
+        check_known(values, conf, "splats", *schemas)
+    check(values, *schemas)
     check_formats(values["formats"])
     if values["simulation"]["particles"] != "auto":
         check_particles("simulation.particles", values["simulation"]["particles"])

@@ -1,6 +1,7 @@
 """What each key of a configuration may be, checked before anything is computed: a typing mistake costs no reconstruction.
 
-What settings dataclasses say of their fields is taken from them. Only kinds and ranges of single values are here; which names,
+What settings dataclasses say of their fields is taken from them, what an adapter says of its arguments is added where its name is
+known (`mosa.extensions.registered_keys`). Only kinds and ranges of single values are here; which names,
 files and combinations exist is said where they are used.
 """
 
@@ -32,7 +33,6 @@ from mosa.schema import (
     THREE,
     TURN,
     WEIGHT,
-    WIDEST,
     Kind,
     is_number,
     kinds_of,
@@ -78,24 +78,9 @@ TRAINING: dict[str, Kind] = {
     "fit.views": COUNT,
     "fit.clip": POSITIVE,
     "losses.*": WEIGHT,
-    "adapter.strain": one_of("green", "biot", "hencky"),
     "prior.candidates": or_null(NAMES),
     "adapter.name": or_null(TEXT),
     "adapter._target_": or_null(TEXT),
-    "adapter.alpha": POSITIVE,
-    "adapter.alpha_normal": or_null(POSITIVE),
-    "adapter.l_max": or_null(POSITIVE),
-    "adapter.input_scale": POSITIVE,
-    "adapter.hidden": whole(1, WIDEST),
-    "adapter.start": one_of("prior", "random"),
-    "adapter.plastic_rate": POSITIVE,
-    "adapter.rank": whole(1, WIDEST),
-    "adapter.scaling": POSITIVE,
-    "adapter.nodes": whole(8, 10**5),
-    "adapter.neighbours": whole(4, 1000),
-    "adapter.stiffer": number(0, 5, above=True),
-    **{f"adapter.{name}": FLAG for name in ("rest_free", "plastic", "major_symmetry", "recompute", "no_C", "no_pre", "no_post",
-                                            "no_prior_stress")},
     "simulation.particles": or_auto(whole(8, 10**8)),
     "simulation.particles_per_cell": number(1, 64),
     "simulation.dx": or_null(POSITIVE),

@@ -30,11 +30,12 @@ def is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def number(low: float, high: float = math.inf, *, above: bool = False) -> Kind:
-    """From `low`, or `above` it, to `high`."""
+def number(low: float, high: float = math.inf, *, above: bool = False, below: bool = False) -> Kind:
+    """From `low`, or `above` it, to `high`, or `below` it."""
     start = f"above {low:g}" if above else f"of at least {low:g}"
-    limit = f" and at most {high:g}" if math.isfinite(high) else ""
-    return Kind(f"a number {start}{limit}", lambda v: is_number(v) and (v > low or (v == low and not above)) and v <= high)
+    limit = f" and {'below' if below else 'at most'} {high:g}" if math.isfinite(high) else ""
+    return Kind(f"a number {start}{limit}",
+                lambda v: is_number(v) and (v > low or (v == low and not above)) and (v < high or (v == high and not below)))
 
 
 def whole(low: int, high: int | None = None) -> Kind:
@@ -88,15 +89,25 @@ def kinds_of(settings: type, where: str) -> dict[str, Kind]:
 
 def check_knobs(settings: Any, where: str) -> None:
     """Every field is of its kind. Errors: ConfigError naming the first that is not, as a key below `where`."""
-    for f in fields(settings):
-        kind, value = f.metadata.get("kind"), getattr(settings, f.name)
-        if kind is not None and not kind.fits(value):
-            raise ConfigError(f"{where}.{f.name}: expected {kind.described}, found {value!r}")
+    values = {f.name: getattr(settings, f.name) for f in fields(settings)}
+    check_kinds(values, {f.name: f.metadata["kind"] for f in fields(settings) if "kind" in f.metadata}, where)
+
+
+def check_kinds(values: Mapping[str, Any], kinds: Mapping[str, Kind], where: str) -> None:
+    """Every value that has a kind is of it. Errors: ConfigError naming the first that is not, as a key below `where`."""
+    for name, value in values.items():
+        if name in kinds and not kinds[name].fits(value):
+            raise ConfigError(f"{where}.{name}: expected {kinds[name].described}, found {value!r}")
+
+
+def arguments_of(build: Callable) -> dict[str, inspect.Parameter]:
+    """What `build` can be given by name."""
+    return {name: p for name, p in inspect.signature(build).parameters.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
 
 
 def known_keys(where: str, build: Callable, keys: Mapping[str, Any], *positional: Any) -> Any:
     """build(*positional, **keys). Errors: ConfigError for a key that it does not take."""
-    known = inspect.signature(build).parameters
+    known = arguments_of(build)
     if unknown := [k for k in keys if k not in known]:
         raise ConfigError(f"{where}.{unknown[0]}: unknown key; expected one of {', '.join(list(known)[len(positional):])}")
     needed = [k for k, parameter in list(known.items())[len(positional):] if parameter.default is parameter.empty]

@@ -13,7 +13,9 @@ from omegaconf import OmegaConf
 from mosa.config import build_adapter, build_stages, rehearse
 from mosa.errors import ConfigError
 from mosa.evaluation_settings import EvaluationSettings
+from mosa.extensions import registered_keys
 from mosa.keys import EVALUATION, SIMULATION, TRAINING
+from mosa.modules.adapters import ADAPTERS, adapter_class
 from mosa.modules.criteria import Criterion
 from mosa.modules.heterogeneity import HeterogeneitySettings
 from mosa.modules.identification import IdentificationSettings
@@ -25,7 +27,7 @@ from mosa.reconstruction.geometry import GeometrySettings
 from mosa.reconstruction.informed import InformedSettings
 from mosa.reconstruction.settings import ReconstructionSettings
 from mosa.reconstruction.static import FitSettings, StaticSettings
-from mosa.schema import check
+from mosa.schema import arguments_of, check
 
 ROOT = Path(__file__).parents[1]
 
@@ -68,7 +70,7 @@ def test_a_mistyped_option_is_refused(override):
     ({"name": "stress", "alfa": 0.1}, "adapter.alfa: unknown key; expected one of alpha"),
     ({"name": "stres"}, "adapter.name: expected hyperelastic, stress, direct, nclaw, neuma, interaction or null, found 'stres'"),
     ({"name": ["stress"]}, "adapter.name: expected hyperelastic, stress, direct, nclaw, neuma, interaction or null"),
-    ({"name": "hyperelastic", "strain": "almansi"}, "adapter.strain: expected one of hencky, biot, green, found 'almansi'"),
+    ({"name": "hyperelastic", "strain": "almansi"}, "adapter.strain: expected hencky or biot or green, found 'almansi'"),
     ({"name": "hyperelastic", "alpha": 0.2}, "adapter.alpha: unknown key; expected one of strain"),
     ({"name": "direct", "_target_": "mosa.modules.adapter.StressAdapter"}, "found both"),
     ({"_target_": "mosa.modules.adapter.Stress"}, "adapter._target_: expected a known adapter"),
@@ -120,7 +122,7 @@ def test_a_calibration_looks_again_where_it_is_all_there_is(override, adapter, e
 def test_every_option_passes_the_checks_before_a_run(group_name):
     for option in group(group_name):
         config = composed(f"{group_name}={option}")
-        check(config, TRAINING, EVALUATION)
+        check(config, TRAINING, EVALUATION, registered_keys(config))
         rehearse(config)
 
 
@@ -140,7 +142,8 @@ def test_every_option_passes_the_checks_before_a_run(group_name):
 def test_a_value_of_the_wrong_kind_is_named_before_anything_is_computed(override):
     base = ["adapter=linear"] if override.startswith("adapter.") else []  # it has the keys, and the default has not
     with pytest.raises(ConfigError, match=rf"^{override.lstrip('+').split('=')[0]}: expected .*, found "):
-        check(composed(*base, override), TRAINING, EVALUATION)
+        config = composed(*base, override)
+        check(config, TRAINING, EVALUATION, registered_keys(config))
 
 
 @pytest.mark.parametrize("overrides, message", [
@@ -236,3 +239,20 @@ def test_a_knob_is_written_once(settings):
         assert not kind.fits(wrong)
         with pytest.raises(ConfigError, match=rf"\.{f.name}: expected {re.escape(kind.described)}, found <object"):
             settings(**{**given, f.name: wrong})
+
+
+@pytest.mark.parametrize("name", sorted(ADAPTERS))
+def test_an_adapters_knobs_are_its_own(name):
+    """Its class says what each argument may be, the check of a configuration has that from there, and the adapter refuses what that
+    refuses; another adapter may have an argument of the same name that is something else."""
+    build = adapter_class({"name": name})
+    arguments, keys = arguments_of(build), registered_keys({"adapter": {"name": name}})
+    assert set(build.knobs) == set(arguments)
+    for argument, kind in build.knobs.items():
+        assert kind.fits(arguments[argument].default) and keys[f"adapter.{argument}"] is kind
+        assert f"adapter.{argument}" not in TRAINING
+        wrong = object()
+        with pytest.raises(ConfigError, match=rf"^adapter\.{argument}: expected {re.escape(kind.described)}, found <object"):
+            build(**{argument: wrong})
+        with pytest.raises(ConfigError, match=rf"^adapter\.{argument}: expected "):
+            build_adapter({"name": name, argument: wrong})

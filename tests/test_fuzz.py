@@ -19,6 +19,7 @@ from mosa.config import rehearse
 from mosa.data.export import export_pacnerf, export_transforms
 from mosa.data.scene import load_scene
 from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
+from mosa.extensions import registered_keys
 from mosa.keys import EVALUATION, TRAINING
 from mosa.known import check_known
 from mosa.npz import read_npz, write_npz
@@ -36,8 +37,9 @@ def one_message(error: MosaError) -> None:
 def configured(config: dict) -> None:
     """What train.py checks before it reads data."""
     try:
-        check_known(config, ROOT / "conf", "train", TRAINING, EVALUATION)
-        check(config, TRAINING, EVALUATION)
+        schemas = TRAINING, EVALUATION, registered_keys(config)
+        check_known(config, ROOT / "conf", "train", *schemas)
+        check(config, *schemas)
         rehearse(config)
     except ConfigError as error:
         one_message(error)

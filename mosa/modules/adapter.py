@@ -10,12 +10,17 @@ from torch.utils.checkpoint import checkpoint
 
 from mosa.errors import ConfigError
 from mosa.modules.adapter_base import Adapter
-from mosa.modules.fused.selection import PRECISIONS, check_options, chosen, weights_of
+from mosa.modules.fused.selection import FUSED, PRECISIONS, chosen, weights_of
 from mosa.modules.progressive import Correction, ProgressiveOperator, apply
 from mosa.modules.stiffening import ADAPTER_MARGIN, acoustic_stiffening, worst_stiffening
 from mosa.modules.warm_start import warm_start
 from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState
 from mosa.physics.engine.network_evaluation import backward_at_hand
+from mosa.schema import FLAG, POSITIVE, WIDEST, number, one_of, or_null, whole
+
+NETWORK = {"l_max": or_null(POSITIVE), "input_scale": POSITIVE, "hidden": whole(1, WIDEST)}
+"""What the arguments of a bounded network may be."""
+ABLATIONS = ("no_C", "no_pre", "no_post", "no_prior_stress")
 
 
 class StressAdapter(Adapter):
@@ -32,6 +37,12 @@ class StressAdapter(Adapter):
     no_C, no_pre, no_post, no_prior_stress: ablations. Errors: ConfigError naming the key for values out of range.
     """
 
+    knobs = {
+        "alpha": number(0, 1, above=True, below=True), "alpha_normal": or_null(number(0, 1, above=True, below=True)),
+        "state_dependence": one_of("full", "constant"), "fused": FUSED, "precision": one_of(*PRECISIONS), **NETWORK,
+        **dict.fromkeys(("rest_free", "plastic", "major_symmetry", "recompute", *ABLATIONS), FLAG),
+    }  # fmt: skip
+
     def __init__(
         self, *, alpha: float = 0.1, alpha_normal: float | None = None, l_max: float | None = 0.1, input_scale: float = 10.0,
         hidden: int = 64, rest_free: bool = True, plastic: bool = False, major_symmetry: bool = False,
@@ -39,16 +50,8 @@ class StressAdapter(Adapter):
         no_C: bool = False, no_pre: bool = False, no_post: bool = False, no_prior_stress: bool = False,
     ) -> None:  # fmt: skip
         super().__init__()
-        if not 0 < alpha < 1:
-            raise ConfigError(f"adapter.alpha: expected a number between 0 and 1, found {alpha}")
-        if alpha_normal is not None and not 0 < alpha_normal < 1:
-            raise ConfigError(f"adapter.alpha_normal: expected a number between 0 and 1 or null, found {alpha_normal}")
-        check_network(l_max, input_scale, hidden)
-        if state_dependence not in ("full", "constant"):
-            raise ConfigError(f"adapter.state_dependence: expected full or constant, found {state_dependence!r}")
         if no_prior_stress and no_pre:
             raise ConfigError("adapter: no_prior_stress needs L_pre (no_pre=false): the stress comes from it alone")
-        check_options(fused, precision)
         self.rest_free, self.recompute, self.fused, self.precision = rest_free, recompute, fused, precision
         shape = {"alpha": alpha, "alpha_normal": alpha_normal, "input_scale": input_scale, "hidden": hidden}
         shape |= {"state_dependence": state_dependence, "no_C": no_C, "no_pre": no_pre, "no_post": no_post}
@@ -154,13 +157,3 @@ def rested(b: Tensor, rest: Tensor, w: Tensor, s: Tensor) -> Tensor:
     difference = b - rest
     at_rest = ((w == 0) & (s == 0)).all(-1, keepdim=True)
     return difference - torch.where(at_rest, difference.detach(), torch.zeros_like(difference))
-
-
-def check_network(l_max: float | None, input_scale: float, hidden: int) -> None:
-    """Errors: ConfigError naming the key."""
-    if l_max is not None and not l_max > 0:
-        raise ConfigError(f"adapter.l_max: expected a positive number or null, found {l_max}")
-    if not input_scale > 0:
-        raise ConfigError(f"adapter.input_scale: expected a positive number, found {input_scale}")
-    if not (isinstance(hidden, int) and hidden > 0):
-        raise ConfigError(f"adapter.hidden: expected a positive whole number, found {hidden!r}")

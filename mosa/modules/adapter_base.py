@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -15,6 +16,7 @@ from mosa.modules.penalties import PENALTIES, OperatorStatistics, Penalty, stati
 from mosa.modules.stiffening import ADAPTER_MARGIN
 from mosa.physics.constitutive.laws import Law
 from mosa.physics.engine.adapter_interface import MaterialState
+from mosa.schema import Kind, check_kinds
 
 
 class Adapter(nn.Module, AdapterProtocol):
@@ -25,8 +27,14 @@ class Adapter(nn.Module, AdapterProtocol):
     few_numbers = False
     replaces_law = False
     own_dynamics = False
+    knobs: Mapping[str, Kind] = {}
     penalties: Mapping[str, Penalty] = PENALTIES
     flow: Callable[[Tensor, float], Tensor] | None = None
+
+    def __new__(cls, *_, **given: Any):
+        """Errors: ConfigError naming a keyword argument that is not what `knobs` says."""
+        check_kinds(given, cls.knobs, "adapter")
+        return super().__new__(cls)
 
     def __init__(self) -> None:
         super().__init__()

@@ -45,7 +45,8 @@ def adapter_class(config: Mapping[str, Any]) -> type[nn.Module] | None:
     if name is None:
         return None
     if not isinstance(name, str) or name not in ADAPTERS:
-        raise ConfigError(f"adapter.name: expected {', '.join(ADAPTERS)} or null, found {name!r}")
+        raise ConfigError(f"adapter.name: expected {', '.join(ADAPTERS)} or null, found {name!r}; one of another package is known "
+                          "once that is imported (extensions)")
     module, _, found = ADAPTERS[name].partition(":")
     try:
         return getattr(importlib.import_module(module), found)

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from mosa.errors import ConfigError
 from mosa.modules.carried_splats import CarriedSplats
 from mosa.modules.contact import ContactOffset
-from mosa.modules.heterogeneity import HeterogeneityField
+from mosa.modules.heterogeneity import StiffnessField
 from mosa.modules.material import Material
 from mosa.modules.model import Model
 from mosa.modules.ready import Ready
@@ -53,7 +53,7 @@ class Body(nn.Module):
         covariances: Tensor,
         density: float,
         material: Material,
-        heterogeneity: HeterogeneityField | None,
+        heterogeneity: StiffnessField | None,
         adapter: nn.Module | None,
         settings: SimulationSettings,
         law_options: LawOptions = AS_USUAL,

@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.modules.adapter import check_network, rested
+from mosa.modules.adapter import ABLATIONS, NETWORK, rested
 from mosa.modules.adapter_base import Adapter
 from mosa.modules.networks import TwoHiddenLayers, zero_outputs
 from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState
+from mosa.schema import FLAG
 
 
 class DirectAdapter(Adapter):
@@ -20,12 +21,13 @@ class DirectAdapter(Adapter):
     Errors: ConfigError naming the key for values out of range, or for an ablation of parts it has not.
     """
 
+    knobs = {**NETWORK, **dict.fromkeys(("rest_free", *ABLATIONS), FLAG)}
+
     def __init__(
         self, *, l_max: float | None = 0.1, input_scale: float = 10.0, hidden: int = 64, rest_free: bool = True,
         no_C: bool = False, no_pre: bool = False, no_post: bool = False, no_prior_stress: bool = False,
     ) -> None:  # fmt: skip
         super().__init__()
-        check_network(l_max, input_scale, hidden)
         switches = {"no_C": no_C, "no_pre": no_pre, "no_post": no_post, "no_prior_stress": no_prior_stress}
         if on := [name for name, value in switches.items() if value]:
             raise ConfigError(f"adapter=direct: {', '.join(on)} ablates parts of adapter=mosa that a black box has not")

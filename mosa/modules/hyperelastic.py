@@ -17,7 +17,6 @@ from functools import lru_cache
 import torch
 from torch import Tensor, nn
 
-from mosa.errors import ConfigError
 from mosa.modules.adapter_base import Adapter
 from mosa.modules.microplane import MANDEL, isotropic_stiffness
 from mosa.modules.penalties import OperatorStatistics
@@ -25,6 +24,7 @@ from mosa.modules.stiffening import ADAPTER_MARGIN, acoustic_stiffening
 from mosa.physics.constitutive.laws import Law
 from mosa.physics.constitutive.strain import STRAINS
 from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState
+from mosa.schema import one_of
 
 SHARPNESS = 60.0
 """Of the smoothed smallest eigenvalue: it is above the true one by at most log(6)/60."""
@@ -65,11 +65,10 @@ class HyperelasticAdapter(Adapter):
     """
 
     few_numbers = True
+    knobs = {"strain": one_of(*STRAINS)}
 
     def __init__(self, *, strain: str = "green") -> None:
         super().__init__()
-        if strain not in STRAINS:
-            raise ConfigError(f"adapter.strain: expected one of {', '.join(STRAINS)}, found {strain!r}")
         self.strain = strain
         self.numbers = nn.Parameter(torch.zeros(NUMBERS))
         self._live: Tensor | None = None

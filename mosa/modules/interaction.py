@@ -30,6 +30,7 @@ from mosa.errors import ConfigError, SimulationDiverged
 from mosa.modules.adapter_base import Adapter
 from mosa.modules.networks import TwoHiddenLayers, zero_outputs
 from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState
+from mosa.schema import WIDEST, number, whole
 from mosa.types import ParticleState, Rollout
 
 DAMPING = 0.1
@@ -49,14 +50,11 @@ class InteractionNetwork(Adapter):
 
     replaces_law = True
     own_dynamics = True
+    knobs = {"hidden": whole(1, WIDEST), "nodes": whole(8, 10**5), "neighbours": whole(4, 1000),
+             "stiffer": number(0, 5, above=True)}  # fmt: skip
 
     def __init__(self, *, hidden: int = 32, nodes: int = 250, neighbours: int = 20, stiffer: float = 1.0) -> None:
         super().__init__()
-        for name, value, low in (("nodes", nodes, 8), ("neighbours", neighbours, 4)):
-            if isinstance(value, bool) or not isinstance(value, int) or value < low:
-                raise ConfigError(f"adapter.{name}: expected a whole number of at least {low}, found {value!r}")
-        if not 0 < stiffer <= 5:
-            raise ConfigError(f"adapter.stiffer: expected a number above 0 and at most 5, found {stiffer}")
         self.most, self.neighbours, self.stiffer = nodes, neighbours, stiffer
         self.net = TwoHiddenLayers(3, 2, hidden)
         zero_outputs(self.net[-1])

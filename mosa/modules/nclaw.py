@@ -23,6 +23,7 @@ from mosa.modules.adapter_base import Adapter
 from mosa.modules.warm_start import SMALLEST_STRAIN, drawn_stretches
 from mosa.physics.constitutive.singular_values import singular_value_decomposition
 from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState
+from mosa.schema import FLAG, POSITIVE, WIDEST, one_of, whole
 
 INPUTS, OUTPUTS = 13, 9
 PLACES = ((0, 5, 4), (5, 1, 3), (4, 3, 2))
@@ -84,13 +85,10 @@ class NeuralLaw(Adapter):
     """
 
     replaces_law = True
+    knobs = {"hidden": whole(1, WIDEST), "start": one_of("prior", "random"), "plastic": FLAG, "plastic_rate": POSITIVE}
 
     def __init__(self, *, hidden: int = 64, start: str = "prior", plastic: bool = False, plastic_rate: float = 2.0) -> None:
         super().__init__()
-        if start not in ("prior", "random"):
-            raise ConfigError(f"adapter.start: expected prior or random, found {start!r}")
-        if not plastic_rate > 0:
-            raise ConfigError(f"adapter.plastic_rate: expected a positive number [1/s], found {plastic_rate}")
         self.start, self.plastic_rate = start, plastic_rate
         self.elastic = network(hidden)
         self.plastic = network(hidden) if plastic else None

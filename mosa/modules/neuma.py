@@ -14,9 +14,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
-from mosa.errors import ConfigError
 from mosa.modules.nclaw import NeuralLaw, network, pretrain
 from mosa.physics.engine.adapter_interface import MaterialState
+from mosa.schema import POSITIVE, WIDEST, whole
 
 
 class LowRankLinear(nn.Linear):
@@ -44,14 +44,13 @@ class LowRankLaw(NeuralLaw):
     Errors: ConfigError naming the key.
     """
 
+    knobs = {"rank": whole(1, WIDEST), "scaling": POSITIVE,
+             **{name: NeuralLaw.knobs[name] for name in ("hidden", "plastic", "plastic_rate")}}  # fmt: skip
+
     def __init__(
         self, *, hidden: int = 64, rank: int = 16, scaling: float = 16.0, plastic: bool = False, plastic_rate: float = 2.0
     ) -> None:
         super().__init__(hidden=hidden, plastic=plastic, plastic_rate=plastic_rate)
-        if isinstance(rank, bool) or not isinstance(rank, int) or rank < 1:
-            raise ConfigError(f"adapter.rank: expected a whole number of at least 1, found {rank!r}")
-        if not scaling > 0:
-            raise ConfigError(f"adapter.scaling: expected a positive number, found {scaling}")
         self.hidden = hidden
         self.elastic = low_rank(self.elastic, rank, scaling)
         # the held weights of the plastic network's last layer are zero: it starts without flow, and B A is what may begin one

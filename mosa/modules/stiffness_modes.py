@@ -10,22 +10,17 @@ import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError
-from mosa.modules.heterogeneity import HeterogeneitySettings, check_box
+from mosa.modules.heterogeneity import HeterogeneitySettings, StiffnessField
 
 
-class StiffnessModes(nn.Module):
-    """low, high: (3,) corners of the body's box [m]. Call `settle(rest)` once with the particles.
+class StiffnessModes(StiffnessField):
+    """Call `settle(rest)` once with the particles. Errors: also ConfigError where no wave fits."""
 
-    Errors: ConfigError for a box without volume.
-    """
+    few_numbers = True
 
     def __init__(self, low: Tensor, high: Tensor, settings: HeterogeneitySettings | None = None) -> None:
-        super().__init__()
-        settings = settings or HeterogeneitySettings()
-        check_box(low, high)
-        self.register_buffer("low", low.detach().clone())
-        self.register_buffer("high", high.detach().clone())
-        self.amplitude, wavelength = settings.amplitude, settings.wavelength
+        super().__init__(low, high, settings)
+        wavelength = self.settings.wavelength
         extent = (high - low).double().cpu()
         sides = (extent / extent.max()).tolist()
         limit = 2 / wavelength  # in half waves per longest side
@@ -37,7 +32,7 @@ class StiffnessModes(nn.Module):
                     size = sum((n / s) ** 2 for n, s in zip((a, b, c), sides)) ** 0.5
                     if 0 < size <= limit:
                         found.append((size, a, b, c))
-        found = sorted(found)[: settings.most]
+        found = sorted(found)[: self.settings.most]
         if not found:
             raise ConfigError(f"heterogeneity.wavelength: no wave of {wavelength} times the body fits; expected less than 2")
         self.register_buffer("waves", torch.tensor([f[1:] for f in found], dtype=torch.float32))
@@ -45,9 +40,6 @@ class StiffnessModes(nn.Module):
         self.register_buffer("mean", torch.zeros(len(found)))
         self.register_buffer("scale", torch.ones(len(found)))
         self.coefficients = nn.Parameter(torch.zeros(len(found)))
-
-    few_numbers = True
-    """Whether Gauss-Newton can learn its coefficients."""
 
     def raw(self, X: Tensor) -> Tensor:
         """(N, K) products of cosines at X (N, 3) [m]."""
@@ -68,7 +60,3 @@ class StiffnessModes(nn.Module):
     def forward(self, X: Tensor) -> Tensor:
         """eta (N,) at rest positions X (N, 3) [m]."""
         return self.basis(X) @ self.coefficients
-
-    def factor(self, X: Tensor) -> Tensor:
-        """1 + amplitude tanh eta(X), (N,)."""
-        return 1 + self.amplitude * torch.tanh(self(X))

@@ -1,4 +1,5 @@
-"""The package of docs/extending.md as the page has it, in a run of every stage: law, adapter, loss term, metric, format."""
+"""The package of docs/extending.md as the page has it, in a run of every stage: law, adapter, loss term, metric, format; and
+the baseline."""
 
 import json
 import os
@@ -44,7 +45,7 @@ def recorded(folder: Path, cache: Path) -> Path:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, cache):
     folder = tmp_path_factory.mktemp("extending")
-    assert len(written(folder)) == 9
+    assert len(written(folder)) == 11
     given = [*QUICK, "extensions=[my_mosa]", f"hydra.searchpath=[file://{folder}/conf_of_mine]", "scene=recording",
              f"scene.path={recorded(folder, cache)}", f"scene.cache={folder}/cache", "prior=fibres", "adapter=softer",
              "+losses.volume=0.5"]  # fmt: skip
@@ -98,7 +99,34 @@ def test_a_checkpoint_needs_the_package_and_does_not_import_it(run):
                             capture_output=True, timeout=200, env=os.environ | {"PYTHONPATH": f"{run}{os.pathsep}{ROOT}"})
     assert result.returncode == 0, result.stderr[-2000:]
     refused, found = result.stdout.strip().splitlines()[-2:]
-    assert "expected one of" in refused and "found 'fibres'" in refused
+    assert "adapter.name: expected" in refused and "found 'softer'" in refused and "extensions" in refused
     flag, *numbers = found.split()
     figures = json.loads((run / "run" / "metrics.json").read_text())
     assert flag == "True" and [float(n) for n in numbers] == pytest.approx([figures[f"id/fibre_{a}"] for a in "xyz"], abs=1e-6)
+
+
+BASELINE = """
+import my_mosa, torch
+from small_bodies import FRAME_DT, WORLD, small_body, start
+from mosa.config import build_adapter
+def rolled(k, E):
+    body = small_body(adapter=False, E=E)
+    body.settings = type(body.settings)(**{**vars(body.settings), "stride": 1})
+    body.adapter = build_adapter({"name": "one_number", "start": k}).double()
+    body.adapter.switch_on(3e4, 0.35)
+    x = body.simulate(start(), WORLD, 4, FRAME_DT, substeps=80).x
+    x[-1].square().sum().backward()
+    return x.detach(), float(body.adapter.k.grad)
+(one, slope), (other, _), (softer, _) = rolled(0.3, 3e4), rolled(0.3, 2e4), rolled(0.15, 3e4)
+print(float((one - other).abs().max()), float((one - softer).abs().max()), slope)
+"""
+
+
+def test_the_baseline_stands_in_for_the_law(tmp_path):
+    written(tmp_path)
+    path = os.pathsep.join(map(str, (tmp_path, ROOT, ROOT / "tests" / "modules")))
+    result = subprocess.run([sys.executable, "-c", BASELINE], text=True, capture_output=True, timeout=200,
+                            env=os.environ | {"PYTHONPATH": path})  # fmt: skip
+    assert result.returncode == 0, result.stderr[-2000:]
+    other_prior, other_number, slope = map(float, result.stdout.split()[-3:])
+    assert other_prior < 1e-9 < 1e-4 < other_number and abs(slope) > 1e-4

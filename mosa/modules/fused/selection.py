@@ -10,18 +10,14 @@ from torch import Tensor, nn
 
 from mosa.errors import ConfigError
 from mosa.modules.progressive import ProgressiveOperator
+from mosa.schema import Kind
 
 PRECISIONS = {"accurate": "tf32x3", "tf32": "tf32", "half": "half"}
 """How products are made on tensor cores: three of tf32 with the rounding errors carried along, one, or, half, one of tf32 in the
 backward pass and one of float16 forward, which rounds numbers from 6e-5 to 65504 alike and takes half the instructions."""
 
 
-def check_options(fused: bool | str, precision: str) -> None:
-    """Errors: ConfigError naming the key."""
-    if not isinstance(fused, bool) and fused != "auto":
-        raise ConfigError(f"adapter.fused: expected auto, true or false, found {fused!r}")
-    if precision not in PRECISIONS:
-        raise ConfigError(f"adapter.precision: expected {' or '.join(PRECISIONS)}, found {precision!r}")
+FUSED = Kind("auto, true or false", lambda v: isinstance(v, bool) or v == "auto")
 
 
 def interpreted() -> bool:

@@ -117,7 +117,8 @@ def law_named(name: str) -> Law:
         if sign in name and name not in _LAWS:
             make(name, [law_named(part) for part in name.split(sign)])
     if name not in _LAWS:
-        raise ConfigError(f"law: expected one of {', '.join(law_names())}, found {name!r}")
+        raise ConfigError(f"law: expected one of {', '.join(law_names())}, found {name!r}; one of another package is known once "
+                          "that is imported (extensions)")
     return _LAWS[name]
 
 

@@ -67,12 +67,10 @@ class Lanes:
                 return function(solver, *(argument[index] for argument in arguments))
 
         count = len(self.solvers)
-        if self.solvers[0].volume.is_cuda:  # in turns: while one captures a graph no other may touch the stream
+        if count == 1 or self.solvers[0].volume.is_cuda:  # in turns: while one captures a graph no other may touch the stream
             return [run(index) for index in range(count)]
         if kind in self.buffers.ran:
             return list(threaded(run, range(count)))
         first = run(0)
         self.buffers.ran.add(kind)
         return [first, *threaded(run, range(1, count))]
-
-

@@ -112,7 +112,7 @@ class SegmentSolver:
 
     def _apart(self, t: Tensor) -> Tensor:
         """(worlds, particles of each, ...)."""
-        return t.unflatten(0, (self.worlds, -1))
+        return t.view(self.worlds, -1, *t.shape[1:])
 
     def has_room(self, substeps: int) -> bool:
         """Whether the states of so many substeps may be kept."""

@@ -41,6 +41,7 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
     add3, add4, settle_node = adding.add3, adding.add4, exact_node_access(scalar).settle_node
     added_to = wp.array2d(dtype=wp.int64) if exact else wp.array(dtype=vec4)
     spline, spline_slope, cell, local_cell = stencil.spline, stencil.spline_slope, stencil.cell, stencil.local_cell
+    window_row = stencil.window_row
     module = f"mosa.physics.{'exact_' if exact else ''}transfers_{scalar.__name__}"
 
     # `steps` in the kernels holds the node offsets as scalars: Warp 1.19 retypes a loop variable that is cast to float64
@@ -72,7 +73,7 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
         p = wp.tid()
         xp = x[p]
         base = cell(xp, inv_dx)
-        place = 3 * (p / size)
+        place = window_row(p, size)
         dims = window[place + 1]
         n = local_cell(base, window, place)
         if n < 0:
@@ -116,7 +117,7 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
         p = wp.tid()
         xp = x[p]
         base = cell(xp, inv_dx)
-        place = 3 * (p / size)
+        place = window_row(p, size)
         dims = window[place + 1]
         n = local_cell(base, window, place)
         if n < 0:
@@ -180,7 +181,7 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
         p = wp.tid()
         xp = x[p]
         base = cell(xp, inv_dx)
-        place = 3 * (p / size)
+        place = window_row(p, size)
         dims = window[place + 1]
         n = local_cell(base, window, place)
         if n < 0:
@@ -240,7 +241,7 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
         p = wp.tid()
         xp = x[p]
         base = cell(xp, inv_dx)
-        place = 3 * (p / size)
+        place = window_row(p, size)
         dims = window[place + 1]
         n = local_cell(base, window, place)
         if n < 0:

@@ -20,6 +20,8 @@ GAINED = 1.5
 """A window has room for particles that come to move faster by this factor along the axes on which they move,"""
 TURNED = 0.5
 """and in any direction at this times the largest speed: what hits the ground spreads."""
+_OUTWARDS = np.repeat([-1.0, 1.0], 3)
+"""Of lowest and highest velocities: what moves a body's lower and its upper ends away from it."""
 
 
 def extent(x: Tensor, v: Tensor) -> Tensor:
@@ -53,14 +55,14 @@ def grid_window(
         raise SimulationDiverged(f"{name(world)}particle {bad} has a non-finite position or velocity before the substep")
     low, dims = window_of(bounds, dx, time, margin)
     far = np.abs(low).max(-1) + dims.max(-1)
-    if (far > FARTHEST).any():
+    if far.max() > FARTHEST:
         world = int(np.argmax(far))
         raise SimulationDiverged(
             f"{name(world)}a particle is {np.abs(rows[world, :6]).max():.3g} m from the origin, more than {FARTHEST} nodes of {dx} "
             "m: use more substeps, or a box"
         )
     nodes = dims.prod(-1)
-    if (nodes > MAX_NODES).any() or nodes.sum() > MOST_NODES:
+    if nodes.max() > MAX_NODES or nodes.sum() > MOST_NODES:
         world = int(np.argmax(nodes))
         raise SimulationDiverged(
             f"{name(world)}particles spread over {dims.reshape(-1, 3)[world].tolist()} grid nodes of {dx} m (speeds to "
@@ -72,11 +74,9 @@ def grid_window(
 def window_of(bounds: np.ndarray, dx: float, time: float, margin: int) -> tuple[np.ndarray, np.ndarray]:
     """As `grid_window`, of extents (..., 12) and of any size."""
     bounds = np.asarray(bounds, dtype=np.float64)
-    turned = TURNED * np.abs(bounds[..., 6:]).max(-1, keepdims=True)  # by the largest component of a velocity
-
-    def nodes(speed: np.ndarray) -> np.ndarray:
-        return np.ceil(np.maximum(GAINED * speed, turned) * time / dx) + margin
-
-    low = np.floor(bounds[..., :3] / dx - 0.5) - nodes(-bounds[..., 6:9])
-    high = np.floor(bounds[..., 3:6] / dx - 0.5) + 2 + nodes(bounds[..., 9:])
+    speeds = _OUTWARDS * bounds[..., 6:]
+    turned = TURNED * np.abs(speeds).max(-1, keepdims=True)  # by the largest component of a velocity
+    ahead = np.ceil(np.maximum(GAINED * speeds, turned) * time / dx) + margin
+    cells = np.floor(bounds[..., :6] / dx - 0.5)
+    low, high = cells[..., :3] - ahead[..., :3], cells[..., 3:] + 2 + ahead[..., 3:]
     return low.astype(np.int64), (high - low + 1).astype(np.int64)

@@ -1,0 +1,94 @@
+"""Iterations of Gauss-Newton on the distance between motion cues and rollouts, of all numbers of a stage at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from mosa import parallel
+from mosa.errors import DataError, MosaError
+from mosa.modules.identification import Identification, choose_law
+from mosa.modules.residuals import SAMPLES
+from mosa.modules.stages import Stage
+from mosa.progress import tqdm
+
+
+class NewtonSteps:
+    """The part of `LitMosa` that runs stages by Gauss-Newton, under a trainer or, by `identify`, without one."""
+
+    def newton_step(self, stage: Stage, iteration: int) -> None:
+        """One iteration of Gauss-Newton: of all numbers on all takes, without images."""
+        failure, found = None, {}
+        try:
+            if self.identification is None:
+                saved = self.saved_identification if iteration > 0 else None
+                self.identification = self.begun(stage, saved)
+            found = self.identification.iterate()
+        except MosaError as error:
+            failure = error
+        parallel.agree(failure)
+        parallel.synchronise(self.body)  # ranks do the same work, and on a GPU come to slightly different numbers
+        self.losses.append(found["after"])
+        self.steps_done += 1
+        self.report_newton(found)
+        if self.identification.converged or stage.ended(self.losses):
+            self.keep_posterior(stage)
+            self.finish(stage)
+
+    def begun(self, stage: Stage, saved: Mapping[str, Any] | None = None) -> Identification:
+        """A stage's identification, ready for its first iteration, or for the next one where `saved` is what a checkpoint kept."""
+        searched = bool(self.body.material.candidates)  # then the best of them is where its calibration left it
+        if searched:
+            self.compared = choose_law(self.body, self.body.material.candidates, lambda: self.identifying(stage))
+            self.settle_law()
+        identification = self.identifying(stage)
+        if saved is not None:
+            self.go_on(identification, saved)
+        elif stage.calibrates and not searched and not stage.looks_again:
+            identification.search()
+        return identification
+
+    def keep_posterior(self, stage: Stage) -> None:
+        """Of the running identification, where it is the last one."""
+        alone = self.body.adapter is None and self.body.heterogeneity is None  # then the calibration is all there is
+        if stage.learns_adapter or (stage.calibrates and alone):
+            self.posterior = self.identification.posterior()
+
+    def identify(self) -> None:
+        """All stages by Gauss-Newton without a trainer: nothing is logged or kept. Errors: those of an iteration."""
+        for stage in self.stages[self.stage_index :]:
+            self.begin(stage)
+            self.identification = self.begun(stage)
+            for _ in tqdm(range(stage.iterations), f"stage {stage.name}", leave=False):
+                self.identification.iterate()
+                if self.identification.converged:
+                    break
+            self.keep_posterior(stage)
+            self.end(stage)
+
+    def identifying(self, stage: Stage) -> Identification:
+        """A stage's identification on the takes, from where the body stands."""
+        kinds = tuple(self.weights.get(name, 0.0) != 0 for name in ("position", "rotation", "stretch"))
+        return Identification(self.body, self.takes, self.world, stage, self.criterion, self.settings, kinds)
+
+    def go_on(self, identification: Identification, saved: Mapping[str, Any]) -> None:
+        """The identification as a checkpoint has it, whose containers were checked. Errors: DataError where it is another fit's."""
+        expected = [len(self.takes[i].cues.positions) - 1 for i, _ in identification.pairs]
+        samples = min(len(self.body.rest), SAMPLES)
+        for name, size in (("noise", ()), ("grid", (samples, 3))):
+            found = saved.get(name)
+            if found is not None and [[tuple(t.shape) for t in each] for each in found] != [[(T, *size)] * 3 for T in expected]:
+                raise DataError(f"ckpt_path: mosa.identification.{name}: expected tensors of {expected} frames after the "
+                                "first, found others: the checkpoint belongs to another configuration")
+        if len(saved["factors"]) != (count := len(identification.newton.blocks)):
+            raise DataError(f"ckpt_path: mosa.identification.factors: expected {count} numbers, found {len(saved['factors'])}: "
+                            "the checkpoint belongs to another configuration")
+        identification.restore(dict(saved))
+
+    def report_newton(self, found: dict[str, float]) -> None:
+        """Scalars of one iteration: cost, step, what the evidence found, parameters."""
+        values = {"loss/total": found["after"], "fit/stage": float(self.stage_index), "newton/share": found["share"],
+                  "newton/length": found["length"]}
+        values |= {f"newton/{name}": value for name, value in found.items() if name.startswith("sd/")}
+        values["fit/distance_m"] = self.identification.distance()
+        self.log_values(values)
