@@ -16,6 +16,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from typing import TextIO
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -90,14 +91,18 @@ def run_command(run: Callable[[], None], conf: str | Path) -> None:
     Exit code 2 too for what Hydra refuses before any job begins: a mistake of the user like all others."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # on small tensors and shared machines a second thread was measured 30x slower
     sys.argv[1:] = map(quoted, sys.argv[1:])
-    check_arguments(sys.argv[1:], Path(conf))
-    check_folders(sys.argv[1:])
-    try:
-        run()
-    except SystemExit as ended:
-        if ended.code == 1 and not begun:
-            sys.exit(2)
-        raise
+    with outlived():
+        check_arguments(sys.argv[1:], Path(conf))
+        check_folders(sys.argv[1:])
+        try:
+            run()
+        except SystemExit as ended:
+            if ended.code == 1 and not begun:
+                sys.exit(2)
+            raise
+        except KeyboardInterrupt:  # between jobs, or before the first
+            fail("stopped")
+            sys.exit(130)
 
 
 begun: list[bool] = []
@@ -121,6 +126,45 @@ class Failures(Callback):
         if files:
             listed = "\n".join(f"  {file.stem}: {file.read_text().strip()}" for file in files)
             print(f"\n{len(files)} jobs of the sweep failed:\n{listed}", file=sys.stderr)
+
+
+class Outlived:
+    """A stream of text whose reader may go before the program does (`| head -1`, a terminal that is closed, a log on a full disk):
+    what comes after that goes nowhere, and the work goes on."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self.stream = stream
+
+    def __getattr__(self, name: str):
+        return getattr(self.stream, name)
+
+    def write(self, text: str) -> int:
+        return self.attempted(lambda: self.stream.write(text), len(text))
+
+    def flush(self) -> None:
+        self.attempted(self.stream.flush, None)
+
+    def attempted(self, act: Callable, otherwise):
+        try:
+            return act()
+        except OSError:
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, self.stream.fileno())  # also for what runs below this process, and for what is still in the buffer
+            os.close(nowhere)
+            return otherwise
+
+
+@contextmanager
+def outlived() -> Iterator[None]:
+    """Standard output and error may lose their readers meanwhile; where there are none (`>&-`) there are some that go nowhere."""
+    before = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = (Outlived(open(os.devnull, "w") if stream is None else stream) for stream in before)
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        sys.stdout, sys.stderr = before
 
 
 signals: list[int] = []
@@ -191,7 +235,7 @@ def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float
         signal.signal(signal.SIGTERM, terminated)
     folder = OmegaConf.select(HydraConfig.get(), "runtime.output_dir") if HydraConfig.initialized() else None
     try:
-        with held(folder) if first and folder is not None else nullcontext():
+        with outlived(), held(folder) if first and folder is not None else nullcontext():
             return job(cfg)
     except KeyboardInterrupt:
         if first:
