@@ -187,14 +187,16 @@ def disk_message(error: OSError) -> str | None:
             "hydra.run.dir= and scene.cache= (eval.py: cache=)")
 
 
-NO_MEMORY = ("can't allocate memory", "out of memory", "Failed to allocate")
-"""What torch and Warp say where the machine, or a GPU, has no more: errors of types that are also others'."""
+NO_MEMORY = ("can't allocate memory", "out of memory", "Failed to allocate", "Cannot allocate memory", "failed to map segment")
+"""What torch, Warp and the system's loader of libraries say where the machine, or a GPU, has no more: errors of types that are also
+others'."""
 
 
-def memory_message(error: Exception) -> str | None:
+def memory_message(error: BaseException) -> str | None:
     """One sentence on memory that there is not, of the machine or of a GPU; None for any other error."""
-    if not isinstance(error, MemoryError) and not any(text in str(error) for text in NO_MEMORY):
-        return None
+    while not isinstance(error, MemoryError) and not any(text in str(error) for text in NO_MEMORY):
+        if (error := error.__cause__ or error.__context__) is None:
+            return None
     told = " ".join(str(error).split())[:200] or "the machine has no more"
     if "cuda" in told.lower():
         return (f"the GPU has no memory left ({told}); stop what else runs there, lower simulation.particles or scene.scale, or "
@@ -243,7 +245,7 @@ def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float
         sys.exit(143 if signal.SIGTERM in signals else 130)
     except MosaError as error:
         message = f"{type(error).__name__}: {error}"
-    except (MemoryError, RuntimeError) as error:
+    except (MemoryError, RuntimeError, ImportError) as error:
         if (reason := memory_message(error)) is None:
             raise
         message = f"MemoryError: {reason}"

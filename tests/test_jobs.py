@@ -2,6 +2,7 @@
 
 import errno
 import os
+import shlex
 import subprocess
 import sys
 import textwrap
@@ -149,3 +150,27 @@ def test_a_joblib_sweep_with_failed_jobs_does_not_exit_with_0(tmp_path):
     keys = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", f"hydra.sweep.dir={tmp_path}", "debug=default", "seed=-1,-2"]
     found = subprocess.run([sys.executable, "train.py", "-m", *keys], cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert found.returncode == 1 and "2 jobs of the sweep failed" in found.stderr
+
+
+OUTLIVED = """
+    import logging, sys
+    from mosa.commands import begin_log
+    from mosa.jobs import outlived
+    with outlived():
+        logging.basicConfig(stream=sys.stdout, level=logging.INFO)
+        begin_log()
+        for k in range(2000):
+            logging.info("a line %d", k)
+            print("another", file=sys.stderr)
+        open({done!r}, "w").close()
+"""
+
+
+@pytest.mark.parametrize("shell", ["{} 2>&1 | head -1", "{} | head -1", "{} >&- 2>&-", "{} > /dev/full 2>&1"])
+def test_a_run_outlives_whoever_reads_its_lines(tmp_path, shell):
+    """`| head -1` ended a run without a word, and printed hundreds of tracebacks where the reader of the output alone had gone."""
+    done = tmp_path / "done"
+    program = f"{sys.executable} -c {shlex.quote(textwrap.dedent(OUTLIVED.format(done=str(done))))}"
+    found = subprocess.run(["bash", "-o", "pipefail", "-c", shell.format(program)], cwd=ROOT, capture_output=True, text=True)
+    assert found.returncode == 0 and done.is_file() and "Error" not in found.stderr
+    assert found.stdout.count("\n") <= 1

@@ -60,8 +60,10 @@ class StageCache:
             digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]
             self.folder = Path(root) / "reconstruction" / f"{key['scene'].replace('/', '_')[:80]}-{digest}"
             self.folder.mkdir(parents=True, exist_ok=True)
-            with written_whole(self.folder / "key.json") as partial:
-                partial.write_text(json.dumps(key, indent=1, sort_keys=True))
+            file, text = self.folder / "key.json", json.dumps(key, indent=1, sort_keys=True)
+            if not file.is_file() or file.read_bytes() != text.encode():  # a cache that has all may be one that is only read
+                with written_whole(file) as partial:
+                    partial.write_text(text)
 
     def stage(self, name: str, compute: Callable[[], Any], leading: tuple[int, ...] | None = None) -> Any:
         """The stored result of a stage, or `compute()` stored. A damaged file, or one that holds something else, is computed again.
