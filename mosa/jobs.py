@@ -60,19 +60,26 @@ def check_arguments(arguments: Sequence[str], conf: Path) -> None:
 
 def quoted(argument: str) -> str:
     """An override as Hydra's grammar reads it: a value with letters beyond ASCII, or ~, &, = and the like, as paths have them, gets
-    quotes. As it is where it can be read, and where it has a list, quotes or an escape of its own."""
+    quotes. As it is where it can be read, and where it has a list, quotes or an escape of its own, but for what begins as a path."""
     key, mark, value = argument.partition("=")
-    if not mark or argument.startswith("-") or set(value) & set(",[]{}'\"\\"):
+    path = value.startswith(("/", "./", "../", "~/")) and "\\" not in value
+    if not mark or argument.startswith("-") or (set(value) & set(",[]{}'\"\\") and not path):
         return argument
     try:
         OverridesParser.create().parse_overrides([argument])
     except HydraException:
-        return f"{key}='{value}'"
+        return f"{key}='{value.replace(chr(39), chr(92) + chr(39))}'"
     return argument
 
 
 def check_folders(arguments: Sequence[str]) -> None:
-    """Exit with 2 and a message for a run folder that cannot be made, to which Hydra answers with a traceback."""
+    """Exit with 2 and a message for a run folder that cannot be made, or a working one that is gone, to which Hydra answers with a
+    traceback."""
+    try:
+        os.getcwd()
+    except OSError:
+        print("\nConfigError: the folder that this was started in is no more; change to another one", file=sys.stderr)
+        sys.exit(2)
     for argument in arguments:
         key, _, value = argument.partition("=")
         if key not in ("hydra.run.dir", "hydra.sweep.dir") or "$" in value:

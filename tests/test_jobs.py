@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
@@ -107,10 +108,15 @@ def test_a_long_name_is_cut_and_stays_its_own():
     ("scene.path=/data/höhle", "scene.path='/data/höhle'"), ("scene.path=~/x", "scene.path='~/x'"),
     ("scene.path=/a=b & c", "scene.path='/a=b & c'"), ("scene.path=/a b", "scene.path=/a b"), ("seed=0,1", "seed=0,1"),
     ("fit.x=[ä]", "fit.x=[ä]"), ("x='ä'", "x='ä'"), ("prior=ä,b", "prior=ä,b"), ("--cfg=ä", "--cfg=ä"), ("banana", "banana"),
+    ("scene.path=/a's b", r"scene.path='/a\'s b'"), ("scene.path=/a b, [c] {d}", "scene.path='/a b, [c] {d}'"),
+    ("x=/a,/b", "x=/a,/b"),
 ])  # fmt: skip
 def test_values_that_hydra_cannot_read_are_quoted(argument, found):
     """It ended a run whose path had an umlaut in it."""
     assert quoted(argument) == found
+    if argument.startswith("scene.path="):
+        (read,) = OverridesParser.create().parse_overrides([found])
+        assert str(read.value()) == argument.partition("=")[2]
 
 
 def test_a_run_folder_that_cannot_be_made_is_said_before_hydra_fails(tmp_path, capsys):
@@ -174,3 +180,23 @@ def test_a_run_outlives_whoever_reads_its_lines(tmp_path, shell):
     found = subprocess.run(["bash", "-o", "pipefail", "-c", shell.format(program)], cwd=ROOT, capture_output=True, text=True)
     assert found.returncode == 0 and done.is_file() and "Error" not in found.stderr
     assert found.stdout.count("\n") <= 1
+
+
+def test_a_working_folder_that_is_gone_is_said(tmp_path):
+    (tmp_path / "gone").mkdir()
+    command = f"cd {tmp_path}/gone && rmdir ../gone && exec {sys.executable} {ROOT}/train.py debug=default"
+    found = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60, cwd=ROOT,
+                           env={**os.environ, "PYTHONPATH": str(ROOT)})  # fmt: skip
+    assert found.returncode == 2 and "the folder that this was started in is no more" in found.stderr
+    assert "Traceback" not in found.stderr
+
+
+def test_a_stop_before_the_first_job_is_no_traceback():
+    code = textwrap.dedent("""
+        from mosa.jobs import run_command; import os, signal, sys
+        sys.argv[1:] = []
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        run_command(lambda: os.kill(os.getpid(), signal.SIGINT), "conf")
+    """)
+    found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert found.returncode == 130 and found.stderr.strip() == "stopped"
