@@ -17,6 +17,7 @@ import argparse
 import signal
 import sys
 import tempfile
+import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -79,6 +80,8 @@ def main() -> None:
             for what, attack in GROUPS[name](Path(folder)):
                 kind, text = outcome(attack, LONGER.get(name, PATIENCE))
                 counts[kind] += 1
+                if name in LONGER:  # whole processes: minutes in which nothing would be seen
+                    print(f"  {time.strftime('%H:%M:%S')} {what[:100]}: {kind} {text[:100]}", flush=True)
                 said += [f"{name}: {kind}: {what[:100]} {text[:150]}"] if kind != "message" else []
         rows.append(f"| {name} | {sum(counts.values())} | {counts['message']} | {counts['traceback'] + counts['hang']} | "
                     f"{counts['ran']} |")

@@ -60,7 +60,7 @@ def check_arguments(arguments: Sequence[str], conf: Path) -> None:
 
 def quoted(argument: str) -> str:
     """An override as Hydra's grammar reads it: a value with letters beyond ASCII, or ~, &, = and the like, as paths have them, gets
-    quotes. As it is where it can be read, and where it has a list, quotes or an escape of its own, but for what begins as a path."""
+    quotes. As it is where it can be read, and where it has a list, quotes or an escape, unless it begins as a path does."""
     key, mark, value = argument.partition("=")
     path = value.startswith(("/", "./", "../", "~/")) and "\\" not in value
     if not mark or argument.startswith("-") or (set(value) & set(",[]{}'\"\\") and not path):

@@ -4,7 +4,9 @@ import errno
 import math
 import os
 import struct
+import sys
 import zlib
+from pathlib import Path
 
 import pytest
 import torch
@@ -17,7 +19,7 @@ from mosa.config import rehearse
 from mosa.data.images import check_amount, read_image
 from mosa.data.particles import read_ply
 from mosa.errors import ConfigError, DataError
-from mosa.guards import check_begin, check_particles
+from mosa.guards import check_begin, check_configuration, check_particles
 from mosa.limits import machine_memory
 from mosa.physics.contact.mesh import field_of_mesh
 from mosa.reconstruction.cache import StageCache
@@ -128,6 +130,16 @@ def test_a_cache_that_holds_something_else_is_made_again(tmp_path, wrong, caplog
     assert made is SPLATS and "static.pt: cannot be read" in caplog.text
     again = cache.stage("static", lambda: pytest.fail("it is there"))
     assert all(torch.equal(again[key], SPLATS[key]) for key in SPLATS)
+
+
+def test_a_video_without_an_ffmpeg_is_refused_before_anything_long(monkeypatch):
+    """It was found out after the fit, when the video was to be written."""
+    values = composed("debug=default")
+    check_configuration(values, Path(__file__).parents[1] / "conf")
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(ConfigError, match=r"evaluation\.video: expected false, or an ffmpeg"):
+        check_configuration(values, Path(__file__).parents[1] / "conf")
+    check_configuration(values | {"evaluation": values["evaluation"] | {"video": False}}, Path(__file__).parents[1] / "conf")
 
 
 def test_a_cache_whose_bits_have_changed_is_made_again(tmp_path, caplog):

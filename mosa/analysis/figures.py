@@ -9,20 +9,21 @@ from pathlib import Path
 import cv2
 import imageio.v2 as imageio
 import numpy as np
-from imageio_ffmpeg import get_ffmpeg_exe, write_frames
 from torch import Tensor
 
 from mosa.errors import ConfigError
 from mosa.whole_files import written_whole
 
 
-def ffmpeg() -> str:
-    """Path of the program that writes videos. Errors: ConfigError where there is none."""
+def ffmpeg(key: str) -> str:
+    """Path of the program that writes the video which `key` asks for. Errors: ConfigError where there is none."""
     try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+
         return get_ffmpeg_exe()
-    except RuntimeError as error:
-        raise ConfigError("evaluation.video: expected false, or an ffmpeg to write it with (set IMAGEIO_FFMPEG_EXE, or install "
-                          f"one), found none ({' '.join(str(error).split())[:200]})") from error
+    except (ImportError, RuntimeError) as error:
+        raise ConfigError(f"{key}: expected false, or an ffmpeg to write it with (set IMAGEIO_FFMPEG_EXE, or install "
+                          f"imageio-ffmpeg), found none ({' '.join(str(error).split())[:200]})") from error
 
 
 def to_uint8(image: Tensor | np.ndarray) -> np.ndarray:
@@ -63,13 +64,14 @@ def side_by_side(columns: Images, *, below: Images | None = None, footer: list[s
 def write_video(path: str | Path, frames: list[np.ndarray], fps: float = 12.0) -> Path:
     """H.264 video; the size is padded to even numbers. Plays slower than real time where fps is below the capture's.
 
-    Errors: ConfigError without a usable ffmpeg; OSError where it cannot write.
+    Errors: ImportError or RuntimeError without an ffmpeg (`ffmpeg` says it before); OSError where that cannot write.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     height, width = frames[0].shape[:2]
     padding = ((0, height % 2), (0, width % 2), (0, 0))
-    ffmpeg()
+    from imageio_ffmpeg import write_frames
+
     # imageio takes the kind of file from its name, which has it only once the file is whole
     size, options = (width + width % 2, height + height % 2), {"quality": 8, "macro_block_size": 2}
     with written_whole(path) as partial:
