@@ -84,7 +84,7 @@ def running(folder: Path) -> Iterator[Attack]:
 
     def stopped(name: str, sign: int, fresh: bool) -> None:
         run, used, most = folder / name, folder / f"{name}_cache" if fresh else cache, 25.0 if fresh else 12.0
-        for _ in range(4):
+        for _ in range(2 if fresh else 3):
             program(*arguments(run, used), seconds=generator.uniform(3.0, most), sign=sign, wanted=None)
         program(*arguments(run, used))
         equal(whole, run, used)
@@ -106,7 +106,7 @@ def running(folder: Path) -> Iterator[Attack]:
     told = program(*arguments(fitted("listed")), disturbed=("list:0", str(folder / "listed")))
     writes = [int(line.split()[2]) for line in told.splitlines() if line.startswith("disturbed: list") and ".hydra" not in line]
     writes = [n for n in writes if n > 3]  # Hydra's own first ones are its
-    for how, code, share in (("kill", None, 3), ("full", 2, 3), ("term", 143, 9), ("int", 130, 9)):
+    for how, code, share in (("kill", None, 4), ("full", 2, 4), ("term", 143, 9), ("int", 130, 9)):
         for number in writes[::share]:
             yield f"{how} at write {number} of the evaluation", lambda h=how, n=number, c=code: at_a_file(h, n, c)
 
