@@ -235,16 +235,48 @@ def held(folder: str | Path) -> Iterator[None]:
         os.close(number)
 
 
+@contextmanager
+def held_back() -> Iterator[None]:
+    """Ctrl-C and SIGTERM wait until this is over, a second one does not: an exception in the middle of some libraries' imports aborts
+    the interpreter."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    waiting: list[int] = []
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def wait(number: int, frame) -> None:
+        waiting.append(number)
+        if len(waiting) > 1:
+            before[number](number, frame)
+
+    replaced = {number: handler for number, handler in before.items() if callable(handler)}  # not what is ignored, or ends at once
+    for number in replaced:
+        signal.signal(number, wait)
+    try:
+        yield
+    finally:
+        for number, handler in replaced.items():
+            signal.signal(number, handler)
+    if waiting:
+        before[waiting[0]](waiting[0], None)
+
+
 def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float | None:
     """job(cfg) and its result. A mistake of the user ends in one message and exit code 2; in a sweep it is kept for the end, the
     result is infinite, and the other jobs go on. A stop ends in 130 (Ctrl-C) or 143 (SIGTERM)."""
+    with outlived():  # also in a launcher's worker, and for the message
+        return attempted(job, cfg)
+
+
+def attempted(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float | None:
     begun.append(True)
     first = os.environ.get("LOCAL_RANK", "0") == "0"  # of the processes of a fit on several devices: it speaks for all
     if first and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, terminated)
     folder = OmegaConf.select(HydraConfig.get(), "runtime.output_dir") if HydraConfig.initialized() else None
     try:
-        with outlived(), held(folder) if first and folder is not None else nullcontext():
+        with held(folder) if first and folder is not None else nullcontext():
             return job(cfg)
     except KeyboardInterrupt:
         if first:

@@ -1,6 +1,7 @@
 """Exit codes and messages of a job and of a sweep, whichever process its jobs ran in."""
 
 import errno
+import io
 import os
 import shlex
 import subprocess
@@ -200,3 +201,45 @@ def test_a_stop_before_the_first_job_is_no_traceback():
     """)
     found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert found.returncode == 130 and found.stderr.strip() == "stopped"
+
+
+@pytest.mark.parametrize(("times", "imported"), [(1, True), (2, False)])
+@pytest.mark.parametrize(("name", "code"), [("TERM", 143), ("INT", 130)])
+def test_a_stop_waits_for_the_imports_and_a_second_one_does_not(tmp_path, name, code, times, imported):
+    """Ctrl-C in the middle of an extension's import aborted the interpreter, with a traceback."""
+    (tmp_path / "slow_module.py").write_text(f"""
+import os, signal
+for _ in range({times}):
+    os.kill(os.getpid(), signal.SIG{name})
+print("imported", flush=True)
+""")
+    program = """
+        import signal, sys
+        from mosa.jobs import attempt, held_back
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        def job(cfg):
+            with held_back():
+                import slow_module
+            print("ran")
+        attempt(job, None)
+    """
+    found = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], cwd=tmp_path, capture_output=True, text=True,
+                           timeout=60, env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"})  # fmt: skip
+    assert found.returncode == code and "Traceback" not in found.stderr and "stopped" in found.stderr
+    assert found.stdout == ("imported\n" if imported else "")
+
+
+def test_a_message_is_kept_where_nobody_reads_the_screen(sweep, tmp_path, monkeypatch):
+    """A worker of a launcher whose screen had gone ended in a broken pipe, and the sweep did not say why its job had failed."""
+    class Gone(io.StringIO):
+        def write(self, text):
+            raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
+
+        def fileno(self):
+            return nowhere
+
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    monkeypatch.setattr(sys, "stderr", Gone())
+    assert attempt(fail(ConfigError("seed: wrong")), None) == float("inf")
+    os.close(nowhere)
+    assert (tmp_path / "failed" / "3.txt").read_text() == "ConfigError: seed: wrong\n"
