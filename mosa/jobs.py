@@ -237,7 +237,7 @@ def held(folder: str | Path) -> Iterator[None]:
 
 @contextmanager
 def held_back() -> Iterator[None]:
-    """Ctrl-C and SIGTERM wait until this is over, a second one does not: an exception in the middle of some libraries' imports aborts
+    """Ctrl-C and SIGTERM wait until this is over, a second one does not: an exception amid the imports of some libraries aborts
     the interpreter."""
     if threading.current_thread() is not threading.main_thread():
         yield
