@@ -146,11 +146,13 @@ def running(folder: Path) -> Iterator[Attack]:
 
     yield "moved to a name with quotes and an umlaut, from within", moved
 
-    def gone() -> None:
-        run = fitted("gone")
+    def gone(name: str, line: str) -> None:
+        """Once the run's log has the line."""
+        run = fitted(name)
         process = subprocess.Popen([sys.executable, str(ROOT / "train.py"), *arguments(run)], cwd=ROOT, stdout=subprocess.DEVNULL,
                                    stderr=subprocess.PIPE, text=True)  # fmt: skip
-        while not (run / "train.log").is_file() and process.poll() is None:
+        log = run / "train.log"
+        while not (log.is_file() and line in log.read_text()) and process.poll() is None:
             time.sleep(0.05)
         shutil.rmtree(run)
         told = process.communicate()[1]
@@ -159,7 +161,8 @@ def running(folder: Path) -> Iterator[Attack]:
     def refuse_not(told: str) -> None:
         raise AssertionError(told[-500:])
 
-    yield "the folder is removed while it runs", gone
+    for name, line in {"early": "mosa", "late": "fit: "}.items():
+        yield f"the folder is removed while it runs, {name}", lambda n=name, x=line: gone(n, x)
 
     def beside() -> None:
         run = fitted("twice")

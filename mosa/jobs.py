@@ -16,7 +16,6 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TextIO
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -27,6 +26,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mosa.commands import fail
 from mosa.errors import ConfigError, MosaError
+from mosa.screen import outlived
 
 FAILED = "failed"
 """Folder in that of a sweep: one file for each job that ended in an error, named after its number, with the message."""
@@ -135,45 +135,6 @@ class Failures(Callback):
             print(f"\n{len(files)} jobs of the sweep failed:\n{listed}", file=sys.stderr)
 
 
-class Outlived:
-    """A stream of text whose reader may go before the program does (`| head -1`, a terminal that is closed, a log on a full disk):
-    what comes after that goes nowhere, and the work goes on."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self.stream = stream
-
-    def __getattr__(self, name: str):
-        return getattr(self.stream, name)
-
-    def write(self, text: str) -> int:
-        return self.attempted(lambda: self.stream.write(text), len(text))
-
-    def flush(self) -> None:
-        self.attempted(self.stream.flush, None)
-
-    def attempted(self, act: Callable, otherwise):
-        try:
-            return act()
-        except OSError:
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self.stream.fileno())  # also for what runs below this process, and for what is still in the buffer
-            os.close(nowhere)
-            return otherwise
-
-
-@contextmanager
-def outlived() -> Iterator[None]:
-    """Standard output and error may lose their readers meanwhile; where there are none (`>&-`) there are some that go nowhere."""
-    before = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = (Outlived(open(os.devnull, "w") if stream is None else stream) for stream in before)
-    try:
-        yield
-    finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        sys.stdout, sys.stderr = before
-
-
 signals: list[int] = []
 """Received. Lightning turns what stops a fit into an exit of its own, which no longer says which one it was."""
 
@@ -188,6 +149,8 @@ def disk_message(error: OSError) -> str | None:
     """One sentence on what the disk refused; None for any other error."""
     if error.errno in (errno.EMFILE, errno.ENFILE):
         return f"{error.filename or 'a file'}: cannot be opened ({error.strerror}); allow more of them at once with ulimit -n"
+    if error.errno == errno.ENOENT and isinstance(error.filename, (str, os.PathLike)) and not Path(error.filename).parent.is_dir():
+        return f"{error.filename}: cannot be written or read: its folder has been removed meanwhile; give the command again"
     if error.errno not in DISK:
         return None
     return (f"{error.filename or 'a file'}: cannot be written or read ({error.strerror}); free space, or choose other folders with "

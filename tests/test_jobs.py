@@ -17,6 +17,7 @@ from omegaconf import OmegaConf
 
 from mosa.errors import ConfigError
 from mosa.jobs import LONGEST, Failures, attempt, check_folders, folder_name, held, quoted
+from mosa.npz import write_npz
 
 ROOT = Path(__file__).parents[1]
 
@@ -70,6 +71,13 @@ def test_a_run_folder_is_one_process_own_until_that_ends(tmp_path):
         with held(tmp_path):
             pass
     assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_was_removed_meanwhile_is_one_message(sweep, tmp_path, capsys):
+    attempt(lambda _: write_npz(tmp_path / "gone" / "observed.npz", {}), None)
+    assert "observed.npz" in (said := capsys.readouterr().err) and "its folder has been removed meanwhile" in said
+    with pytest.raises(FileNotFoundError):  # a file that is not there is the program's
+        attempt(lambda _: (tmp_path / "none").read_text(), None)
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EFBIG])
@@ -162,7 +170,7 @@ def test_a_joblib_sweep_with_failed_jobs_does_not_exit_with_0(tmp_path):
 OUTLIVED = """
     import logging, sys
     from mosa.commands import begin_log
-    from mosa.jobs import outlived
+    from mosa.screen import outlived
     with outlived():
         logging.basicConfig(stream=sys.stdout, level=logging.INFO)
         begin_log()
