@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from attacks import Attack, put, refuse, stored
 
-from mosa.checkpoints import RESUMED, check_resumed
+from mosa.checkpoints import RESUMED, check_resumed, read_checkpoint
 from mosa.npz import read_npz, write_npz
 from mosa.reconstruction.cache import StageCache
 from mosa.twin import Twin
@@ -26,6 +26,18 @@ class Touch:
 
     def __reduce__(self):
         return Path.touch, (self.path,)
+
+
+def same(found, wanted) -> None:
+    """Errors: AssertionError where nested containers hold something else."""
+    if isinstance(wanted, dict):
+        assert found.keys() == wanted.keys()
+        for key in wanted:
+            same(found[key], wanted[key])
+    elif isinstance(wanted, torch.Tensor):
+        assert found.numpy().tobytes() == wanted.numpy().tobytes()  # some are not numbers yet
+    else:
+        assert str(found) == str(wanted)
 
 
 def checkpoints(folder: Path) -> Iterator[Attack]:
@@ -63,6 +75,13 @@ def checkpoints(folder: Path) -> Iterator[Attack]:
             Twin.load(folder / "cut.ckpt")
 
         yield f"cut at {share:.0%}", cut
+    for place in np.random.default_rng(0).integers(0, len(content), 20).tolist():
+        def flipped(place=place):
+            (folder / "flipped.ckpt").write_bytes(content[:place] + bytes([content[place] ^ 16]) + content[place + 1 :])
+            same(read_checkpoint(folder / "flipped.ckpt"), read_checkpoint(folder / "good.ckpt"))
+            refuse("a byte that holds nothing")
+
+        yield f"bit flipped in byte {place}", flipped
     yield "what was named has run", lambda: None if target.exists() else refuse("nothing was executed or written")
 
 

@@ -4,10 +4,11 @@
     python benchmarks/robustness.py --only data,npz     # some of them
     python benchmarks/robustness.py --only cuda         # what a GPU answers otherwise (minutes)
     python benchmarks/robustness.py --runs              # and whole processes: exit codes, a sweep of failures (minutes)
+    python benchmarks/robustness.py --only running      # kills, disks, screens, folders, limits (a quarter of an hour or more)
 
 Each attack ends in one clear message (a MosaError of one line), in a traceback, in a hang (over 60 s), or it runs. What runs is
 listed: those are the attacks that the program has no word against. The attacks are in attacks_on_files.py, attacks_on_calls.py,
-attacks_on_data.py, attacks_on_meaning.py and attacks_on_cuda.py.
+attacks_on_data.py, attacks_on_meaning.py, attacks_on_running.py and attacks_on_cuda.py.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import argparse
 import signal
 import sys
 import tempfile
+import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -25,15 +27,16 @@ import attacks_on_data as data
 import attacks_on_files as files
 from attacks_on_cuda import cuda
 from attacks_on_meaning import MORE
+from attacks_on_running import running
 
 from mosa.errors import MosaError
 
 GROUPS = {"checkpoints": files.checkpoints, "npz": files.npz, "overrides": calls.overrides, "colliders": calls.colliders,
           "calls": calls.calls, "data": data.data, "meshes": data.meshes, "caches": files.caches, "poses": data.poses,
-          "resumed": files.resumed, "runs": calls.runs} | MORE | {"cuda": cuda}  # fmt: skip
+          "resumed": files.resumed, "runs": calls.runs} | MORE | {"running": running, "cuda": cuda}  # fmt: skip
 """Name -> pairs of what is done and a function that does it, in a folder."""
 PATIENCE = 60
-LONGER = {"runs": 300, "cuda": 300}
+LONGER = {"runs": 300, "cuda": 300, "running": 600}
 """Seconds until an attack counts as a hang; of whole processes."""
 HEAD = "| group | tried | one clear message | traceback or hang | ran |\n|---|---|---|---|---|"
 
@@ -67,7 +70,7 @@ def outcome(attack: Callable[[], object], patience: int = PATIENCE) -> tuple[str
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", default=",".join(name for name in GROUPS if name not in ("runs", "cuda")))
+    parser.add_argument("--only", default=",".join(name for name in GROUPS if name not in LONGER))
     parser.add_argument("--runs", action="store_true")
     options = parser.parse_args()
     rows, said = [], []
@@ -77,6 +80,8 @@ def main() -> None:
             for what, attack in GROUPS[name](Path(folder)):
                 kind, text = outcome(attack, LONGER.get(name, PATIENCE))
                 counts[kind] += 1
+                if name in LONGER:  # whole processes: minutes in which nothing would be seen
+                    print(f"  {time.strftime('%H:%M:%S')} {what[:100]}: {kind} {text[:100]}", flush=True)
                 said += [f"{name}: {kind}: {what[:100]} {text[:150]}"] if kind != "message" else []
         rows.append(f"| {name} | {sum(counts.values())} | {counts['message']} | {counts['traceback'] + counts['hang']} | "
                     f"{counts['ran']} |")

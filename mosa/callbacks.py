@@ -45,6 +45,11 @@ class KeepLast(L.Callback):
     def __init__(self, folder: str | Path, every: int = 1) -> None:
         self.path, self.every = Path(folder) / "last.ckpt", every
 
+    def on_fit_start(self, trainer, module) -> None:
+        """The figures of an earlier run in this folder go: they would say that this one is complete."""
+        if trainer.is_global_zero:
+            (self.path.parent.parent / "metrics.json").unlink(missing_ok=True)
+
     def on_train_epoch_end(self, trainer, module) -> None:
         if module.steps_done % self.every == 0 or module.stage is None:
             trainer.save_checkpoint(self.path)

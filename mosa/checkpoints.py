@@ -9,7 +9,7 @@ import math
 import pickletools
 import re
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +41,10 @@ NAMED = {"collections OrderedDict", "torch Size", "torch._utils _rebuild_tensor_
          *(f"torch {kind}Storage" for kind in ("Float", "Double", "Half", "BFloat16", "Long", "Int", "Short", "Char", "Byte",
                                                "Bool"))}  # fmt: skip
 """Functions and classes that a checkpoint of this program refers to; torch knows some more, of which a few make large objects."""
+BESIDE = ("ckpt_path", "resume", "optimized_metric", "logger", "trainer", "evaluation", "rendering.backend", "scene.cache",
+          "scene.root", "identification.threads", "extensions")  # fmt: skip
+"""Keys of a run that do not say what is learned, or say where things lie on this machine. A capture may have been moved: of
+`scene.path` the last part counts."""
 GOING_ON: dict[str, Kind] = {
     "stage": whole(0), "steps_done": whole(0), "particles": whole(1), "misfit": POSITIVE,
     "losses": Kind("numbers", lambda v: isinstance(v, list) and all(is_number(x) for x in v)),
@@ -117,6 +121,8 @@ def check_archive(path: Path) -> None:
         names = archive.namelist()
         if len(set(names)) < len(names):
             raise DataError(f"ckpt_path: {path} is not a readable checkpoint (an entry of its archive is there twice)")
+        if (damaged := archive.testzip()) is not None:  # torch does not compare the sums: a flipped bit would be another number
+            raise DataError(f"ckpt_path: {path} is damaged: its part {damaged} is not what was written (another sum)")
         for entry in names:
             if not entry.endswith(".pkl"):
                 continue
@@ -328,6 +334,36 @@ def check_same(checkpoint: Mapping[str, Any], module: torch.nn.Module, path: str
     if stage > most:
         raise DataError(f"ckpt_path: {path}: mosa.stage: expected at most {most}, the stages of this fit, found {stage}: the "
                         "checkpoint belongs to another configuration (fit)")
+
+
+def check_same_run(checkpoint: Mapping[str, Any], values: Mapping[str, Any], folder: str | Path) -> None:
+    """The checkpoint in a run's folder is of the configuration that resume=auto is to go on with: figures and steps of another one
+    would else pass for this one's. Keys that only one of both has are of another version. Errors: ConfigError naming the keys."""
+    stored = checkpoint["mosa"].get("config")
+    stored = stored.get("cfg") if isinstance(stored, Mapping) else None
+    if not isinstance(stored, Mapping):
+        return
+    chosen = ("prior",) if checkpoint["mosa"].get("compared") else ()  # a law was chosen among prior.candidates
+    if found := list(differing(stored, values, (*BESIDE, *chosen))):
+        shown = ", ".join(f"{key}: {str(there)[:60]} there, {str(here)[:60]} here" for key, there, here in found[:4])
+        more = f", and {len(found) - 4} more" if len(found) > 4 else ""
+        raise ConfigError(f"resume: expected in {folder} a run of this configuration, found another one's ({shown}{more}); give "
+                          "this run a folder of its own, begin anew in this one with resume=null, or go on from its checkpoint "
+                          "with ckpt_path=")
+
+
+def differing(stored: Any, values: Any, without: Sequence[str] = (), where: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """(key, stored, given) of the values that differ among those that both have; `without`: keys with all that is below them."""
+    if isinstance(stored, Mapping) and isinstance(values, Mapping):
+        for key in sorted(set(stored) & set(values), key=str):
+            below = f"{where}.{key}".strip(".")
+            if below not in without:
+                yield from differing(stored[key], values[key], without, below)
+    elif where == "scene.path" and isinstance(stored, str) and isinstance(values, str):
+        if Path(stored).name != Path(values).name:
+            yield where, stored, values
+    elif (list(stored) if isinstance(stored, tuple) else stored) != values:
+        yield where, stored, values
 
 
 def check_cues(found: Any) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from mosa.analysis.figures import ffmpeg
 from mosa.checkpoints import check_resumed, read_checkpoint
 from mosa.config import plain, rehearse
 from mosa.data.agreement import lines_of_sight, misses
@@ -40,6 +41,8 @@ def check_configuration(values: Mapping[str, Any], conf: Path | None = None) -> 
     check(values, *schemas)
     if values["simulation"]["particles"] != "auto":
         check_particles("simulation.particles", values["simulation"]["particles"])
+    if values["evaluation"]["video"]:
+        ffmpeg("evaluation.video")
     stages = rehearse(values)
     if HydraConfig.initialized():
         warn_of_idle(HydraConfig.get().overrides.task, values, stages)
@@ -50,6 +53,8 @@ def check_evaluation(values: Mapping[str, Any]) -> None:
     if (conf := conf_folder()) is not None:
         check_known({k: v for k, v in values.items() if k != "scene"}, conf, "eval", EVALUATION, SIMULATION)
     check(values, EVALUATION, SIMULATION)
+    if values["evaluation"]["video"]:
+        ffmpeg("evaluation.video")
 
 
 def check_splats(values: Mapping[str, Any]) -> None:
@@ -58,6 +63,8 @@ def check_splats(values: Mapping[str, Any]) -> None:
     if (conf := conf_folder()) is not None:
         check_known(values, conf, "splats", *schemas)
     check(values, *schemas)
+    if values["video"]:
+        ffmpeg("video")
     check_formats(values["formats"])
     if values["simulation"]["particles"] != "auto":
         check_particles("simulation.particles", values["simulation"]["particles"])

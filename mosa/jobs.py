@@ -26,6 +26,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mosa.commands import fail
 from mosa.errors import ConfigError, MosaError
+from mosa.screen import outlived
 
 FAILED = "failed"
 """Folder in that of a sweep: one file for each job that ended in an error, named after its number, with the message."""
@@ -59,19 +60,26 @@ def check_arguments(arguments: Sequence[str], conf: Path) -> None:
 
 def quoted(argument: str) -> str:
     """An override as Hydra's grammar reads it: a value with letters beyond ASCII, or ~, &, = and the like, as paths have them, gets
-    quotes. As it is where it can be read, and where it has a list, quotes or an escape of its own."""
+    quotes. As it is where it can be read, and where it has a list, quotes or an escape, unless it begins as a path does."""
     key, mark, value = argument.partition("=")
-    if not mark or argument.startswith("-") or set(value) & set(",[]{}'\"\\"):
+    path = value.startswith(("/", "./", "../", "~/")) and "\\" not in value
+    if not mark or argument.startswith("-") or (set(value) & set(",[]{}'\"\\") and not path):
         return argument
     try:
         OverridesParser.create().parse_overrides([argument])
     except HydraException:
-        return f"{key}='{value}'"
+        return f"{key}='{value.replace(chr(39), chr(92) + chr(39))}'"
     return argument
 
 
 def check_folders(arguments: Sequence[str]) -> None:
-    """Exit with 2 and a message for a run folder that cannot be made, to which Hydra answers with a traceback."""
+    """Exit with 2 and a message for a run folder that cannot be made, or a working one that is gone, to which Hydra answers with a
+    traceback."""
+    try:
+        os.getcwd()
+    except OSError:
+        print("\nConfigError: the folder that this was started in is no more; change to another one", file=sys.stderr)
+        sys.exit(2)
     for argument in arguments:
         key, _, value = argument.partition("=")
         if key not in ("hydra.run.dir", "hydra.sweep.dir") or "$" in value:
@@ -90,14 +98,18 @@ def run_command(run: Callable[[], None], conf: str | Path) -> None:
     Exit code 2 too for what Hydra refuses before any job begins: a mistake of the user like all others."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # on small tensors and shared machines a second thread was measured 30x slower
     sys.argv[1:] = map(quoted, sys.argv[1:])
-    check_arguments(sys.argv[1:], Path(conf))
-    check_folders(sys.argv[1:])
-    try:
-        run()
-    except SystemExit as ended:
-        if ended.code == 1 and not begun:
-            sys.exit(2)
-        raise
+    with outlived():
+        check_arguments(sys.argv[1:], Path(conf))
+        check_folders(sys.argv[1:])
+        try:
+            run()
+        except SystemExit as ended:
+            if ended.code == 1 and not begun:
+                sys.exit(2)
+            raise
+        except KeyboardInterrupt:  # between jobs, or before the first
+            fail("stopped")
+            sys.exit(130)
 
 
 begun: list[bool] = []
@@ -137,20 +149,24 @@ def disk_message(error: OSError) -> str | None:
     """One sentence on what the disk refused; None for any other error."""
     if error.errno in (errno.EMFILE, errno.ENFILE):
         return f"{error.filename or 'a file'}: cannot be opened ({error.strerror}); allow more of them at once with ulimit -n"
+    if error.errno == errno.ENOENT and isinstance(error.filename, (str, os.PathLike)) and not Path(error.filename).parent.is_dir():
+        return f"{error.filename}: cannot be written or read: its folder has been removed meanwhile; give the command again"
     if error.errno not in DISK:
         return None
     return (f"{error.filename or 'a file'}: cannot be written or read ({error.strerror}); free space, or choose other folders with "
             "hydra.run.dir= and scene.cache= (eval.py: cache=)")
 
 
-NO_MEMORY = ("can't allocate memory", "out of memory", "Failed to allocate")
-"""What torch and Warp say where the machine, or a GPU, has no more: errors of types that are also others'."""
+NO_MEMORY = ("can't allocate memory", "out of memory", "Failed to allocate", "Cannot allocate memory", "failed to map segment")
+"""What torch, Warp and the system's loader of libraries say where the machine, or a GPU, has no more: errors of types that are also
+others'."""
 
 
-def memory_message(error: Exception) -> str | None:
+def memory_message(error: BaseException) -> str | None:
     """One sentence on memory that there is not, of the machine or of a GPU; None for any other error."""
-    if not isinstance(error, MemoryError) and not any(text in str(error) for text in NO_MEMORY):
-        return None
+    while not isinstance(error, MemoryError) and not any(text in str(error) for text in NO_MEMORY):
+        if (error := error.__cause__ or error.__context__) is None:
+            return None
     told = " ".join(str(error).split())[:200] or "the machine has no more"
     if "cuda" in told.lower():
         return (f"the GPU has no memory left ({told}); stop what else runs there, lower simulation.particles or scene.scale, or "
@@ -182,9 +198,41 @@ def held(folder: str | Path) -> Iterator[None]:
         os.close(number)
 
 
+@contextmanager
+def held_back() -> Iterator[None]:
+    """Ctrl-C and SIGTERM wait until this is over, a second one does not: an exception amid the imports of some libraries aborts
+    the interpreter."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    waiting: list[int] = []
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def wait(number: int, frame) -> None:
+        waiting.append(number)
+        if len(waiting) > 1:
+            before[number](number, frame)
+
+    replaced = {number: handler for number, handler in before.items() if callable(handler)}  # not what is ignored, or ends at once
+    for number in replaced:
+        signal.signal(number, wait)
+    try:
+        yield
+    finally:
+        for number, handler in replaced.items():
+            signal.signal(number, handler)
+    if waiting:
+        before[waiting[0]](waiting[0], None)
+
+
 def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float | None:
     """job(cfg) and its result. A mistake of the user ends in one message and exit code 2; in a sweep it is kept for the end, the
     result is infinite, and the other jobs go on. A stop ends in 130 (Ctrl-C) or 143 (SIGTERM)."""
+    with outlived():  # also in a launcher's worker, and for the message
+        return attempted(job, cfg)
+
+
+def attempted(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float | None:
     begun.append(True)
     first = os.environ.get("LOCAL_RANK", "0") == "0"  # of the processes of a fit on several devices: it speaks for all
     if first and threading.current_thread() is threading.main_thread():
@@ -199,7 +247,7 @@ def attempt(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> float
         sys.exit(143 if signal.SIGTERM in signals else 130)
     except MosaError as error:
         message = f"{type(error).__name__}: {error}"
-    except (MemoryError, RuntimeError) as error:
+    except (MemoryError, RuntimeError, ImportError) as error:
         if (reason := memory_message(error)) is None:
             raise
         message = f"MemoryError: {reason}"

@@ -28,6 +28,7 @@ from mosa.prediction import determined, predicted_spread
 from mosa.rollout_file import save_rollout, save_spread, save_truth
 from mosa.run import write_figures
 from mosa.types import Rollout, Scene
+from mosa.whole_files import written_whole
 
 log = logging.getLogger(__name__)
 
@@ -87,7 +88,8 @@ def write_outputs(
     parts = (results_table(figures), parameter_table(figures), continued_text(figures), determined_text(figures),
              geometry_lines(figures))  # fmt: skip
     table = "\n\n".join(filter(None, parts))
-    (folder / "results.md").write_text(table + "\n")
+    with written_whole(folder / "results.md") as partial:
+        partial.write_text(table + "\n")
     write_figures(folder, figures)  # the last file: the run is complete
     log.info("\n%s\n\nrun folder: %s", table, folder)
 

@@ -153,7 +153,8 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         rollout = twin.simulate(**simulate, progress=True)
         given = simulate["colliders"]
         solids = twin.world.colliders if given is None else colliders_from_config(given, "simulate.colliders")
-        log.info("simulated %d frames into %s", len(rollout.x), twin.export(rollout, folder, colliders=solids))
+        written = twin.export(rollout, folder, colliders=solids, video=cfg.evaluation.video)
+        log.info("simulated %d frames into %s", len(rollout.x), written)
         return None
     scene, held_out = scenes(evaluated_scene(cfg, twin))
     body, world = twin.body, twin.world

@@ -17,12 +17,16 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from mosa import parallel
+from mosa.checkpoints import check_same_run, read_checkpoint
 from mosa.config import plain
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body import Body, Start
+from mosa.whole_files import written_whole
 
 log = logging.getLogger(__name__)
 
+LAST = Path("checkpoints", "last.ckpt")
+"""In a run's folder."""
 MOST_PARTICLES = {"cpu": 6000, "cuda": 30000}
 """Of simulation.particles=auto: what a machine identifies in the time that a user waits for a first result."""
 SPECIAL = {"Infinity": math.inf, "-Infinity": -math.inf, "NaN": math.nan}
@@ -49,9 +53,8 @@ def write_figures(folder: Path, figures: dict[str, float | str]) -> None:
             return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
         return value
 
-    partial = folder / "metrics.json.partial"
-    partial.write_text(json.dumps({k: strict(figures[k]) for k in sorted(figures)}, indent=1, allow_nan=False))
-    partial.replace(folder / "metrics.json")
+    with written_whole(folder / "metrics.json") as partial:
+        partial.write_text(json.dumps({k: strict(figures[k]) for k in sorted(figures)}, indent=1, allow_nan=False))
 
 
 def read_figures(path: Path) -> dict[str, float | str]:
@@ -67,18 +70,33 @@ def read_figures(path: Path) -> dict[str, float | str]:
 
 
 def finished(cfg: DictConfig, folder: Path) -> dict[str, float] | None:
-    """The figures of a run that is complete and, with resume=auto, is not made again. Errors: ConfigError."""
+    """The figures of a run that is complete and, with resume=auto, is not made again. Errors: ConfigError where the folder's run is
+    one of another configuration."""
     if cfg.resume not in (None, "auto"):
         raise ConfigError(f"resume: expected null or auto, found {cfg.resume!r}; a checkpoint's path is ckpt_path")
     path = folder / "metrics.json"
-    return read_figures(path) if cfg.resume == "auto" and path.is_file() else None
+    if cfg.resume != "auto" or not path.is_file():
+        return None
+    check_own(cfg, folder)
+    return read_figures(path)
+
+
+def check_own(cfg: DictConfig, folder: Path) -> None:
+    """The folder's checkpoint, where it has one that can be read, is of this configuration. Errors: ConfigError."""
+    try:
+        found = read_checkpoint(folder / LAST)
+    except DataError:  # said where a fit is to go on from it
+        return
+    check_same_run(found, plain(cfg), folder)
 
 
 def begins_from(cfg: DictConfig, folder: Path) -> str | None:
-    """The checkpoint that the fit goes on from: with resume=auto the run folder's own where it has one."""
-    last = folder / "checkpoints" / "last.ckpt"
+    """The checkpoint that the fit goes on from: with resume=auto the run folder's own where it has one. Errors: ConfigError where
+    that is of another configuration."""
+    last = folder / LAST
     if cfg.resume != "auto" or not last.is_file():
         return cfg.ckpt_path
+    check_own(cfg, folder)
     log.info("going on from %s (resume=auto)", last)
     return str(last)
 
@@ -135,6 +153,7 @@ def shared_starts(cfg: DictConfig, folder: Path, find: Callable[[], dict[str, St
         return {k: Start.read(s, body.rest) for k, s in json.loads(path.read_text()).items()}
     found = find()
     if len(device_names(cfg)) > 1:
-        path.write_text(json.dumps({k: s.written() for k, s in found.items()}))
+        with written_whole(path) as partial:
+            partial.write_text(json.dumps({k: s.written() for k, s in found.items()}))
     return found
 

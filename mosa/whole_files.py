@@ -12,7 +12,8 @@ from pathlib import Path
 @contextmanager
 def written_whole(path: str | Path) -> Iterator[Path]:
     """Where to write a file that is renamed to `path` afterwards, if nothing went wrong. Each process writes beside the others, and
-    removes what processes of this machine that have ended left of the same file."""
+    removes what processes of this machine that have ended left of the same file. It is on the disk before it gets its name: a
+    machine that loses power would else keep a name without content."""
     path = Path(path)
     own = f"{path.name}.{platform.node().replace('.', '_')}."
     for old in path.parent.glob(f"{own.replace('[', '[[]')}*.partial"):
@@ -21,7 +22,13 @@ def written_whole(path: str | Path) -> Iterator[Path]:
     partial = path.with_name(f"{own}{os.getpid()}.partial")
     try:
         yield partial
+        with open(partial, "rb") as written:
+            os.fsync(written.fileno())
         os.replace(partial, path)
+    except OSError as error:
+        if error.errno is not None and error.filename is None:  # a disk that fills up meanwhile names no file
+            error.filename = str(path)
+        raise
     finally:
         partial.unlink(missing_ok=True)
 

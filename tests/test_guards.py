@@ -1,8 +1,12 @@
 """What is refused before anything long runs, or made again, with the message that says so."""
 
+import errno
 import math
+import os
 import struct
+import sys
 import zlib
+from pathlib import Path
 
 import pytest
 import torch
@@ -15,7 +19,7 @@ from mosa.config import rehearse
 from mosa.data.images import check_amount, read_image
 from mosa.data.particles import read_ply
 from mosa.errors import ConfigError, DataError
-from mosa.guards import check_begin, check_particles
+from mosa.guards import check_begin, check_configuration, check_particles
 from mosa.limits import machine_memory
 from mosa.physics.contact.mesh import field_of_mesh
 from mosa.reconstruction.cache import StageCache
@@ -126,6 +130,39 @@ def test_a_cache_that_holds_something_else_is_made_again(tmp_path, wrong, caplog
     assert made is SPLATS and "static.pt: cannot be read" in caplog.text
     again = cache.stage("static", lambda: pytest.fail("it is there"))
     assert all(torch.equal(again[key], SPLATS[key]) for key in SPLATS)
+
+
+def test_a_video_without_an_ffmpeg_is_refused_before_anything_long(monkeypatch):
+    """It was found out after the fit, when the video was to be written."""
+    values = composed("debug=default")
+    check_configuration(values, Path(__file__).parents[1] / "conf")
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(ConfigError, match=r"evaluation\.video: expected false, or an ffmpeg"):
+        check_configuration(values, Path(__file__).parents[1] / "conf")
+    check_configuration(values | {"evaluation": values["evaluation"] | {"video": False}}, Path(__file__).parents[1] / "conf")
+
+
+def test_a_cache_whose_bits_have_changed_is_made_again(tmp_path, caplog):
+    """torch reads a flipped bit as another number."""
+    cache = StageCache(tmp_path, {"scene": "a"})
+    cache.stage("static", lambda: SPLATS)
+    content, scales = bytearray((cache.folder / "static.pt").read_bytes()), SPLATS["scales"].numpy().tobytes()
+    content[content.index(scales) + 1] ^= 1
+    (cache.folder / "static.pt").write_bytes(content)
+    assert cache.stage("static", lambda: SPLATS) is SPLATS and "static.pt: cannot be read (other bytes" in caplog.text
+
+
+def test_a_cache_that_has_all_may_be_read_only(tmp_path, monkeypatch):
+    """One that several users share, and that only one of them writes."""
+    StageCache(tmp_path, {"scene": "a"}).stage("static", lambda: SPLATS)
+
+    def refuse(path):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+
+    monkeypatch.setattr("mosa.reconstruction.cache.written_whole", refuse)
+    assert StageCache(tmp_path, {"scene": "a"}).stage("static", lambda: pytest.fail("it is there")).keys() == SPLATS.keys()
+    with pytest.raises(OSError, match="Read-only"):
+        StageCache(tmp_path, {"scene": "b"})
 
 
 def test_a_scene_cannot_name_a_folder_outside_of_the_cache(tmp_path):

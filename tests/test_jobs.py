@@ -1,7 +1,9 @@
 """Exit codes and messages of a job and of a sweep, whichever process its jobs ran in."""
 
 import errno
+import io
 import os
+import shlex
 import subprocess
 import sys
 import textwrap
@@ -9,11 +11,13 @@ from pathlib import Path
 
 import pytest
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from mosa.errors import ConfigError
 from mosa.jobs import LONGEST, Failures, attempt, check_folders, folder_name, held, quoted
+from mosa.npz import write_npz
 
 ROOT = Path(__file__).parents[1]
 
@@ -69,6 +73,13 @@ def test_a_run_folder_is_one_process_own_until_that_ends(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_folder_that_was_removed_meanwhile_is_one_message(sweep, tmp_path, capsys):
+    attempt(lambda _: write_npz(tmp_path / "gone" / "observed.npz", {}), None)
+    assert "observed.npz" in (said := capsys.readouterr().err) and "its folder has been removed meanwhile" in said
+    with pytest.raises(FileNotFoundError):  # a file that is not there is the program's
+        attempt(lambda _: (tmp_path / "none").read_text(), None)
+
+
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EFBIG])
 def test_what_a_disk_refuses_is_one_message(sweep, capsys, code):
     attempt(fail(OSError(code, os.strerror(code), "/full/file")), None)
@@ -106,10 +117,15 @@ def test_a_long_name_is_cut_and_stays_its_own():
     ("scene.path=/data/höhle", "scene.path='/data/höhle'"), ("scene.path=~/x", "scene.path='~/x'"),
     ("scene.path=/a=b & c", "scene.path='/a=b & c'"), ("scene.path=/a b", "scene.path=/a b"), ("seed=0,1", "seed=0,1"),
     ("fit.x=[ä]", "fit.x=[ä]"), ("x='ä'", "x='ä'"), ("prior=ä,b", "prior=ä,b"), ("--cfg=ä", "--cfg=ä"), ("banana", "banana"),
+    ("scene.path=/a's b", r"scene.path='/a\'s b'"), ("scene.path=/a b, [c] {d}", "scene.path='/a b, [c] {d}'"),
+    ("x=/a,/b", "x=/a,/b"),
 ])  # fmt: skip
 def test_values_that_hydra_cannot_read_are_quoted(argument, found):
     """It ended a run whose path had an umlaut in it."""
     assert quoted(argument) == found
+    if argument.startswith("scene.path="):
+        (read,) = OverridesParser.create().parse_overrides([found])
+        assert str(read.value()) == argument.partition("=")[2]
 
 
 def test_a_run_folder_that_cannot_be_made_is_said_before_hydra_fails(tmp_path, capsys):
@@ -149,3 +165,89 @@ def test_a_joblib_sweep_with_failed_jobs_does_not_exit_with_0(tmp_path):
     keys = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", f"hydra.sweep.dir={tmp_path}", "debug=default", "seed=-1,-2"]
     found = subprocess.run([sys.executable, "train.py", "-m", *keys], cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert found.returncode == 1 and "2 jobs of the sweep failed" in found.stderr
+
+
+OUTLIVED = """
+    import logging, sys
+    from mosa.commands import begin_log
+    from mosa.screen import outlived
+    with outlived():
+        logging.basicConfig(stream=sys.stdout, level=logging.INFO)
+        begin_log()
+        for k in range(2000):
+            logging.info("a line %d", k)
+            print("another", file=sys.stderr)
+        open({done!r}, "w").close()
+"""
+
+
+@pytest.mark.parametrize("shell", ["{} 2>&1 | head -1", "{} | head -1", "{} >&- 2>&-", "{} > /dev/full 2>&1"])
+def test_a_run_outlives_whoever_reads_its_lines(tmp_path, shell):
+    """`| head -1` ended a run without a word, and printed hundreds of tracebacks where the reader of the output alone had gone."""
+    done = tmp_path / "done"
+    program = f"{sys.executable} -c {shlex.quote(textwrap.dedent(OUTLIVED.format(done=str(done))))}"
+    found = subprocess.run(["bash", "-o", "pipefail", "-c", shell.format(program)], cwd=ROOT, capture_output=True, text=True)
+    assert found.returncode == 0 and done.is_file() and "Error" not in found.stderr
+    assert found.stdout.count("\n") <= 1
+
+
+def test_a_working_folder_that_is_gone_is_said(tmp_path):
+    (tmp_path / "gone").mkdir()
+    command = f"cd {tmp_path}/gone && rmdir ../gone && exec {sys.executable} {ROOT}/train.py debug=default"
+    found = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60, cwd=ROOT,
+                           env={**os.environ, "PYTHONPATH": str(ROOT)})  # fmt: skip
+    assert found.returncode == 2 and "the folder that this was started in is no more" in found.stderr
+    assert "Traceback" not in found.stderr
+
+
+def test_a_stop_before_the_first_job_is_no_traceback():
+    code = textwrap.dedent("""
+        from mosa.jobs import run_command; import os, signal, sys
+        sys.argv[1:] = []
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        run_command(lambda: os.kill(os.getpid(), signal.SIGINT), "conf")
+    """)
+    found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert found.returncode == 130 and found.stderr.strip() == "stopped"
+
+
+@pytest.mark.parametrize(("times", "imported"), [(1, True), (2, False)])
+@pytest.mark.parametrize(("name", "code"), [("TERM", 143), ("INT", 130)])
+def test_a_stop_waits_for_the_imports_and_a_second_one_does_not(tmp_path, name, code, times, imported):
+    """Ctrl-C in the middle of an extension's import aborted the interpreter, with a traceback."""
+    (tmp_path / "slow_module.py").write_text(f"""
+import os, signal
+for _ in range({times}):
+    os.kill(os.getpid(), signal.SIG{name})
+print("imported", flush=True)
+""")
+    program = """
+        import signal, sys
+        from mosa.jobs import attempt, held_back
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        def job(cfg):
+            with held_back():
+                import slow_module
+            print("ran")
+        attempt(job, None)
+    """
+    found = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], cwd=tmp_path, capture_output=True, text=True,
+                           timeout=60, env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"})  # fmt: skip
+    assert found.returncode == code and "Traceback" not in found.stderr and "stopped" in found.stderr
+    assert found.stdout == ("imported\n" if imported else "")
+
+
+def test_a_message_is_kept_where_nobody_reads_the_screen(sweep, tmp_path, monkeypatch):
+    """A worker of a launcher whose screen had gone ended in a broken pipe, and the sweep did not say why its job had failed."""
+    class Gone(io.StringIO):
+        def write(self, text):
+            raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
+
+        def fileno(self):
+            return nowhere
+
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    monkeypatch.setattr(sys, "stderr", Gone())
+    assert attempt(fail(ConfigError("seed: wrong")), None) == float("inf")
+    os.close(nowhere)
+    assert (tmp_path / "failed" / "3.txt").read_text() == "ConfigError: seed: wrong\n"

@@ -2,10 +2,13 @@
 
 import json
 import math
+from types import SimpleNamespace
 
 import pytest
+import torch
 from omegaconf import OmegaConf
 
+from mosa.callbacks import KeepLast
 from mosa.errors import ConfigError
 from mosa.run import begins_from, finished, read_figures, write_figures
 
@@ -71,3 +74,48 @@ def test_figures_of_runs_before_are_read(tmp_path):
     (tmp_path / "metrics.json").write_text(json.dumps({"train/psnr_full": math.inf, "id/growth_per_period": math.nan}))
     found = finished(config("auto"), tmp_path)
     assert found["train/psnr_full"] == math.inf and math.isnan(found["id/growth_per_period"])
+
+
+def trained(folder, figures=True, **changed):
+    """A run folder whose checkpoint and figures are of a configuration, with `changed` in it; the configuration."""
+    cfg = OmegaConf.create({"resume": "auto", "ckpt_path": None, "seed": 0, "prior": {"law": "corotated"}, "fit": {"views": 1},
+                            "scene": {"path": "/a/duck", "cache": None}, "evaluation": {"video": True}})  # fmt: skip
+    (folder / "checkpoints").mkdir()
+    stored = OmegaConf.to_container(OmegaConf.merge(cfg, OmegaConf.create(changed)))
+    torch.save({"mosa": {"config": {"cfg": stored}, "compared": changed.get("compared", {})}}, folder / "checkpoints" / "last.ckpt")
+    if figures:
+        write_figures(folder, {"test/rms_m": 0.5})
+    return cfg
+
+
+@pytest.mark.parametrize(("changed", "said"), [
+    ({"seed": 1}, "seed: 1 there, 0 here"), ({"prior": {"law": "linear"}}, "prior.law: linear there, corotated here"),
+    ({"fit": {"views": 2}}, "fit.views: 2 there, 1 here"), ({"scene": {"path": "/b/goose"}}, "scene.path: /b/goose there"),
+])  # fmt: skip
+@pytest.mark.parametrize("figures", [True, False])
+def test_a_run_of_another_configuration_is_not_taken_for_this_one(tmp_path, changed, said, figures):
+    """Two sweeps in one folder, whose jobs are numbered alike: the second had the figures of the first, or went on with its fit."""
+    cfg = trained(tmp_path, figures, **changed)
+    with pytest.raises(ConfigError, match=f"resume: expected in .* a run of this configuration, .*{said}"):
+        finished(cfg, tmp_path)
+        begins_from(cfg, tmp_path)
+    cfg.resume = None
+    assert finished(cfg, tmp_path) is None and begins_from(cfg, tmp_path) is None
+
+
+@pytest.mark.parametrize("changed", [
+    {}, {"evaluation": {"video": False}}, {"scene": {"path": "/moved/duck", "cache": "/b"}}, {"an_older_key": 1},
+    {"prior": {"law": "stvk"}, "compared": {"stvk": 0.1, "corotated": 0.2}},
+])  # fmt: skip
+def test_what_does_not_say_what_is_learned_may_differ(tmp_path, changed):
+    cfg = trained(tmp_path, **changed)
+    assert finished(cfg, tmp_path) == {"test/rms_m": 0.5} and begins_from(cfg, tmp_path).endswith("last.ckpt")
+
+
+def test_a_fit_that_begins_takes_away_the_figures_of_the_run_before(tmp_path):
+    """They would say that it is complete, were it killed."""
+    write_figures(tmp_path, {"test/rms_m": 0.5})
+    KeepLast(tmp_path / "checkpoints").on_fit_start(SimpleNamespace(is_global_zero=False), None)  # another process of the fit
+    assert (tmp_path / "metrics.json").is_file()
+    KeepLast(tmp_path / "checkpoints").on_fit_start(SimpleNamespace(is_global_zero=True), None)
+    assert not (tmp_path / "metrics.json").exists()

@@ -1,5 +1,6 @@
 """Files that are complete under their name, beside what others write and what a kill left."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -40,3 +41,10 @@ with written_whole({str(path)!r}) as partial:
     with written_whole(path) as partial:
         partial.write_text("all of it")
     assert sorted(tmp_path.iterdir()) == sorted([path, other, alive])
+
+
+def test_a_disk_that_fills_up_is_said_with_the_file(tmp_path):
+    """Python names no file where a write fails, only where it cannot be opened."""
+    with pytest.raises(OSError, match=r"No space left on device: '.*a\.npz'") as caught, written_whole(tmp_path / "a.npz"):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert caught.value.filename == str(tmp_path / "a.npz") and not list(tmp_path.iterdir())

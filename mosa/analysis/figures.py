@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -9,6 +10,20 @@ import cv2
 import imageio.v2 as imageio
 import numpy as np
 from torch import Tensor
+
+from mosa.errors import ConfigError
+from mosa.whole_files import written_whole
+
+
+def ffmpeg(key: str) -> str:
+    """Path of the program that writes the video which `key` asks for. Errors: ConfigError where there is none."""
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+
+        return get_ffmpeg_exe()
+    except (ImportError, RuntimeError) as error:
+        raise ConfigError(f"{key}: expected false, or an ffmpeg to write it with (set IMAGEIO_FFMPEG_EXE, or install "
+                          f"imageio-ffmpeg), found none ({' '.join(str(error).split())[:200]})") from error
 
 
 def to_uint8(image: Tensor | np.ndarray) -> np.ndarray:
@@ -47,14 +62,30 @@ def side_by_side(columns: Images, *, below: Images | None = None, footer: list[s
 
 
 def write_video(path: str | Path, frames: list[np.ndarray], fps: float = 12.0) -> Path:
-    """H.264 video; the size is padded to even numbers. Plays slower than real time where fps is below the capture's."""
+    """H.264 video; the size is padded to even numbers. Plays slower than real time where fps is below the capture's.
+
+    Errors: ImportError or RuntimeError without an ffmpeg (`ffmpeg` says it before); OSError where that cannot write.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     height, width = frames[0].shape[:2]
     padding = ((0, height % 2), (0, width % 2), (0, 0))
-    with imageio.get_writer(path, fps=fps, codec="libx264", quality=8, macro_block_size=2) as writer:
-        for frame in frames:
-            writer.append_data(np.pad(frame, padding, mode="edge"))
+    from imageio_ffmpeg import write_frames
+
+    # imageio takes the kind of file from its name, which has it only once the file is whole
+    size, options = (width + width % 2, height + height % 2), {"quality": 8, "macro_block_size": 2}
+    with written_whole(path) as partial:
+        writer = write_frames(str(partial), size, fps=fps, codec="libx264", output_params=["-f", "mp4"], **options)
+        try:
+            writer.send(None)
+            for frame in frames:
+                writer.send(np.pad(frame, padding, mode="edge").tobytes())
+        except OSError as error:  # ffmpeg has ended, and what it said is its whole output
+            raise OSError(errno.EIO, "ffmpeg has ended while it wrote", str(path)) from error
+        finally:
+            writer.close()
+        if (found := int(cv2.VideoCapture(str(partial)).get(cv2.CAP_PROP_FRAME_COUNT))) != len(frames):  # ffmpeg says nothing of it
+            raise OSError(errno.EIO, f"{found} of {len(frames)} pictures are in it: is the disk full?", str(path))
     return path
 
 
@@ -72,5 +103,6 @@ def write_strip(path: str | Path, columns: Images, frames: int = 6, *, notes: Ma
         rows.append(label(row, name))
     width = max(row.shape[1] for row in rows)
     rows = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
-    imageio.imwrite(path, np.concatenate(rows))
+    with written_whole(path) as partial:
+        imageio.imwrite(partial, np.concatenate(rows), format="PNG")
     return path

@@ -19,6 +19,7 @@ def begin_log() -> None:
     """Warnings become lines of the log, on the screen and in the run folder; the chatter of libraries does not."""
     for name in ("matplotlib", "imageio", "PIL", "fsspec"):
         logging.getLogger(name).setLevel(logging.WARNING)
+    logging.raiseExceptions = False  # a line that cannot be written (a closed screen, a full disk) is no reason for a traceback
     warnings.formatwarning = one_line
     logging.captureWarnings(True)
 

@@ -9,7 +9,7 @@ import hydra
 from omegaconf import DictConfig
 
 from mosa.commands import begin_log, configuration
-from mosa.jobs import attempt, run_command
+from mosa.jobs import attempt, held_back, run_command
 
 
 def command(module: str, job: str) -> Callable[[], None]:
@@ -20,7 +20,9 @@ def command(module: str, job: str) -> Callable[[], None]:
     where, _, function = job.partition(":")
 
     def imported(cfg: DictConfig) -> float | None:
-        return getattr(importlib.import_module(where), function)(cfg)
+        with held_back():
+            module = importlib.import_module(where)
+        return getattr(module, function)(cfg)
 
     def run(cfg: DictConfig) -> float | None:
         begin_log()

@@ -12,6 +12,7 @@ from pathlib import Path
 from mosa.commands import configuration
 from mosa.errors import ConfigError, MosaError
 from mosa.jobs import disk_message
+from mosa.screen import outlived
 
 RESULTS = Path("docs/results")
 
@@ -46,6 +47,13 @@ def arguments(words: list[str]) -> argparse.Namespace:
 def main(words: list[str] | None = None) -> None:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     signal.signal(signal.SIGTERM, interrupt)  # or the jobs would go on without anyone who waits for them
+    with outlived():  # hours of jobs do not end with whoever read their lines
+        code = code_of(words)
+    sys.exit(code)
+
+
+def code_of(words: list[str] | None) -> int:
+    """Exit code of a command line, of which a mistake or a stop is one message."""
     try:
         code = run(arguments(sys.argv[1:] if words is None else words))
     except MosaError as error:
@@ -59,7 +67,7 @@ def main(words: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         print("\nstopped; the same command goes on from here", file=sys.stderr)
         code = 130
-    sys.exit(code)
+    return code
 
 
 def interrupt(*_) -> None:

@@ -19,6 +19,7 @@ from mosa.errors import ConfigError, DataError
 from mosa.rendering.covariance import scales_and_rotations
 from mosa.rendering.spherical_harmonics import Y0, degree_of, mean_colors, rotated
 from mosa.types import Appearance, Splats
+from mosa.whole_files import written_whole
 
 if TYPE_CHECKING:
     from mosa.modules.carried_splats import Seen
@@ -60,7 +61,8 @@ def save_splat(path: str | Path, splats: Splats) -> Path:
     unit = torch.nn.functional.normalize(splats.rotations, dim=-1).numpy()[order]
     rows["rotation"] = np.clip(128 + 128 * unit + 0.5, 0, 255).astype(np.uint8)
     path.parent.mkdir(parents=True, exist_ok=True)
-    rows.tofile(path)
+    with written_whole(path) as partial:
+        rows.tofile(partial)
     return path
 
 
@@ -95,7 +97,8 @@ def save_spz(path: str | Path, appearance: Appearance) -> Path:
     higher = harmonics[:, 1:].contiguous().numpy() if harmonics.shape[1] > 1 else None
     data = GSData.from_arrays(splats.means.numpy(), splats.scales.clamp(min=1e-9).log().numpy(), splats.rotations.numpy(),
                               logits.numpy(), harmonics[:, 0].contiguous().numpy(), higher)  # fmt: skip
-    write_spz(path, data, fractional_bits=SPZ_BITS)
+    with written_whole(path) as partial:
+        write_spz(partial, data, fractional_bits=SPZ_BITS)
     return path
 
 

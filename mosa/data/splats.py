@@ -18,6 +18,7 @@ from mosa.ply import check_ply
 from mosa.rendering.covariance import scales_and_rotations
 from mosa.rendering.spherical_harmonics import DEGREES, constant_coefficients, degree_of, mean_colors
 from mosa.types import Splats
+from mosa.whole_files import written_whole
 
 AXES = ("x", "y", "z")
 SCALES = tuple(f"scale_{i}" for i in range(3))
@@ -55,7 +56,8 @@ def save_ply(path: str | Path, splats: Splats, coefficients: Tensor | None = Non
         for name, column in zip(fields, values.detach().cpu().numpy().T):
             vertices[name] = _finite(column, name, path, "to write")
     path.parent.mkdir(parents=True, exist_ok=True)
-    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(path)
+    with written_whole(path) as partial, open(partial, "wb") as file:
+        PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(file)
     return path
 
 

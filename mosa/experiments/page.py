@@ -15,6 +15,7 @@ from mosa.errors import ConfigError, DataError
 from mosa.experiments.collecting import Cell
 from mosa.experiments.printed import printed_table
 from mosa.experiments.specification import Claim, Experiment, Figure, load_experiment
+from mosa.whole_files import written_whole
 
 Tables = Mapping[str, Mapping[str, Mapping[str, Cell | None]]]
 NOT_RUN = "not run"
@@ -31,7 +32,8 @@ def write_json(path: Path, tables: Tables, extra: str, lines: Sequence[str], pic
     cells = {label: {row: {c: None if cell is None else [cell.mean, cell.sd, cell.count] for c, cell in found.items()}
                      for row, found in rows.items()} for label, rows in tables.items()}  # fmt: skip
     found = {"cells": cells, "extra": extra, "provenance": list(lines), "pictures": [picture.name for picture in pictures]}
-    path.write_text(json.dumps(found, indent=1) + "\n")
+    with written_whole(path) as partial:
+        partial.write_text(json.dumps(found, indent=1) + "\n")
 
 
 def read_tables(path: Path) -> tuple[Tables, dict[str, Any]] | None:

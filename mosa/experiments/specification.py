@@ -266,7 +266,10 @@ def minutes_taken(job: Job) -> float | None:
         return None
     measured = job.folder / MINUTES
     if measured.is_file():
-        return float(measured.read_text())
+        try:
+            return float(measured.read_text())
+        except ValueError:  # killed while it was written
+            pass
     figures = figures_of(job)
     return sum(value for key, value in figures.items() if key.startswith("time/") and key.endswith("_s") and key.count("_") == 1
                and isinstance(value, (int, float))) / 60  # fmt: skip

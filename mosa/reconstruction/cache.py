@@ -7,6 +7,7 @@ import hashlib
 import json
 import logging
 import os
+import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -59,7 +60,10 @@ class StageCache:
             digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]
             self.folder = Path(root) / "reconstruction" / f"{key['scene'].replace('/', '_')[:80]}-{digest}"
             self.folder.mkdir(parents=True, exist_ok=True)
-            (self.folder / "key.json").write_text(json.dumps(key, indent=1, sort_keys=True))
+            file, text = self.folder / "key.json", json.dumps(key, indent=1, sort_keys=True)
+            if not file.is_file() or file.read_bytes() != text.encode():  # a cache that has all may be one that is only read
+                with written_whole(file) as partial:
+                    partial.write_text(text)
 
     def stage(self, name: str, compute: Callable[[], Any], leading: tuple[int, ...] | None = None) -> Any:
         """The stored result of a stage, or `compute()` stored. A damaged file, or one that holds something else, is computed again.
@@ -69,6 +73,9 @@ class StageCache:
         path = self.folder / f"{name}.pt"
         if path.exists():
             try:
+                with zipfile.ZipFile(path) as archive:  # torch does not compare the sums
+                    if archive.testzip() is not None:
+                        raise ValueError("other bytes than were written")
                 result = torch.load(path, map_location="cpu", weights_only=True)
                 check_result(name, result, leading)
                 return result
@@ -88,4 +95,6 @@ class StageCache:
             return
         chosen = np.unique(np.linspace(0, len(windows) - 1, columns).astype(int))
         rows = [torch.cat(list(images[chosen].cpu()), 1) for images in (windows.images, rendered)]
-        imageio.imwrite(self.folder / f"{name}.png", (torch.cat(rows).clamp(0, 1).numpy() * 255).round().astype(np.uint8))
+        picture = (torch.cat(rows).clamp(0, 1).numpy() * 255).round().astype(np.uint8)
+        with written_whole(self.folder / f"{name}.png") as partial:
+            imageio.imwrite(partial, picture, extension=".png")

@@ -1,9 +1,12 @@
 """Pictures of a run."""
 
+import cv2
 import imageio.v3 as imageio
+import numpy as np
+import pytest
 import torch
 
-from mosa.analysis.figures import write_strip
+from mosa.analysis.figures import write_strip, write_video
 
 
 def test_a_strip_takes_rows_of_different_sizes(tmp_path):
@@ -14,3 +17,23 @@ def test_a_strip_takes_rows_of_different_sizes(tmp_path):
     assert picture.shape[1] == 5 * 50
     assert (picture[height - 1, : 5 * 30] == 0).all() and (picture[height - 1, 5 * 30 :] == 255).all()
     assert (abs(picture[-1].astype(int) - 128) <= 1).all()
+
+
+def test_a_video_and_a_strip_are_whole_or_not_there(tmp_path):
+    frames = [np.full((41, 60, 3), 40 * k, np.uint8) for k in range(5)]
+    write_strip(tmp_path / "a.png", {"x": np.stack(frames)})
+    found = cv2.VideoCapture(str(write_video(tmp_path / "a.mp4", frames, fps=6)))
+    assert found.get(cv2.CAP_PROP_FRAME_COUNT) == 5 and found.get(cv2.CAP_PROP_FRAME_HEIGHT) == 42
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.mp4", "a.png"]
+
+
+@pytest.mark.parametrize("program", ["exit 1", "cat > /dev/null", "head -c 99 > /dev/null"])
+def test_an_ffmpeg_that_writes_nothing_is_said(tmp_path, monkeypatch, program):
+    """On a full disk ffmpeg ends, and imageio does not look at how: the run had half a film under its name."""
+    other = tmp_path / "ffmpeg"
+    other.write_text(f"#!/bin/sh\n{program}\n")
+    other.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(other))
+    with pytest.raises(OSError, match=r"(ffmpeg has ended while it wrote|of 5 pictures are in it).*a\.mp4"):
+        write_video(tmp_path / "a.mp4", [np.zeros((400, 600, 3), np.uint8)] * 5)
+    assert [file.name for file in tmp_path.iterdir()] == ["ffmpeg"]

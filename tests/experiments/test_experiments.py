@@ -21,6 +21,7 @@ from mosa.experiments.page import verdict
 from mosa.experiments.printed import printed_table
 from mosa.experiments.specification import (
     CROWD,
+    MINUTES,
     Claim,
     Experiment,
     Figure,
@@ -31,6 +32,7 @@ from mosa.experiments.specification import (
     folder_name,
     jobs_of,
     load_experiment,
+    minutes_taken,
     narrowed,
     pairs,
 )
@@ -312,6 +314,15 @@ def test_a_damaged_metrics_file_is_named(tmp_path):
     (jobs[0].folder / "metrics.json").write_text("{")
     with pytest.raises(DataError, match=r"metrics\.json.*belongs to the job adapter=operator scene=a seed=0"):
         records_of(jobs)
+
+
+def test_a_time_that_a_kill_left_half_written_is_taken_from_the_figures(tmp_path):
+    job = made_up(tmp_path)[1][0]
+    write_metrics(job, **{"time/data_s": 120.0})
+    (job.folder / MINUTES).write_text("3.5")
+    assert minutes_taken(job) == 3.5
+    (job.folder / MINUTES).write_text("")
+    assert minutes_taken(job) == pytest.approx(3.0)
 
 
 def test_the_command_is_written_without_folders_of_this_machine():

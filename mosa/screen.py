@@ -1,0 +1,48 @@
+"""The screen of a program that goes on when nobody reads it any more."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TextIO
+
+
+class Outlived:
+    """A stream of text whose reader may go before the program does (`| head -1`, a terminal that is closed, a log on a full disk):
+    what comes after that goes nowhere, and the work goes on."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self.stream = stream
+
+    def __getattr__(self, name: str):
+        return getattr(self.stream, name)
+
+    def write(self, text: str) -> int:
+        return self.attempted(lambda: self.stream.write(text), len(text))
+
+    def flush(self) -> None:
+        self.attempted(self.stream.flush, None)
+
+    def attempted(self, act: Callable, otherwise):
+        try:
+            return act()
+        except OSError:
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, self.stream.fileno())  # also for what runs below this process, and for what is still in the buffer
+            os.close(nowhere)
+            return otherwise
+
+
+@contextmanager
+def outlived() -> Iterator[None]:
+    """Standard output and error may lose their readers meanwhile; where there are none (`>&-`) there are some that go nowhere."""
+    before = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = (Outlived(open(os.devnull, "w") if stream is None else stream) for stream in before)
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        sys.stdout, sys.stderr = before
