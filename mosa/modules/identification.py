@@ -100,7 +100,7 @@ def blocks_of(body: Body, *, adapter: bool, heterogeneity: bool, settings: Ident
         blocks.append(Block("operator", zero, zero + settings.operator_sd, step, learned=settings.evidence))
     if heterogeneity:
         falls = (1 + (body.heterogeneity.size / 2) ** 2) ** (-settings.smoothness / 2)
-        blocks.append(Block("stiffness", 0 * falls, settings.stiffness_sd * falls, step / body.heterogeneity.amplitude,
+        blocks.append(Block("stiffness", 0 * falls, settings.stiffness_sd * falls, step / body.heterogeneity.settings.amplitude,
                             learned=settings.evidence))
     return blocks
 
