@@ -17,7 +17,8 @@ from mosa.modules.adapters import adapter_class
 from mosa.modules.body import Body, SimulationSettings, World
 from mosa.modules.criteria import Criterion
 from mosa.modules.heterogeneity import HeterogeneityField, HeterogeneitySettings
-from mosa.modules.identification import IdentificationSettings, few_numbers
+from mosa.modules.identification_settings import IdentificationSettings
+from mosa.modules.learned_numbers import few_numbers
 from mosa.modules.material import Material
 from mosa.modules.stages import STAGES, Stage, recalibrations
 from mosa.modules.stiffness_modes import StiffnessModes

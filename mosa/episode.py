@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body import Body, Ready, Start, World
-from mosa.modules.identification import each_law
+from mosa.modules.learned_numbers import each_law
 from mosa.physics.contact.colliders import reach
 from mosa.physics.contact.motion import Poses, exponential, rotation_matrices, rotation_vector
 from mosa.physics.engine.clock import Moment

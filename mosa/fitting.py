@@ -19,7 +19,7 @@ from mosa.costs import Costs, duration, seconds_of_fit, speed_of_rollouts
 from mosa.data.datamodule import MultiViewDataModule
 from mosa.errors import DataError, MosaError, SimulationDiverged
 from mosa.loggers import build_loggers
-from mosa.modules.identification import read_numbers
+from mosa.modules.learned_numbers import read_numbers
 from mosa.modules.lit_mosa import LitMosa
 from mosa.run import device_names
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from mosa.evaluation_settings import EvaluationSettings
 from mosa.modules.criteria import Criterion
 from mosa.modules.heterogeneity import HeterogeneitySettings
-from mosa.modules.identification import IdentificationSettings
+from mosa.modules.identification_settings import IdentificationSettings
 from mosa.modules.simulation_settings import SimulationSettings
 from mosa.modules.stages import Stage
 from mosa.physics.engine.law_options import LawOptions

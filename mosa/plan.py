@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from mosa.errors import ConfigError, SimulationDiverged
-from mosa.modules.identification import each_law
+from mosa.modules.learned_numbers import each_law
 from mosa.progress import tqdm
 from mosa.twin import Twin
 

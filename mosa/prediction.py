@@ -14,7 +14,7 @@ from mosa.errors import MosaError
 from mosa.evaluation import Sequence, true_motion
 from mosa.modules.body import Body, World
 from mosa.modules.gauss_newton import Posterior
-from mosa.modules.identification import as_rival, each_law
+from mosa.modules.learned_numbers import as_rival, each_law
 from mosa.progress import tqdm
 
 DRAWS = 12

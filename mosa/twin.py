@@ -28,7 +28,7 @@ from mosa.limits import named_device
 from mosa.modules.body import Body, Start, World
 from mosa.modules.carried_splats import CarriedSplats, seen
 from mosa.modules.gauss_newton import Posterior
-from mosa.modules.identification import read_numbers
+from mosa.modules.learned_numbers import read_numbers
 from mosa.physics.contact.colliders import Collider, colliders_from_config, reach
 from mosa.prediction import DRAWS, among_forms, drawn_motions, rival_motions, total_spread
 from mosa.progress import tqdm

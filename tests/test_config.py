@@ -18,7 +18,7 @@ from mosa.keys import EVALUATION, SIMULATION, TRAINING
 from mosa.modules.adapters import ADAPTERS, adapter_class
 from mosa.modules.criteria import Criterion
 from mosa.modules.heterogeneity import HeterogeneitySettings
-from mosa.modules.identification import IdentificationSettings
+from mosa.modules.identification_settings import IdentificationSettings
 from mosa.modules.simulation_settings import SimulationSettings
 from mosa.modules.stages import Stage
 from mosa.reconstruction.carried import CarriedSettings

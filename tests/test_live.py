@@ -38,7 +38,7 @@ class Drawn:
     model_error = 1e-3
 
     def draws(self, count: int, generator: torch.Generator) -> torch.Tensor:
-        from mosa.modules.identification import read_numbers
+        from mosa.modules.learned_numbers import read_numbers
 
         return read_numbers(twin().body)[None] + 0.5 * torch.linspace(-1, 1, count)[:, None]
 

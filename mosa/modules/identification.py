@@ -1,45 +1,30 @@
-"""Identification of a body's few numbers by Gauss-Newton: which numbers there are, what is compared, and what was found.
+"""Identification of a body's few numbers by Gauss-Newton: what is compared, and what was found.
 
-The numbers are the prior's global parameters, the contact offset, the adapter's and the stiffness modes'; what is compared are the
-motion cues (`residuals`), in the rollouts that the criterion asks for (`criteria`).
+The numbers are those of `learned_numbers`; what is compared are the motion cues (`residuals`), in the rollouts that the criterion
+asks for (`criteria`).
 """
 
 from __future__ import annotations
 
 import copy
-import math
 import os
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError, MosaError, SimulationDiverged
 from mosa.modules import residuals
-from mosa.modules.body import Body, ContactOffset, Ready, World
+from mosa.modules.backbone_search import search
+from mosa.modules.body import Body, Ready, World
 from mosa.modules.criteria import Criterion
 from mosa.modules.gauss_newton import Block, GaussNewton, Posterior, Seat
-from mosa.modules.material import FORMS, NU_MAX, RIVALS, STIFFNESS
+from mosa.modules.identification_settings import IdentificationSettings
+from mosa.modules.learned_numbers import blocks_of, is_learned, tensors_of
+from mosa.modules.material import RIVALS
 from mosa.modules.stages import Stage
-from mosa.schema import FLAG, POSITIVE, WEIGHT, check_knobs, knob, number, whole
 
-STIFFNESS_STEPS = (0.3, 0.6, 1.0, 1.5, 2.2, 3.2, 4.5, 7.0)
-POISSON_STEPS = (0.2, 0.32, 0.42)
-"""Where a calibration looks first: multiples of the stiffness that the configuration starts from, and Poisson numbers."""
-FURTHER, FURTHEST = 1.5, 100.0
-"""Where the best lies at an end of the multiples, these go on by such a factor, up to so much of the configuration's stiffness."""
-STRIDES = {"E": 1.1, "mu": 1.1, "kappa": 1.1, "yield_stress": 1.1, "viscosity": 1.6, "cohesion": 0.5, "nu": 0.8,
-           "friction_angle": 0.8}
-"""First steps of a compass search in unconstrained parameters: a factor of 3 (of 5 in a viscosity), or 0.1 in the middle of nu's
-range and 17 degrees in that of the angle's."""
-FINEST = 0.2
-"""Of the first steps: there a compass search ends, and Gauss-Newton goes on."""
-FINER = 0.25
-"""Steps of the joint stage's differences over those of a calibration, which begins further from its end. What one-sided differences
-get wrong falls with their step, and on two drops it had stopped the fit: the rabbit's ended at a cost of 675, with a quarter of the
-steps at 568, and its held-out error fell from 0.56 to 0.49 of the prior's (docs/identification.md)."""
 NOISE_ITERATIONS = 3
 """Iterations in which the noise is found again; later its scale stays, so that costs can be compared."""
 EVIDENCE_ITERATIONS = 5
@@ -53,159 +38,10 @@ PARTICLES_TOGETHER = 400_000
 """Of all worlds in one launch: more no longer make a GPU's substep cheaper for each."""
 ROUNDED = 8
 """Substeps are held fixed within an iteration, at a multiple of this above what the time step bound asks for at its start."""
-
-
-@dataclass(frozen=True)
-class IdentificationSettings:
-    """count: independent data in a frame; grid_error: what the grid gets wrong, in differences from a grid `COARSER` times as
-    coarse (`Identification`), 0 for none; model_error: what is wrong beside that, in cells; operator_sd, stiffness_sd: prior
-    standard deviations of the operator's numbers and of the stiffness modes before the evidence finds their factor; smoothness:
-    power with which that of the modes falls with their wave number; evidence: whether it is found; tolerance: of the last step, in
-    posterior standard deviations; threads: rollouts side by side on a CPU, 0 for one a core. Errors: ConfigError naming the key."""
-
-    count: float = knob(30.0, POSITIVE)
-    grid_error: float = knob(1.0, number(0, 10))
-    model_error: float = knob(0.02, number(0, 1))
-    operator_sd: float = knob(0.1, POSITIVE)
-    stiffness_sd: float = knob(0.12, POSITIVE)
-    smoothness: float = knob(1.0, WEIGHT)
-    evidence: bool = knob(True, FLAG)
-    tolerance: float = knob(0.3, POSITIVE)
-    threads: int = knob(0, whole(0, 256))
-
-    def __post_init__(self) -> None:
-        check_knobs(self, "identification")
-
-
-def few_numbers(module: torch.nn.Module | None) -> bool:
-    """Whether Gauss-Newton can learn a part of a body: an adapter or a heterogeneity field."""
-    return module is None or module.few_numbers
-
-
-def blocks_of(body: Body, *, adapter: bool, heterogeneity: bool, settings: IdentificationSettings,
-              calibrating: bool = False) -> list[Block]:
-    """The numbers that are learned, in the order of `tensors_of`."""
-    blocks, step = [], 0.02 if calibrating else 0.02 * FINER
-    for name, raw in body.material.raw.items():
-        if raw.requires_grad:
-            bounds = (FORMS[name].inverse(0.02), FORMS[name].inverse(0.98 * NU_MAX)) if name == "nu" else (-math.inf, math.inf)
-            start = body.material.begins[name]
-            wider = 2.5 if name == "nu" else 1.0
-            blocks.append(Block(name, torch.tensor([start]), torch.tensor([1.5]), wider * step, bounds=bounds))
-    if body.contact.enabled:
-        sd = 0.05 if calibrating else 0.03
-        blocks.append(Block("contact", torch.tensor([ContactOffset.START]), torch.tensor([sd]), step, bounds=ContactOffset.LIMITS))
-    if adapter:
-        zero = torch.zeros(body.adapter.numbers.numel())
-        blocks.append(Block("operator", zero, zero + settings.operator_sd, step, learned=settings.evidence))
-    if heterogeneity:
-        falls = (1 + (body.heterogeneity.size / 2) ** 2) ** (-settings.smoothness / 2)
-        blocks.append(Block("stiffness", 0 * falls, settings.stiffness_sd * falls, step / body.heterogeneity.settings.amplitude,
-                            learned=settings.evidence))
-    return blocks
-
-
-def tensors_of(body: Body, *, adapter: bool, heterogeneity: bool) -> list[Tensor]:
-    """The parameters of `blocks_of`."""
-    tensors: list[Tensor] = [raw for raw in body.material.raw.values() if raw.requires_grad]
-    tensors += [body.contact.cells] if body.contact.enabled else []
-    tensors += [body.adapter.numbers] if adapter else []
-    return tensors + ([body.heterogeneity.coefficients] if heterogeneity else [])
-
-
-def write_numbers(body: Body, numbers: Tensor) -> None:
-    """Set a learned body to numbers (D,) of its joint stage's posterior, a draw of it for instance."""
-    tensors = tensors_of(body, adapter=_learned(body.adapter), heterogeneity=_learned(body.heterogeneity))
-    Seat(tensors, lambda: numbers).write(numbers)
-
-
-def read_numbers(body: Body) -> Tensor:
-    """What `write_numbers` sets, (D,)."""
-    return Seat(tensors_of(body, adapter=_learned(body.adapter), heterogeneity=_learned(body.heterogeneity)), torch.empty).read()
-
-
-def each_law(body: Body, numbers: Tensor) -> Iterator[Tensor]:
-    """Goes through laws (D, numbers): at each turn `body` is that law; afterwards, whatever happens, what it was before."""
-    kept = read_numbers(body)
-    try:
-        for law in numbers:
-            write_numbers(body, law)
-            yield law
-    finally:
-        write_numbers(body, kept)
-
-
-def _learned(module) -> bool:
-    return module is not None and few_numbers(module)
-
-
-def compass(at: Callable[[dict[str, float]], float], row: dict[str, float], strides: dict[str, float]) -> dict[str, float]:
-    """The place that a compass search of at() ends at, begun at `row`: a step up or down in one number at a time, where it
-    improves, and smaller steps where none does."""
-    best, share = at(row), 1.0
-    while share > FINEST:
-        moved = False
-        for name, stride in strides.items():
-            for sign in (1.0, -1.0):
-                step = row | {name: row[name] + sign * share * stride}
-                found = at(step)
-                if found < best:
-                    best, row, moved = found, step, True
-                    break
-        if not moved:
-            share *= 0.5
-    return row
-
-
 RIVAL_STEPS = 2
 """With the fitted law's Jacobian, from its numbers on: then their costs are within a tenth of the fitted law's mostly."""
 IMPLAUSIBLE = 3.0
 """A rival whose cost is more than so many times the fitted law's does not explain the data."""
-
-
-@contextmanager
-def as_rival(body: Body, law: str, numbers: Tensor) -> Iterator[None]:
-    """`body` as a rival of its posterior, and afterwards, whatever happens, what it was before."""
-    kept = body.material.law
-    body.material.law = law
-    try:
-        for _ in each_law(body, numbers[None]):
-            yield
-    finally:
-        body.material.law = kept
-
-
-TRIED = 4
-"""Iterations after which candidates for the backbone are compared: from the best start of the grid they hardly move later."""
-
-
-def choose_law(body: Body, candidates: Sequence[str], build: Callable[[], Identification]) -> dict[str, float]:
-    """Calibrate every candidate and leave `body` at the one with the smallest mean distance from the cues, which is returned for
-    each [m], infinite where a law cannot be simulated. build: a calibration of `body`. Errors: SimulationDiverged where none can.
-    """
-    found: dict[str, float] = {}
-    best: tuple[float, dict, str] | None = None
-    for law in candidates:
-        body.material.law = law
-        calibration = build()
-        try:
-            calibration.search()
-            for _ in range(TRIED):
-                calibration.iterate()
-            found[law] = calibration.distance()
-        except SimulationDiverged:
-            found[law] = math.inf
-            continue
-        if best is None or found[law] < best[0]:
-            best = (found[law], {part: copy.deepcopy(getattr(body, part).state_dict()) for part in ("material", "contact")}, law)
-    if best is None:
-        raise SimulationDiverged(f"prior=auto: none of {', '.join(candidates)} can be calibrated; set prior.parameters nearer "
-                                 "to the body's")
-    for part, state in best[1].items():
-        getattr(body, part).load_state_dict(state)
-    for material in (body.material, *(variant["material"] for variant in body.frozen.values())):
-        material.choose(best[2])
-    return found
 
 
 class Identification:
@@ -228,8 +64,8 @@ class Identification:
     ) -> None:  # fmt: skip
         self.body, self.takes, self.world, self.settings = body, list(takes), world, settings
         self.calibrating = stage.calibrates
-        self.adapter = stage.learns_adapter and _learned(body.adapter)
-        self.heterogeneity = not self.calibrating and _learned(body.heterogeneity)
+        self.adapter = stage.learns_adapter and is_learned(body.adapter)
+        self.heterogeneity = not self.calibrating and is_learned(body.heterogeneity)
         self.gains = (0.0,) if self.calibrating else criterion.gains
         self.kinds = (True, False, False) if self.calibrating and kinds[0] else kinds
         if not any(self.kinds):
@@ -353,58 +189,8 @@ class Identification:
         self.noise = residuals.spread(self._along(found, self.multiple()), least, wrong)
 
     def search(self) -> float:
-        """Start a calibration near the smallest mean distance [m] of free rollouts from the cues, which is returned.
-
-        The best of a coarse grid of stiffness and Poisson number, which goes on where its best is at an end of the stiffness; then,
-        for laws with parameters beside these, a compass search in all of them (Kolda, Lewis, Torczon, SIAM Review 45, 2003).
-        Errors: SimulationDiverged where no start of the grid can be simulated."""
-        starts, learned = self.body.material.begins, self._learned_names()
-        modulated = [n for n in STIFFNESS if n in learned and n in self.body.material.modulated]
-        tried: dict[tuple[float, ...], float] = {}
-
-        def at(row: dict[str, float]) -> float:
-            key = tuple(row.values())
-            if key not in tried:
-                tried[key] = self._distance_at(row)
-            return tried[key]
-
-        def row_of(multiple: float, nu: float | None) -> dict[str, float]:
-            row = {n: starts[n] + math.log(multiple) * (n in modulated) for n in learned}
-            return row if nu is None else row | {"nu": FORMS["nu"].inverse(nu)}
-
-        numbers: tuple[float | None, ...] = POISSON_STEPS if "nu" in learned else (None,)
-        multiples = list(STIFFNESS_STEPS) if modulated else [1.0]
-        best = min(((at(row_of(m, nu)), m, nu) for m in multiples for nu in numbers), key=lambda found: found[0])
-        for end, factor in ((multiples[0], 1 / FURTHER), (multiples[-1], FURTHER)):
-            multiple = end
-            while modulated and best[1] == multiple and math.isfinite(best[0]) and 1 / FURTHEST < multiple * factor < FURTHEST:
-                multiple *= factor
-                found = min(((at(row_of(multiple, nu)), multiple, nu) for nu in numbers), key=lambda found: found[0])
-                best = min(best, found, key=lambda found: found[0])
-        if not math.isfinite(best[0]):
-            raise SimulationDiverged("fit.prior: none of the starts of the coarse grid can be simulated; set prior.parameters "
-                                     "nearer to the body's, or raise simulation.max_substeps")
-        row = row_of(*best[1:])
-        if set(learned) - {"E", "nu"}:
-            row = compass(at, row, {n: STRIDES.get(n, 1.0) for n in learned})
-        self._set(row)
-        return at(row)
-
-    def _learned_names(self) -> list[str]:
-        return [name for name, raw in self.body.material.raw.items() if raw.requires_grad]
-
-    def _distance_at(self, row: dict[str, float]) -> float:
-        """Of these unconstrained parameters, infinite where they cannot be simulated."""
-        self._set(row)
-        try:
-            return self.distance()
-        except (SimulationDiverged, ConfigError):
-            return math.inf
-
-    @torch.no_grad()
-    def _set(self, row: dict[str, float]) -> None:
-        for name, value in row.items():
-            self.body.material.raw[name].fill_(value)
+        """Start a calibration near its end (`backbone_search`); the mean distance [m] there. Errors: SimulationDiverged."""
+        return search(self)
 
     def distance(self) -> float:
         """Mean distance [m] of free rollouts from the cues after frame 0."""

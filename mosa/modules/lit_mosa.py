@@ -20,7 +20,8 @@ from mosa.modules.body import Body, World
 from mosa.modules.criteria import Criterion
 from mosa.modules.gauss_newton import Posterior
 from mosa.modules.gradient_steps import GradientSteps
-from mosa.modules.identification import Identification, IdentificationSettings
+from mosa.modules.identification import Identification
+from mosa.modules.identification_settings import IdentificationSettings
 from mosa.modules.material import material_states
 from mosa.modules.newton_steps import NewtonSteps
 from mosa.modules.observer import deformed_covariances, observe

@@ -7,7 +7,8 @@ from typing import Any
 
 from mosa import parallel
 from mosa.errors import DataError, MosaError
-from mosa.modules.identification import Identification, choose_law
+from mosa.modules.backbone_search import choose_law
+from mosa.modules.identification import Identification
 from mosa.modules.residuals import SAMPLES
 from mosa.modules.stages import Stage
 from mosa.progress import tqdm

@@ -7,7 +7,7 @@ from small_bodies import DX, FRAME_DT, FREE, WORLD, small_body, start
 from mosa.errors import ConfigError
 from mosa.modules.body import Ready
 from mosa.modules.criteria import Criterion
-from mosa.modules.identification import each_law, read_numbers
+from mosa.modules.learned_numbers import each_law, read_numbers
 
 
 def simulated(body, begins, frames=10, world=WORLD, **options):

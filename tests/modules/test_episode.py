@@ -11,7 +11,7 @@ from small_bodies import FRAME_DT, STICKY, WORLD, small_body, start
 
 from mosa.episode import TwinState
 from mosa.errors import ConfigError, DataError
-from mosa.modules.identification import read_numbers
+from mosa.modules.learned_numbers import read_numbers
 from mosa.physics.contact.colliders import colliders_from_config
 from mosa.physics.contact.motion import Trajectory, exponential
 from mosa.twin import Twin
@@ -232,7 +232,7 @@ def test_gradients_of_worlds_are_those_of_their_twins():
 
 
 def _with(body, numbers):
-    from mosa.modules.identification import each_law
+    from mosa.modules.learned_numbers import each_law
 
     for _ in each_law(body, numbers[None]):
         made = small_body(contact=True, numbers=NUMBERS)

@@ -7,7 +7,8 @@ from small_bodies import NU, WORLD, E, small_body, start, take_of
 from mosa.data.builtin.hidden_material import LAW
 from mosa.modules import material as material_module
 from mosa.modules.criteria import Criterion
-from mosa.modules.identification import Identification, IdentificationSettings
+from mosa.modules.identification import Identification
+from mosa.modules.identification_settings import IdentificationSettings
 from mosa.modules.material import FORMS, LOG, Direction, Material, register_form
 from mosa.modules.ready import Ready
 from mosa.modules.stages import Stage

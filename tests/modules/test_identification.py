@@ -11,19 +11,13 @@ from mosa.analysis.anisotropy import dyads
 from mosa.analysis.stiffness import angle_between, stiffest
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.modules import identification as identification_module
+from mosa.modules.backbone_search import compass
 from mosa.modules.criteria import Criterion
 from mosa.modules.gauss_newton import Seat
 from mosa.modules.hyperelastic import anisotropic_basis
-from mosa.modules.identification import (
-    COARSER,
-    EVIDENCE_ITERATIONS,
-    Identification,
-    IdentificationSettings,
-    as_rival,
-    compass,
-    read_numbers,
-    write_numbers,
-)
+from mosa.modules.identification import COARSER, EVIDENCE_ITERATIONS, Identification
+from mosa.modules.identification_settings import IdentificationSettings
+from mosa.modules.learned_numbers import as_rival, read_numbers, write_numbers
 from mosa.modules.stages import Stage
 
 FRAMES = 12

@@ -9,7 +9,7 @@ from small_bodies import WORLD, small_body, start
 
 from mosa.errors import ConfigError
 from mosa.modules.gauss_newton import Posterior
-from mosa.modules.identification import as_rival, each_law, read_numbers
+from mosa.modules.learned_numbers import as_rival, each_law, read_numbers
 from mosa.plan import drawn_starts, information, plan
 from mosa.prediction import DRAWN, INFLATION, among_forms, total_spread
 from mosa.twin import Twin

@@ -1,0 +1,130 @@
+"""Where a calibration begins: the best of a coarse grid, a compass search for laws of more numbers; which law is the backbone."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+
+from mosa.errors import ConfigError, SimulationDiverged
+from mosa.modules.body import Body
+from mosa.modules.material import FORMS, STIFFNESS
+
+if TYPE_CHECKING:
+    from mosa.modules.identification import Identification
+
+STIFFNESS_STEPS = (0.3, 0.6, 1.0, 1.5, 2.2, 3.2, 4.5, 7.0)
+POISSON_STEPS = (0.2, 0.32, 0.42)
+"""Where a calibration looks first: multiples of the stiffness that the configuration starts from, and Poisson numbers."""
+FURTHER, FURTHEST = 1.5, 100.0
+"""Where the best lies at an end of the multiples, these go on by such a factor, up to so much of the configuration's stiffness."""
+STRIDES = {"E": 1.1, "mu": 1.1, "kappa": 1.1, "yield_stress": 1.1, "viscosity": 1.6, "cohesion": 0.5, "nu": 0.8,
+           "friction_angle": 0.8}
+"""First steps of a compass search in unconstrained parameters: a factor of 3 (of 5 in a viscosity), or 0.1 in the middle of nu's
+range and 17 degrees in that of the angle's."""
+FINEST = 0.2
+"""Of the first steps: there a compass search ends, and Gauss-Newton goes on."""
+
+
+def compass(at: Callable[[dict[str, float]], float], row: dict[str, float], strides: dict[str, float]) -> dict[str, float]:
+    """The place that a compass search of at() ends at, begun at `row`: a step up or down in one number at a time, where it
+    improves, and smaller steps where none does."""
+    best, share = at(row), 1.0
+    while share > FINEST:
+        moved = False
+        for name, stride in strides.items():
+            for sign in (1.0, -1.0):
+                step = row | {name: row[name] + sign * share * stride}
+                found = at(step)
+                if found < best:
+                    best, row, moved = found, step, True
+                    break
+        if not moved:
+            share *= 0.5
+    return row
+
+
+def search(calibration: Identification) -> float:
+    """Start a calibration near the smallest mean distance [m] of free rollouts from the cues, which is returned.
+
+    The best of a coarse grid of stiffness and Poisson number, which goes on where its best is at an end of the stiffness; then,
+    for laws with parameters beside these, a compass search in all of them (Kolda, Lewis, Torczon, SIAM Review 45, 2003).
+    Errors: SimulationDiverged where no start of the grid can be simulated."""
+    material = calibration.body.material
+    starts, learned = material.begins, [name for name, raw in material.raw.items() if raw.requires_grad]
+    modulated = [n for n in STIFFNESS if n in learned and n in material.modulated]
+    tried: dict[tuple[float, ...], float] = {}
+
+    @torch.no_grad()
+    def start_at(row: dict[str, float]) -> None:
+        for name, value in row.items():
+            material.raw[name].fill_(value)
+
+    def at(row: dict[str, float]) -> float:
+        """Of these unconstrained parameters, infinite where they cannot be simulated."""
+        key = tuple(row.values())
+        if key not in tried:
+            start_at(row)
+            try:
+                tried[key] = calibration.distance()
+            except (SimulationDiverged, ConfigError):
+                tried[key] = math.inf
+        return tried[key]
+
+    def row_of(multiple: float, nu: float | None) -> dict[str, float]:
+        row = {n: starts[n] + math.log(multiple) * (n in modulated) for n in learned}
+        return row if nu is None else row | {"nu": FORMS["nu"].inverse(nu)}
+
+    numbers: tuple[float | None, ...] = POISSON_STEPS if "nu" in learned else (None,)
+    multiples = list(STIFFNESS_STEPS) if modulated else [1.0]
+    best = min(((at(row_of(m, nu)), m, nu) for m in multiples for nu in numbers), key=lambda found: found[0])
+    for end, factor in ((multiples[0], 1 / FURTHER), (multiples[-1], FURTHER)):
+        multiple = end
+        while modulated and best[1] == multiple and math.isfinite(best[0]) and 1 / FURTHEST < multiple * factor < FURTHEST:
+            multiple *= factor
+            found = min(((at(row_of(multiple, nu)), multiple, nu) for nu in numbers), key=lambda found: found[0])
+            best = min(best, found, key=lambda found: found[0])
+    if not math.isfinite(best[0]):
+        raise SimulationDiverged("fit.prior: none of the starts of the coarse grid can be simulated; set prior.parameters "
+                                 "nearer to the body's, or raise simulation.max_substeps")
+    row = row_of(*best[1:])
+    if set(learned) - {"E", "nu"}:
+        row = compass(at, row, {n: STRIDES.get(n, 1.0) for n in learned})
+    start_at(row)
+    return at(row)
+
+
+TRIED = 4
+"""Iterations after which candidates for the backbone are compared: from the best start of the grid they hardly move later."""
+
+
+def choose_law(body: Body, candidates: Sequence[str], build: Callable[[], Identification]) -> dict[str, float]:
+    """Calibrate every candidate and leave `body` at the one with the smallest mean distance from the cues, which is returned for
+    each [m], infinite where a law cannot be simulated. build: a calibration of `body`. Errors: SimulationDiverged where none can.
+    """
+    found: dict[str, float] = {}
+    best: tuple[float, dict, str] | None = None
+    for law in candidates:
+        body.material.law = law
+        calibration = build()
+        try:
+            calibration.search()
+            for _ in range(TRIED):
+                calibration.iterate()
+            found[law] = calibration.distance()
+        except SimulationDiverged:
+            found[law] = math.inf
+            continue
+        if best is None or found[law] < best[0]:
+            best = (found[law], {part: copy.deepcopy(getattr(body, part).state_dict()) for part in ("material", "contact")}, law)
+    if best is None:
+        raise SimulationDiverged(f"prior=auto: none of {', '.join(candidates)} can be calibrated; set prior.parameters nearer "
+                                 "to the body's")
+    for part, state in best[1].items():
+        getattr(body, part).load_state_dict(state)
+    for material in (body.material, *(variant["material"] for variant in body.frozen.values())):
+        material.choose(best[2])
+    return found
