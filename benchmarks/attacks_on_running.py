@@ -104,9 +104,10 @@ def running(folder: Path) -> Iterator[Attack]:
             yield (f"{sign.name} at drawn moments, {'from' if fresh else 'after'} the reconstruction",
                    lambda s=sign, f=fresh: stopped(f"{s.name}_{f}", s, f))  # fmt: skip
     told = program(*arguments(fitted("listed")), disturbed=("list:0", str(folder / "listed")))
-    writes = [int(line.split()[2]) for line in told.splitlines() if line.startswith("disturbed: list") and ".hydra" not in line]
+    writes = [int(line.split()[2]) for line in told.splitlines() if line.startswith("disturbed: list") and ".hydra" not in line
+              and line.split()[3] in ("open", "os.rename")]  # a folder that is there already may fail to be made
     writes = [n for n in writes if n > 3]  # Hydra's own first ones are its
-    for how, code, share in (("kill", None, 4), ("full", 2, 4), ("term", 143, 9), ("int", 130, 9)):
+    for how, code, share in (("kill", None, 3), ("full", 2, 3), ("term", 143, 6), ("int", 130, 6)):
         for number in writes[::share]:
             yield f"{how} at write {number} of the evaluation", lambda h=how, n=number, c=code: at_a_file(h, n, c)
 

@@ -68,7 +68,7 @@ def fit(cfg, module: LitMosa, data: MultiViewDataModule, folder: Path, device: s
     except torch.linalg.LinAlgError as error:
         raise SimulationDiverged(f"the fit came to numbers that cannot be solved with ({' '.join(str(error).split())[:200]}); "
                                  "check the checkpoint that it goes on from, or lower simulation.courant") from error
-    except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+    except (ArithmeticError, AttributeError, FileNotFoundError, LookupError, RuntimeError, TypeError, ValueError) as error:
         if begun or cfg.ckpt_path is None:
             raise
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:300]  # Lightning takes its own entries as they are

@@ -8,8 +8,9 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from mosa import fitting
 from mosa.callbacks import KeepLast
-from mosa.errors import ConfigError
+from mosa.errors import ConfigError, DataError
 from mosa.run import begins_from, finished, read_figures, write_figures
 
 
@@ -119,3 +120,22 @@ def test_a_fit_that_begins_takes_away_the_figures_of_the_run_before(tmp_path):
     assert (tmp_path / "metrics.json").is_file()
     KeepLast(tmp_path / "checkpoints").on_fit_start(SimpleNamespace(is_global_zero=True), None)
     assert not (tmp_path / "metrics.json").exists()
+
+
+def test_a_checkpoint_that_is_removed_before_the_fit_reads_it_is_named(tmp_path, monkeypatch):
+    """Lightning reads it once more, after the reconstruction."""
+
+    class Trainer:
+        def __init__(self, **_):
+            self.callbacks = []
+
+        def fit(self, *_, **__):
+            raise FileNotFoundError("Checkpoint file not found")
+
+    for name in ("read_checkpoint", "check_same", "checked_posterior", "read_numbers"):
+        monkeypatch.setattr(fitting, name, lambda *_: [])
+    monkeypatch.setattr(fitting.L, "Trainer", Trainer)
+    cfg = OmegaConf.create({"ckpt_path": "gone/last.ckpt", "logger": {"images_every": 0},
+                            "trainer": {"accelerator": "cpu", "devices": 1}})  # fmt: skip
+    with pytest.raises(DataError, match=r"ckpt_path: gone/last\.ckpt: the fit cannot go on from it \(FileNotFoundError"):
+        fitting.fit(cfg, SimpleNamespace(body=None), None, tmp_path, "cpu")
