@@ -140,7 +140,9 @@ class Material(nn.Module):
     def _check_names(self, law: str, parameters, frozen, modulated) -> None:
         known = law_named(law)
         if unknown := sorted(set(parameters) - set(FORMS)):
-            raise ConfigError(f"prior.parameters: expected names among {', '.join(FORMS)}, found {', '.join(unknown)}")
+            own = [name for name in unknown if name in known.parameters]
+            hint = f" (law {law} takes {', '.join(own)}: give it a range with register_form)" if own else ""
+            raise ConfigError(f"prior.parameters: expected names among {', '.join(FORMS)}, found {', '.join(unknown)}{hint}")
         for key, names in (("frozen", frozen), ("modulated", modulated or ())):
             if strange := sorted(set(names) - set(parameters)):
                 raise ConfigError(f"prior.{key}: expected names among {', '.join(parameters)}, found {', '.join(strange)}")

@@ -142,6 +142,13 @@ def test_a_mistake_is_named(arguments, message):
         Material(*arguments)
 
 
+def test_a_parameter_without_a_range_says_how_it_gets_one(monkeypatch):
+    monkeypatch.setattr(laws, "_LAWS", dict(laws._LAWS))
+    laws.register_law("rangeless", law_named("stvk").stress, {"mu": 1, "lam": 1, "sponginess": 1})
+    with pytest.raises(ConfigError, match=r"found sponginess \(law rangeless takes sponginess: .*register_form"):
+        Material("rangeless", {**ELASTIC, "sponginess": 2.0})
+
+
 def test_largest_angle_is_below_a_right_angle():
     assert ANGLE_MAX < 90  # at 90 degrees the cone's slope is finite, but sin has no gradient there
 
