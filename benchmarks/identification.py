@@ -13,6 +13,7 @@ docs/identification.md has tables that were made so.
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -35,6 +36,7 @@ from mosa.modules.lit_mosa import LitMosa
 from mosa.modules.residuals import sampled
 from mosa.modules.takes import Take
 from mosa.prediction import DRAWS, LEAST_DRAWS, among_forms, determined, drawn_motions, rival_motions, total_spread
+from mosa.reconstruction.response import Response
 from mosa.types import MotionCues
 
 CONF = Path(__file__).parents[1] / "conf"
@@ -71,12 +73,14 @@ def make(overrides: list[str], folder: Path, device: str) -> Path:
         sequences[each.prefix] = {
             "start": each.start.written(), "contact": each.contact, "frames": s.frames,
             "frame_dt": float(s.times[1] - s.times[0]), "truth": true_motion(body, s)[:, chosen].cpu(),
-            "floor": floors[each.prefix], "cues": None,
+            "floor": floors[each.prefix], "cues": None, "response": None,
         }  # fmt: skip
         if each.prefix.startswith("train"):
-            cues, T = next(takes).cues, len(s.training_frames)
+            take, T = next(takes), len(s.training_frames)
             sequences[each.prefix]["cues"] = {
-                name: getattr(cues, name)[:T].cpu() for name in ("positions", "rotation", "stretch", "weight")}
+                name: getattr(take.cues, name)[:T].cpu() for name in ("positions", "rotation", "stretch", "weight")}
+            sequences[each.prefix]["response"] = take.response and {
+                part.name: getattr(take.response, part.name).cpu() for part in dataclasses.fields(Response)}
     problem = {
         "config": made.config, "rest": body.rest.cpu(), "volume": body.volume.cpu(), "sequences": sequences,
         "fibre": getattr(hidden, "fibre", None) if getattr(hidden, "ratio", 1) > 1 else None,
@@ -109,8 +113,9 @@ def read(path: Path, overrides: list[str], device: str) -> SimpleNamespace:
         own["start"] = Start.read(own["start"], body.rest)
         if own["cues"] is not None:  # without images
             cues = {k: v.float().to(device) for k, v in own["cues"].items()}
+            kept = own.get("response")
             takes.append(Take(own["start"], None, MotionCues(**cues, covariances=torch.zeros(1, device=device)), own["frame_dt"],
-                              own["contact"]))  # fmt: skip
+                              own["contact"], response=kept and Response(**{k: v.to(device) for k, v in kept.items()})))
     module = LitMosa.from_config(config, body, takes=takes, background=torch.ones(3, device=device))
     return SimpleNamespace(problem=problem, module=module, body=body)
 

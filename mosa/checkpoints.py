@@ -376,6 +376,19 @@ def check_cues(found: Any) -> None:
                           f"{str(described)[:200]}")  # fmt: skip
 
 
+def check_responses(found: Any) -> None:
+    """What the cues of each sequence keep of the prediction that they were found about; None where none is known. Errors:
+    ConfigError."""
+    def kept(each: Any) -> bool:
+        return each is None or (isinstance(each, dict) and set(each) == {"about", "share"} and all(
+            isinstance(t, Tensor) and t.ndim == 3 and t.is_floating_point() and bool(torch.isfinite(t).all())
+            for t in each.values()))  # fmt: skip
+
+    if found is not None and not (isinstance(found, list) and all(kept(each) for each in found)):
+        raise ConfigError("mosa.responses: expected null, or for each sequence null or finite tensors `about` (T, N, 3) and "
+                          "`share` (T, 3 K, 3 K)")
+
+
 def check_identification(found: Any) -> None:
     """The state of a running stage of Gauss-Newton; None outside of one. Errors: ConfigError."""
     if found is None:
@@ -418,6 +431,7 @@ def check_resumed(checkpoint: Mapping[str, Any], path: str | Path) -> None:
         check({"mosa": {name: saved[name] for name in GOING_ON if name in saved}},
               {f"mosa.{name}": kind for name, kind in GOING_ON.items()})
         check_cues(saved.get("cues"))
+        check_responses(saved.get("responses"))
         check_identification(saved.get("identification"))
         check_retreat(saved.get("retreat"))
         if saved.get("compared"):

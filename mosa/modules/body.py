@@ -170,18 +170,21 @@ class Body(nn.Module):
         counts: Sequence[int] | None = None,
         observed: Tensor | None = None,
         gain: float = 0.0,
+        unseen: Callable[[Tensor, int], Tensor] | None = None,
         substeps: int | None = None,
     ) -> Rollout:
         """Roll `frames` frames out (frame 0 is the start). Differentiable in every parameter and in `start`.
 
         model: what is simulated, None for all that was learned. collect: called with the statistics of every evaluation of the
         adapter (penalties, mean |C|). counts: of substeps, to replay those of an adaptive rollout. observed, gain: (T, N, 3) [m]
-        and a number; at every frame the velocities are corrected towards what was seen (`criteria.corrected_rollout`). substeps: of
+        and a number; at every frame the velocities are corrected towards what was seen, but for what was `unseen` of the positions
+        in a frame (`criteria.corrected_rollout`). substeps: of
         every frame, where differences hold them fixed; None: as many as the time step bound asks for.
         Errors: SimulationDiverged, ConfigError (time step).
         """
         ready = self.ready(start, world, frames, frame_dt, model=model, counts=counts, substeps=substeps)
-        rollout = ready.simulate(frames, world.colliders, collect=collect, progress=progress, observed=observed, gain=gain)
+        rollout = ready.simulate(frames, world.colliders, collect=collect, progress=progress, observed=observed, gain=gain,
+                                 unseen=unseen)
         taken = rollout.counts
         self.last_substeps = -(-sum(taken) // len(taken)) if taken else ready.simulator.substeps
         return rollout

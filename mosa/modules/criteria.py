@@ -36,18 +36,25 @@ class Criterion:
         return {"free": (0.0,), "corrected": (self.gain,), "both": (0.0, self.gain)}[self.name]
 
 
-def corrected_rollout(roll: Callable[..., Rollout], state, observed: Tensor, gain: float, frame_dt: float) -> Rollout:
+def corrected_rollout(
+    roll: Callable[..., Rollout], state, observed: Tensor, gain: float, frame_dt: float,
+    unseen: Callable[[Tensor, int], Tensor] | None = None,
+) -> Rollout:  # fmt: skip
     """Frames predicted one by one: after each, v += gain (x_seen - x)/frame_dt. Its positions are those before the correction.
 
     roll: a simulator's rollout with everything but state, frames and times given; observed: (T, N, 3) [m] with its frame 0;
-    frame_dt [s]. Differentiable.
+    frame_dt [s]; unseen: of positions [m] in a frame, what would not have been observed of them, and is no distance then.
+    Differentiable.
     """
     parts: list[Rollout] = []
     current = state
     for frame in range(1, len(observed)):
         part = roll(current, frames=2, started=frame > 1, start_time=(frame - 1) * frame_dt)
         parts.append(part)
-        current = replace(part.final, v=part.final.v + (gain / frame_dt) * (observed[frame] - part.final.x))
+        away = observed[frame] - part.final.x
+        if unseen is not None:
+            away = away + unseen(part.final.x, frame)
+        current = replace(part.final, v=part.final.v + (gain / frame_dt) * away)
     if not parts:
         return roll(state, frames=1)
     stacked = {

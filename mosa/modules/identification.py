@@ -24,6 +24,7 @@ from mosa.modules.identification_settings import IdentificationSettings
 from mosa.modules.learned_numbers import blocks_of, is_learned, tensors_of
 from mosa.modules.material import RIVALS
 from mosa.modules.stages import Stage
+from mosa.reconstruction.response import Response
 
 NOISE_ITERATIONS = 3
 """Iterations in which the noise is found again; later its scale stays, so that costs can be compared."""
@@ -116,8 +117,16 @@ class Identification:
         return body.simulate(
             take.start, self.world, len(cues.positions), take.frame_dt,
             model=body.model().only(heterogeneity=self.heterogeneity, adapter=self.adapter),
-            observed=cues.positions if gain else None, gain=gain, substeps=substeps,
+            observed=cues.positions if gain else None, gain=gain, unseen=self.unseen(take), substeps=substeps,
         )  # fmt: skip
+
+    def response(self, take) -> Response | None:
+        """What the take's cues keep of the calibrated backbone's prediction, which is not what a calibration shall find again."""
+        return None if self.calibrating else take.response
+
+    def unseen(self, take) -> Callable[[Tensor, int], Tensor] | None:
+        response = self.response(take)
+        return None if response is None else response.unseen
 
     @torch.no_grad()
     def _many(self, rows: Tensor) -> Tensor:
@@ -135,16 +144,17 @@ class Identification:
                         model=self.body.model().only(heterogeneity=self.heterogeneity, adapter=self.adapter),
                     ).answered())  # fmt: skip
                 rollout = Ready.stack(parts).simulate(
-                    len(take.cues.positions), self.world.colliders, observed=take.cues.positions if gain else None, gain=gain)
+                    len(take.cues.positions), self.world.colliders, observed=take.cues.positions if gain else None, gain=gain,
+                    unseen=self.unseen(take))
                 for k, own in enumerate(rollout.worlds()):
-                    found[first + k].append(residuals.fields(own, take.cues, take.start.rotation, self.chosen))
+                    found[first + k].append(residuals.fields(own, take.cues, take.start.rotation, self.chosen, self.response(take)))
         multiples = rows[:, -1].tolist() if self.knows_grid else [0.0] * len(rows)
         return torch.stack([self._compared(own, multiple) for own, multiple in zip(found, multiples)])
 
     def _fields(self, body: Body) -> list[residuals.Fields]:
         return [
             residuals.fields(self.rollout(body, i, gain, self.substeps[i]), self.takes[i].cues, self.takes[i].start.rotation,
-                             self.chosen)
+                             self.chosen, self.response(self.takes[i]))
             for i, gain in self.pairs
         ]
 

@@ -95,6 +95,8 @@ class LitMosa(NewtonSteps, GradientSteps, Restorable, L.LightningModule):
                               "identification": self.identification.state() if self.identification else None,
                               "compared": self.compared, "retreat": self.retreat.written(),
                               "cues": [take.cues.positions.cpu() for take in self.takes] if self.informed else None,
+                              "responses": [take.response and take.response.written() for take in self.takes]
+                              if self.informed else None,
                               "posterior": self.posterior.written() if self.posterior else None,
                               "splats": self.body.splats.written() if self.body.splats is not None else None}
 
@@ -119,7 +121,7 @@ class LitMosa(NewtonSteps, GradientSteps, Restorable, L.LightningModule):
             self.settle_law()
         self.posterior = Posterior.read(saved["posterior"]) if saved.get("posterior") else None
         if saved.get("cues") is not None and self.takes:
-            self.takes, self.informed = with_positions(self.takes, saved["cues"]), True
+            self.takes, self.informed = with_positions(self.takes, saved["cues"], saved.get("responses")), True
         elif (self.losses and self.stage is not None and (self.stage.looks_again or not self.stage.calibrates)
               and any(take.again for take in self.takes)):  # fmt: skip
             raise ConfigError("ckpt_path: expected the motion that reconstruction.informed finds, as this stage began after it, "
@@ -148,7 +150,7 @@ class LitMosa(NewtonSteps, GradientSteps, Restorable, L.LightningModule):
         if stage.start is not None:
             self.body.thaw(stage.start)
         if stage.looks_again or not (stage.calibrates or self.informed):
-            self.inform()
+            self.inform(response=stage.newton and not stage.calibrates)
         adapter, material = self.body.adapter, self.body.material
         if stage.learns_adapter and adapter is not None:
             adapter.switch_on(material.reference_modulus(), material.poisson())
@@ -158,10 +160,10 @@ class LitMosa(NewtonSteps, GradientSteps, Restorable, L.LightningModule):
                 self.misfit = max(parallel.mean(self.measure_misfit()), 0.1 * MISFIT)
         parallel.synchronise(self.body)  # on a GPU ranks may come to slightly different numbers
 
-    def inform(self) -> None:
-        """The cues of the takes once more, about what the calibrated backbone predicts."""
+    def inform(self, response: bool = True) -> None:
+        """The cues of the takes once more, about what the calibrated backbone predicts; response: and what they keep of that."""
         if any(take.again for take in self.takes):
-            self.takes, self.informed = [seen_again(take, self.body, self.world) for take in self.takes], True
+            self.takes, self.informed = [seen_again(take, self.body, self.world, response) for take in self.takes], True
 
     @torch.no_grad()
     def measure_misfit(self) -> float:

@@ -35,6 +35,7 @@ class Ready:
     def simulate(
         self, frames: int, colliders: Sequence[Collider] = (), *, collect: Callable | None = None,
         progress: Callable[[int], None] | None = None, observed: Tensor | None = None, gain: float = 0.0,
+        unseen: Callable[[Tensor, int], Tensor] | None = None,
     ) -> Rollout:  # fmt: skip
         """As `Body.simulate`, from here on; of a stack, the worlds at once."""
         simulator, stacked = self.simulator, self.state.x.ndim == 3
@@ -47,7 +48,8 @@ class Ready:
             if self.timing:
                 raise ConfigError("simulation.adaptive: expected false where a criterion corrects the prediction frame by frame")
             seen = (observed[:frames, None] if stacked else observed[:frames]) + lift.detach()
-            rollout = corrected_rollout(roll, self.state, seen.to(self.state.x.dtype), gain, simulator.frame_dt)
+            hidden = None if unseen is None else lambda x, frame: unseen(x - lift.detach().to(x), frame)
+            rollout = corrected_rollout(roll, self.state, seen.to(self.state.x.dtype), gain, simulator.frame_dt, hidden)
         fields = {name: getattr(rollout, name).to(self.lift.dtype) for name in ("x", "v", "F", "F_tot")}
         return replace(rollout, **{**fields, "x": fields["x"] - lift})
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from mosa.physics.constitutive.singular_values import singular_value_decomposition
+from mosa.reconstruction.response import Response
 from mosa.types import MotionCues, Rollout
 
 CUE_ERRORS = (0.5e-3, 0.01, 0.015)
@@ -44,15 +45,20 @@ def sampled(particles: int, device: torch.device) -> Tensor:
 
 
 @torch.no_grad()
-def fields(rollout: Rollout, cues: MotionCues, start_rotation: Tensor, chosen: Tensor) -> Fields:
-    """rollout: of T frames; cues: of at least as many, relative to the rest pose; start_rotation: (3, 3) Q of the sequence."""
-    frames = len(rollout.x)
-    U, S, V = singular_value_decomposition(rollout.F_tot[1:, chosen])
+def fields(
+    rollout: Rollout, cues: MotionCues, start_rotation: Tensor, chosen: Tensor, response: Response | None = None
+) -> Fields:
+    """rollout: of T frames; cues: of at least as many, relative to the rest pose; start_rotation: (3, 3) Q of the sequence;
+    response: what the cues keep of the prediction that they were found about."""
+    frames, x, F = len(rollout.x), rollout.x, rollout.F_tot
+    if response is not None:
+        x, F = response.seen(x, F, start_rotation)
+    U, S, V = singular_value_decomposition(F[1:, chosen])
     relative = cues.rotation[1:frames, chosen].mT @ (U @ V.mT @ start_rotation.T.to(U))
     vector = 0.5 * torch.stack([relative[..., 2, 1] - relative[..., 1, 2], relative[..., 0, 2] - relative[..., 2, 0],
                                 relative[..., 1, 0] - relative[..., 0, 1]], -1)
     weight = cues.weight[1:frames, chosen, None]
-    return Fields(rollout.x[1:, chosen] - cues.positions[1:frames, chosen], vector * weight,
+    return Fields(x[1:, chosen] - cues.positions[1:frames, chosen], vector * weight,
                   (S - cues.stretch[1:frames, chosen]) * weight)
 
 

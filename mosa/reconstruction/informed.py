@@ -36,13 +36,15 @@ what was seen of a liquid's late frames may be a tenth of a metre off."""
 @dataclass(frozen=True)
 class InformedSettings:
     """iterations: 0 for never; views: of every frame in each; lr: its step in units of the object's radius; elastic, bending:
-    weights of the energies, counted from the prediction, as in `DynamicSettings`."""
+    weights of the energies, counted from the prediction, as in `DynamicSettings`; response: views of every frame from which it is
+    found how much of the prediction stays in what is seen (`response`), 0 for not at all."""
 
     iterations: int = knob(80, whole(0))
     views: int = knob(1, COUNT)
     lr: float = knob(0.02, POSITIVE)
     elastic: float = knob(0.3, WEIGHT)
     bending: float = knob(1.0, WEIGHT)
+    response: int = knob(4, whole(0))
 
     def __post_init__(self) -> None:
         check_knobs(self, "reconstruction.informed")
@@ -79,9 +81,9 @@ def informed_motion(
     reach: float,
     seed: int,
     progress: Callable[[int], None] | None = None,
-) -> ModalMotion | None:
-    """Motion through all frames of `windows`, about predicted shapes of the body; else as `fit_motion`. None where it follows the
-    images much worse than `seen` does.
+) -> tuple[ModalMotion, Tensor] | None:
+    """(motion through all frames of `windows`, about predicted shapes of the body; those shapes (T, N, 3) [m] where it began); else
+    as `fit_motion`. None where it follows the images much worse than `seen` does.
 
     predicted, seen: (T, N, 3) [m] positions of the particles, a simulation's and those that were found without one.
     """
@@ -100,7 +102,8 @@ def informed_motion(
 
     laid = laid_onto(predicted, seen)
     better = losses(predicted) < AS_IT_IS * losses(laid)
-    project(motion, scaffold, torch.where(better[:, None, None], predicted, laid))
+    begun = torch.where(better[:, None, None], predicted, laid)
+    project(motion, scaffold, begun)
     with torch.no_grad():
         deformation = motion.displacement(every, scaffold.modes)[1]
         about = Predicted(motion.coefficients(every).clone(), torch.linalg.inv(deformation))
@@ -117,4 +120,4 @@ def informed_motion(
     def loss(of: ModalMotion) -> float:
         return float(Objective(of, carried, scaffold, background, alone)(every, compared, compared.frame))
 
-    return motion if loss(motion) < WORSE * loss(first) + SLACK else None
+    return (motion, begun) if loss(motion) < WORSE * loss(first) + SLACK else None

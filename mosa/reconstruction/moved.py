@@ -10,6 +10,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from mosa.errors import ConfigError
 from mosa.progress import tqdm
 from mosa.reconstruction.cache import StageCache
 from mosa.reconstruction.cues import gaussian_cues, neighbourhood, neighbourhood_cues
@@ -19,6 +20,7 @@ from mosa.reconstruction.informed import informed_motion
 from mosa.reconstruction.modes import deformation_modes
 from mosa.reconstruction.motion import MotionSample
 from mosa.reconstruction.observed import Windows, object_windows
+from mosa.reconstruction.response import MODES, Response, image_matrices, response_of
 from mosa.reconstruction.settings import ReconstructionSettings
 from mosa.rendering.covariance import quaternion_to_matrix
 from mosa.rendering.rasterizer import rasterize
@@ -26,6 +28,9 @@ from mosa.threads import threaded
 from mosa.types import MotionCues, Reconstruction, Scene, Splats
 
 log = logging.getLogger(__name__)
+
+UNEXPLAINED = 0.9
+"""A response that leaves more than so much of what it is measured on unexplained says nothing, and cues count as they are."""
 
 
 class MovingParts:
@@ -119,21 +124,73 @@ class SecondLook:
     def about(self, predicted: Tensor, seen: Tensor | None = None) -> MotionCues:
         """predicted: (T, N, 3) [m] of the particles in the training frames; seen: what was found of them before, None for the
         reconstruction's own."""
-        found, scene, settings = self.reconstruction, self.scene, self.settings
-        parts = found.moving
-        windows = object_windows(scene, scene.training_cameras, scene.training_frames, margin=settings.margin).to(self.device)
-        seen = (found.cues.positions if seen is None else seen).to(parts.centres)
-        background = scene.background.to(parts.centres)
-        title = f"motion of {scene.sequence} about the prediction"
+        seen = self._seen(seen)
+        found = self._found(predicted, seen)
+        return self.cues(seen if found is None else found[0])
+
+    def with_response(
+        self, predicted: Tensor, other: Tensor, seen: Tensor, first_contact: int
+    ) -> tuple[MotionCues, Response | None]:
+        """`about` and what the cues keep of the prediction, measured from another prediction (T, N, 3) [m]; None where one of them
+        is no guide to the images, or where what they keep cannot be told.
+
+        first_contact: index of the first frame after it: until then predictions do not differ."""
+        seen, scene, parts, settings = self._seen(seen), self.scene, self.reconstruction.moving, self.settings.informed
+        found = self._found(predicted, seen)
+        if found is None:
+            return self.cues(seen), None
+        positions, about = found
+        second = self._found(other, seen) if settings.response and first_contact < len(positions) else None
+        if second is None:
+            return self.cues(positions), None
+        frames = len(positions) - 1
+        with tqdm(total=frames, desc=f"what images of {scene.sequence} tell", disable=not self.progress, leave=False) as steps:
+            matrices = image_matrices(parts.scaffold, parts.carried, self._windows(), parts.centres, self._background(), positions,
+                                      reach=parts.reach, views=settings.response, progress=steps.update)
+        response, strength, left = response_of(parts.scaffold.modes, matrices, about, positions, second[1], second[0],
+                                               first_contact)
+        log.info("motion of %s: what holds it where images tell little is %.3g of what they tell in the median direction; that "
+                 "explains %.0f%% of what another prediction changed", scene.sequence, strength, 100 * (1 - left))
+        return self.cues(positions), response if left < UNEXPLAINED else None
+
+    def response(self, written: dict[str, Tensor] | None) -> Response | None:
+        """As `Response.written` has it. Errors: ConfigError where it is another body's."""
+        if written is None:
+            return None
+        modes = self.reconstruction.moving.scaffold.modes
+        T, (N, K) = len(self.scene.training_frames), modes.values[:, :MODES].shape
+        found = {name: tuple(written[name].shape) for name in ("about", "share")}
+        expected = {"about": (T, N, 3), "share": (T, 3 * K, 3 * K)}
+        if found != expected:
+            raise ConfigError(f"ckpt_path: expected mosa.responses of shapes {expected}, found {found}: the checkpoint belongs to "
+                              "another sequence")
+        about, share = (written[name].to(modes.values) for name in ("about", "share"))
+        return Response(about, share, modes.values[:, :K], modes.gradient[..., :K])
+
+    def _seen(self, seen: Tensor | None) -> Tensor:
+        return (self.reconstruction.cues.positions if seen is None else seen).to(self.reconstruction.moving.centres)
+
+    def _windows(self) -> Windows:
+        scene = self.scene
+        return object_windows(scene, scene.training_cameras, scene.training_frames, margin=self.settings.margin).to(self.device)
+
+    def _background(self) -> Tensor:
+        return self.scene.background.to(self.reconstruction.moving.centres)
+
+    def _found(self, predicted: Tensor, seen: Tensor) -> tuple[Tensor, Tensor] | None:
+        """(positions, the shapes that they were sought from), (T, N, 3) [m] each; None where the prediction is no guide."""
+        parts, settings, sequence = self.reconstruction.moving, self.settings, self.scene.sequence
+        title = f"motion of {sequence} about the prediction"
         with tqdm(total=settings.informed.iterations, desc=title, disable=not self.progress, leave=False) as steps:
-            motion = informed_motion(parts.scaffold, parts.carried, windows, parts.centres, background, predicted.to(seen), seen,
-                                     settings.informed, settings.dynamic, reach=parts.reach, seed=self.seed, progress=steps.update)
-        if motion is None:
+            found = informed_motion(parts.scaffold, parts.carried, self._windows(), parts.centres, self._background(),
+                                    predicted.to(seen), seen, settings.informed, settings.dynamic, reach=parts.reach,
+                                    seed=self.seed, progress=steps.update)  # fmt: skip
+        if found is None:
             log.warning("reconstruction.informed: what the calibrated law predicts of %s is no guide to its images, and the first "
-                        "motion stays", scene.sequence)
-            return self.cues(seen)
+                        "motion stays", sequence)
+            return None
         with torch.no_grad():
-            return self.cues(parts.sample(motion).positions)
+            return parts.sample(found[0]).positions, found[1]
 
     def cues(self, positions: Tensor) -> MotionCues:
         """Of positions (T, N, 3) [m] that `about` found, for instance those in a checkpoint."""

@@ -72,4 +72,5 @@ def take_of(body: Body, begins: Start, frames: int, world: World = WORLD):
     rollout = body.simulate(begins, world, frames, FRAME_DT)
     touched = (rollout.x[:, :, 1].amin(1) < 0.7 * DX).nonzero()  # a grid stops a body a fraction of a cell before it touches
     first = int(touched[0]) if len(touched) else frames - 1
-    return SimpleNamespace(start=begins, cues=cues_of(rollout, begins.rotation), frame_dt=FRAME_DT, first_contact=first)
+    return SimpleNamespace(start=begins, cues=cues_of(rollout, begins.rotation), frame_dt=FRAME_DT, first_contact=first,
+                           response=None)
