@@ -1,5 +1,7 @@
 """Launches of Warp kernels on torch's tensors: where they lie in memory, on which stream, beside which other threads."""
 
+from __future__ import annotations
+
 import math
 import threading
 from collections.abc import Iterator, Sequence
@@ -19,24 +21,27 @@ BLOCK = 64
 
 
 class Turns:
-    """Many threads launch at once, or one captures alone: Warp's capture on a CPU records every thread's launches."""
+    """Many threads launch at once, or one captures alone: Warp's capture on a CPU records every thread's launches.
+
+    Itself the context of launches, which is entered for every one of them."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._launching, self._capturing = 0, None
 
-    @contextmanager
-    def launching(self) -> Iterator[None]:
+    def launching(self) -> Turns:
         """Beside other launches; within this thread's own capture too."""
-        if self._capturing == threading.get_ident():
-            yield
-            return
-        with self._changed:
-            self._changed.wait_for(lambda: self._capturing is None)
-            self._launching += 1
-        try:
-            yield
-        finally:
+        return self
+
+    def __enter__(self) -> None:
+        if self._capturing != threading.get_ident():
+            with self._changed:
+                while self._capturing is not None:
+                    self._changed.wait()
+                self._launching += 1
+
+    def __exit__(self, *_) -> None:
+        if self._capturing != threading.get_ident():
             with self._changed:
                 self._launching -= 1
                 self._changed.notify_all()
@@ -57,12 +62,13 @@ class Turns:
 
 ON_CPU = Turns()
 """Of this process."""
+NOTHING = nullcontext()
 
 
 def launch(kernel, dim: int, inputs: list, device, adj_inputs: list | None = None) -> None:
     """On Warp's current stream. adj_inputs: launch the adjoint."""
     block = BLOCK if device.is_cuda else None
-    with nullcontext() if device.is_cuda else ON_CPU.launching():
+    with NOTHING if device.is_cuda else ON_CPU.launching():
         if adj_inputs is None:
             wp.launch(kernel, dim, inputs=inputs, device=device, block_dim=block)
         else:

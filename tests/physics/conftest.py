@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from mosa.physics.engine.solver import SegmentSolver
 from mosa.types import ParticleState
 
 torch.set_num_threads(1)
@@ -73,6 +74,19 @@ def block(n: int = 4, spacing: float = 0.02, height: float = 0.03, jitter: float
 def make_block():
     """The function `block`."""
     return block
+
+
+@pytest.fixture
+def looks(monkeypatch):
+    """Frames of each stretch of frames that is launched before the host looks at it, in turn."""
+    found, together = [], SegmentSolver.together
+
+    def counted(*arguments):
+        found.append(together(*arguments))
+        return found[-1]
+
+    monkeypatch.setattr(SegmentSolver, "together", counted)
+    return found
 
 
 @pytest.fixture

@@ -78,10 +78,11 @@ def updated(momentum, planes, seed=None, dx=0.1):
     given = [wp.from_torch(window, dtype=wp.vec3i), 1, wp.from_torch(grid, dtype=vec4), wp.from_torch(torch.zeros(1, 3).double(),
              dtype=wp.vec3d), 0.0, dx, wp.from_torch(values), wp.from_torch(modes), len(planes)]  # fmt: skip
     if seed is None:
-        wp.launch(kernels.grid_update, 1, [*given, wp.from_torch(out, dtype=vec4)], device="cpu")
+        wp.launch(kernels.grid_update, 1, [*given, wp.from_torch(out, dtype=vec4), None], device="cpu")
     else:
         seeds = torch.cat([seed, torch.zeros(count, 1).double()], 1)
-        wp.launch(kernels.adj_grid, 1, [*given, wp.from_torch(seeds, dtype=vec4), wp.from_torch(out, dtype=vec4)], device="cpu")
+        fields = [wp.from_torch(t, dtype=vec4) for t in (seeds, out)]
+        wp.launch(kernels.adj_grid, 1, [*given, *fields, None], device="cpu")
     return out[:, :3]
 
 

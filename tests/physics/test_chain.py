@@ -15,8 +15,8 @@ from mosa.modules.penalties import pool
 from mosa.physics.contact.colliders import Collider, Sphere
 from mosa.physics.contact.motion import Motion
 from mosa.physics.engine import budget
-from mosa.physics.engine import chain_schedule as chains_module
 from mosa.physics.engine import solver as solver_module
+from mosa.physics.engine import stepping as stepping_module
 from mosa.physics.engine.adapter_interface import AdapterOperator
 from mosa.physics.engine.adaptive_steps import StepControl
 from mosa.physics.engine.capture import ATTEMPTS
@@ -248,12 +248,12 @@ def test_two_rollouts_before_their_backward_passes(device, make_block):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("law, plastic", [("corotated", False), ("von_mises", True)])
 @pytest.mark.parametrize("pull, foreseen", [(9.8, True), (3000.0, False)])
-def test_frames_in_one_chain_are_the_frames_one_by_one(device, law, plastic, pull, foreseen, make_block, monkeypatch):
-    """Without a gradient a chain goes over several frames. A pull that is not foreseen takes the body out of their window."""
-    monkeypatch.setattr(Chains, "plan", lambda *_: Plan(40, several=True))
+def test_frames_under_one_look_are_the_frames_one_by_one(device, law, plastic, pull, foreseen, make_block, looks, monkeypatch):
+    """A pull that is not foreseen takes the body out of their window."""
+    monkeypatch.setattr(Chains, "plan", lambda *_: Plan(40))
+    monkeypatch.setattr(stepping_module, "AHEAD", 40)
     if not foreseen:
-        for module in (solver_module, chains_module):
-            monkeypatch.setattr(module, "fallen", lambda bounds, *_: bounds)
+        monkeypatch.setattr(solver_module, "fallen", lambda bounds, *_: bounds)
     adapter, state = adapter_of(device, torch.float64, plastic), make_block(n=5, velocity=(0.3, -1.0, 0.2))
     state = ParticleState(*(getattr(state, name).to(device) for name in ("x", "v", "C_affine", "F", "F_tot")))
     volume = torch.full((len(state.x),), 8e-6, dtype=torch.float64, device=device)
@@ -272,27 +272,26 @@ def test_frames_in_one_chain_are_the_frames_one_by_one(device, law, plastic, pul
             found.setdefault(chained, []).append([t.cpu() for t in values])
     for values in found[True]:
         assert_same(values, found[False][0], 1e-9 if device == "cuda" else 1e-11)
-    marks = [chain.marks for chain in sim.buffers.chains.values()]
-    assert {6, 12} in marks and (({6} in marks) == foreseen)
+    # 3 and 2 of 5 frames; 3 that fail, then one by one
+    assert looks[: 2 if foreseen else 1] == ([3, 2] if foreseen else [3]) and len(looks) == 3 * (2 if foreseen else 1)
 
 
-def test_a_body_at_rest_falls_several_frames_in_one_chain(make_block, monkeypatch):
+def test_a_body_at_rest_falls_several_frames_under_one_look(make_block, looks, monkeypatch):
     """Its window foresees what gravity does."""
     adapter, x = adapter_of("cpu", torch.float64, False), make_block(n=4, jitter=0.0).x
     still = torch.eye(3, dtype=torch.float64).expand(len(x), 3, 3).contiguous()
     state = ParticleState(x, torch.zeros_like(x), torch.zeros_like(still), still, still)
     sim = simulator(True, dx=0.02, substeps=40, frame_dt=1 / 24)
-    monkeypatch.setattr(Chains, "plan", lambda *_: Plan(160, several=True))
-    volume, calls = torch.full((len(state.x),), 8e-6, dtype=torch.float64), []
-    chain_of = Chains.chain
-    monkeypatch.setattr(Chains, "chain", lambda *args: calls.append(args[-1]) or chain_of(*args))
+    monkeypatch.setattr(stepping_module, "AHEAD", 160)
+    volume = torch.full((len(state.x),), 8e-6, dtype=torch.float64)
     with torch.no_grad():
         x = sim.rollout(state, {"mu": 8e2, "lam": 1e3}, volume, 1000.0, 5, adapter=adapter, stride=8).x
-    assert calls[0] and len(calls) < 4 and x[-1].mean(0)[1] < x[0].mean(0)[1] - 0.12
+    assert looks[0] > 1 and len(looks) < 4 and x[-1].mean(0)[1] < x[0].mean(0)[1] - 0.12
 
 
-def test_an_error_after_some_frames_comes_where_it_would_one_by_one(make_block, monkeypatch):
-    monkeypatch.setattr(Chains, "plan", lambda *_: Plan(60, several=True))
+def test_an_error_after_some_frames_comes_where_it_would_one_by_one(make_block, looks, monkeypatch):
+    monkeypatch.setattr(Chains, "plan", lambda *_: Plan(60))
+    monkeypatch.setattr(stepping_module, "AHEAD", 60)
     adapter, state = adapter_of("cpu", torch.float64, False), make_block(n=4, velocity=(0.0, -2.0, 0.0))
     low, volume = state.x.min(0).values, torch.full((len(state.x),), 8e-6, dtype=torch.float64)
     box = torch.stack([low - torch.tensor([1.0, 0.03, 1.0], dtype=torch.float64), low + 2])
@@ -304,7 +303,7 @@ def test_an_error_after_some_frames_comes_where_it_would_one_by_one(make_block, 
             sim.rollout(state, {"mu": 8e3, "lam": 1e4}, volume, 1000.0, 9, adapter=adapter, stride=5, progress=frames.append,
                         collect=collected.append)  # fmt: skip
         seen.append((str(error.value), frames))
-    assert seen[0] == seen[1] and frames == [1, 2, 3] and len(collected) == 6
+    assert seen[0] == seen[1] and frames == [1, 2, 3] and len(collected) == 6 and looks[0] > 1
 
 
 class _Holder(nn.Module):
@@ -443,7 +442,7 @@ def test_buffers_that_could_not_be_made_are_made_later(make_block, monkeypatch):
 
 def test_a_chain_whose_widest_window_would_be_too_large_is_cut(make_block, monkeypatch):
     """A body that bounces back faster than its window foresees, as one segment after the other."""
-    monkeypatch.setattr(Chains, "plan", lambda *_: Plan(192, several=True))
+    monkeypatch.setattr(Chains, "plan", lambda *_: Plan(192))
     adapter, state = adapter_of("cpu", torch.float64, False), make_block(n=4, velocity=(0.0, -45.0, 0.0), jitter=0.0)
     state = replace(state, x=0.5 * state.x)
     volume, found = torch.full((len(state.x),), 1e-6, dtype=torch.float64), []

@@ -1,4 +1,5 @@
-"""Segments on CUDA are long, as far as one window serves them. Here on a CPU: the same bits as short ones, the same gradients."""
+"""Segments on CUDA are long, as far as one window serves them, and frames are launched before the host has looked at the last one.
+Here on a CPU: the same bits as short ones, the same gradients."""
 
 from dataclasses import replace
 
@@ -10,6 +11,7 @@ from mosa.physics.contact.colliders import Collider, Sphere
 from mosa.physics.contact.motion import Motion
 from mosa.physics.engine.law_options import LawOptions
 from mosa.physics.engine.simulator import Simulator
+from mosa.physics.engine.solver import SegmentSolver
 from mosa.types import Ground
 
 PARAMETERS = {"mu": 4e4, "lam": 5e4}
@@ -99,3 +101,19 @@ def test_gradients_through_long_segments(case, make_block, monkeypatch):
 def test_segments_are_long_only_where_their_states_are_kept(make_block, monkeypatch):
     for kept, frames, expected in ((False, 9, {24, 23}), (True, 3, {24, 23}), (True, 6, {35})):
         assert gradients(make_block(), True, monkeypatch, kept=kept, frames=frames)[1] == expected
+
+
+@pytest.mark.parametrize("leaves", [False, True])
+def test_frames_are_launched_before_the_host_looks_at_them(leaves, make_block, looks, monkeypatch):
+    """As many as one window serves; where a particle leaves it they are done again, and what they kept is free."""
+    state, options, solvers, made = make_block(), {"substeps": 20, "frames": 9}, [], SegmentSolver.__init__
+    if leaves:  # a compressed body shows no speed at the start
+        state = make_block(velocity=(0.0, 0.0, 0.0))
+        state = replace(state, F=0.5 * state.F, C_affine=0 * state.C_affine)
+        options |= {"dt": 1e-4, "stiffness": 200.0, "gravity": (0, 0, 0), "ground": None}
+    monkeypatch.setattr(SegmentSolver, "__init__", lambda self, *given: solvers.append(self) or made(self, *given))
+    (long, _), (short, _) = (gradients(state, long, monkeypatch, **options) for long in (True, False))
+    assert looks[0] == 8 and (len(looks) > 1) == leaves
+    assert [solver.budget.room for solver in solvers] == [2**30] * 2
+    for a, b in zip(long, short, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-11 * float(b.abs().max()))

@@ -14,13 +14,14 @@ from mosa.physics.grid.stencil import node_functions
 def update_kernels(scalar) -> SimpleNamespace:
     """Kernels grid_update, adj_grid for wp.float32 or wp.float64 fields.
 
-    They are launched with `threads` for each world and take all nodes of its window, however many threads that is."""
+    They are launched with `threads` for each world and take all nodes of its window, however many threads that is. cleared: what
+    the next substep's particles add to, None where there is none; a launch of its own would take as long as this one."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
     vec4 = wp.types.vector(length=4, dtype=scalar)
     collide, adj_collide = make_plane_functions(scalar)
     fade, slowness = make_fade(scalar), make_slowness(scalar)
     memory, nodes = node_access(scalar), node_functions(scalar)
-    load3, load4, store3, store4 = memory.load3, memory.load4, memory.store3, memory.store4
+    load3, load4, store3, store4, clear = memory.load3, memory.load4, memory.store3, memory.store4, memory.clear
     node_position, nodes_of = nodes.node_position, nodes.nodes_of
     module = f"mosa.physics.grid_update_{scalar.__name__}"
 
@@ -77,7 +78,7 @@ def update_kernels(scalar) -> SimpleNamespace:
     def grid_update(
         window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4), impulses: wp.array(dtype=vec3), cutoff: scalar,
         dx: scalar, planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int,
-        velocity: wp.array(dtype=vec4),
+        velocity: wp.array(dtype=vec4), cleared: wp.array(dtype=vec4),
     ):  # fmt: skip
         world = wp.tid() / threads
         origin = window[3 * world]
@@ -92,12 +93,14 @@ def update_kernels(scalar) -> SimpleNamespace:
                 if count > 0:
                     u = contact(u, node_position(node - first, origin, dims, dx), planes, modes, count)
             store3(velocity, node, u)
+            if cleared:
+                clear(cleared, node)
 
     @wp.kernel(module=module, enable_backward=False)
     def adj_grid(
         window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4), impulses: wp.array(dtype=vec3), cutoff: scalar,
         dx: scalar, planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int,
-        adj_velocity: wp.array(dtype=vec4), adj_grid: wp.array(dtype=vec4),
+        adj_velocity: wp.array(dtype=vec4), adj_grid: wp.array(dtype=vec4), cleared: wp.array(dtype=vec4),
     ):  # fmt: skip
         world = wp.tid() / threads
         origin = window[3 * world]
@@ -115,7 +118,8 @@ def update_kernels(scalar) -> SimpleNamespace:
                 # v = p/m: dL/dm = -a.(p/m)/m
                 store4(adj_grid, node, vec4(a[0], a[1], a[2], -(a[0] * g[0] + a[1] * g[1] + a[2] * g[2]) / g[3]))
             else:
-                z = scalar(0.0)
-                store4(adj_grid, node, vec4(z, z, z, z))
+                clear(adj_grid, node)
+            if cleared:
+                clear(cleared, node)
 
     return SimpleNamespace(grid_update=grid_update, adj_grid=adj_grid)

@@ -31,7 +31,7 @@ from mosa.physics.engine.operation import Stretch, advance
 from mosa.physics.engine.solver import WIDENED, SegmentSolver
 from mosa.physics.engine.workspace import Workspace
 from mosa.physics.grid.transfer_kernels import NO_EVENT
-from mosa.physics.launching import copies, same_memory, warp_stream
+from mosa.physics.launching import same_memory, warp_stream
 
 MOST_GRAPHS = 24
 """Of a chain, whose graphs have memory of their own for an evaluation: two or three for each time step."""
@@ -67,7 +67,6 @@ def learned_of(adapter: nn.Module) -> Learned:
 class Chain:
     """Buffers and captured graphs of K segments of `lengths` substeps for N particles of `worlds` worlds and one adapter.
 
-    marks: numbers of segments after which the state is wanted too, besides the last; only without a gradient.
     ask: (adapter, F, C_affine, packed parameters, into=None) -> its answer by name (`ANSWER`, None where it has none),
     differentiable; into: as `material_state`.
     collects: also return `adapter.statistics()`, a named tuple of tensors, of every evaluation.
@@ -77,10 +76,9 @@ class Chain:
 
     def __init__(
         self, numerics: Numerics, adapter: nn.Module, ask: Callable[..., dict[str, Tensor | None]], particles: int, worlds: int,
-        lengths: Sequence[int], *, learned: Learned, marks: Sequence[int], plastic_adapted: bool, collects: bool, graphs: bool,
+        lengths: Sequence[int], *, learned: Learned, plastic_adapted: bool, collects: bool, graphs: bool,
     ) -> None:  # fmt: skip
         self.numerics, self.adapter, self.ask, self.lengths, self.collects = numerics, adapter, ask, tuple(lengths), collects
-        self.marks, self.marked = frozenset(marks), []
         self.substeps = sum(lengths)
         self.learned = learned
         self._shape = {
@@ -148,13 +146,9 @@ class Chain:
 
     @same_weights()
     def _forward(self, full: bool) -> None:
-        work, collected, marked = self.workspace(full), [], []
-        for count, evaluation in enumerate(self._segments(work, partial(self._answer, work, self.collects)), 1):
-            collected.append(evaluation.statistics)
-            if count in self.marks:
-                marked.append(work.state(sum(self.lengths[:count])))
+        work = self.workspace(full)
+        collected = [each.statistics for each in self._segments(work, partial(self._answer, work, self.collects))]
         self.statistics[full] = tuple(torch.stack(parts) for parts in zip(*collected))
-        self.marked = marked
 
     def _segments(self, work: Workspace, evaluate: Callable[[int], _Evaluation]) -> Iterator[_Evaluation]:
         """Launches all segments, one after each answer of `evaluate` to the state at its start, and passes the answers on."""
@@ -210,7 +204,7 @@ class Chain:
         buffers = tuple(each.allocations if each is not None else 0 for each in (self.light, self.full))
         held, read = (buffers, work.cutoff), (*learned.tensors, *learned.weights)
         if held != self._held or not same_memory(self._read, read):
-            self._held, self._read, self.marked = held, [t.detach() for t in read], []  # aliases, which belong to no graph
+            self._held, self._read = held, [t.detach() for t in read]  # aliases, which belong to no graph
             self._graphs.drop()
 
     def play(self, steps: Steps, name: str, *arguments) -> None:
@@ -234,7 +228,7 @@ class ChainOfSegments(Stretch):
     """Segments with an adapter's evaluations between them. What acts: packed parameters, the adapter's weights. Its statistics are
     those of each evaluation, (K, ...).
 
-    learned: of the adapter as it is now. marked: afterwards, the states at the chain's marks."""
+    learned: of the adapter as it is now."""
 
     chain: Chain
     learned: Learned
@@ -249,7 +243,7 @@ class ChainOfSegments(Stretch):
     @property
     def cut(self) -> bool:
         # shorter chains need less than the widest window, which is larger than any may be
-        return bool(self.chain.marks) or (self.substeps > WIDENED and len(self.chain.lengths) > 1)
+        return self.substeps > WIDENED and len(self.chain.lengths) > 1
 
     def full(self, differentiated: bool, kept: bool) -> bool:
         return differentiated  # a rollout with a backward pass has these buffers anyway
@@ -263,7 +257,6 @@ class ChainOfSegments(Stretch):
         self.chain.play(work.steps, "forward", work.with_adjoint)
 
     def statistics(self, work: Workspace) -> Sequence[Tensor]:
-        self.marked = [State.whole(copies(state)) for state in self.chain.marked]
         return self.chain.statistics[work.with_adjoint]
 
     def statistics_seeds(self) -> Sequence[Tensor]:
@@ -284,11 +277,10 @@ class ChainOfSegments(Stretch):
 def advance_chain(
     lanes: Lanes, chain: Chain, learned: Learned, state: State, packed: Tensor, first: int, poses: tuple[Tensor, ...] = (),
     steps: Steps | None = None,
-) -> tuple[list[State], tuple[Tensor, ...], list]:  # fmt: skip
-    """([the states at the chain's marks and after it], reactions, statistics of each evaluation), differentiable in state,
-    parameters, poses and the adapter's weights, where there are no marks. Arguments: as `ChainOfSegments` and `advance_segment`.
-    Errors: SimulationDiverged; LeftWindow."""
+) -> tuple[State, tuple[Tensor, ...], list]:  # fmt: skip
+    """(the state after the chain, reactions, statistics of each evaluation), differentiable in state, parameters, poses and the
+    adapter's weights. Arguments: as `ChainOfSegments` and `advance_segment`. Errors: SimulationDiverged; LeftWindow."""
     stretch = ChainOfSegments(lanes, first, steps or Steps(lanes.numerics.dt, lanes.numerics.dt), chain, learned)
     final, left = advance(stretch, state, (packed, *learned.weights, *poses))
     reactions = 2 if poses else 0
-    return [*stretch.marked, final], left[:reactions], chain.named(left[reactions:])
+    return final, left[:reactions], chain.named(left[reactions:])

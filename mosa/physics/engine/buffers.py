@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -24,17 +23,15 @@ class Buffers:
         self.probes: dict[tuple, tuple[bool, int]] = {}
         self._pools: list[dict[tuple, Workspace]] = [{}]
 
-    @contextmanager
-    def workspaces(self) -> Iterator[dict[tuple, Workspace]]:
-        """Workspaces by shape, for one thread alone."""
+    def take(self) -> dict[tuple, Workspace]:
+        """Workspaces by shape, for one thread alone until it gives them back."""
         try:
-            pool = self._pools.pop()
+            return self._pools.pop()
         except IndexError:  # more threads than ever before
-            pool = {}
-        try:
-            yield pool
-        finally:
-            self._pools.append(pool)
+            return {}
+
+    def give_back(self, workspaces: dict[tuple, Workspace]) -> None:
+        self._pools.append(workspaces)
 
     def __iter__(self) -> Iterator[Workspace]:
         """All workspaces, of the chains too."""

@@ -4,12 +4,12 @@ import gc
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 
 import torch
 import warp as wp
 
-from mosa.physics.launching import ON_CPU
+from mosa.physics.launching import NOTHING, ON_CPU
 
 ATTEMPTS = 3
 """Captures in a row that may fail before there are no more: a library that sets itself up when it is first captured spoils one."""
@@ -47,29 +47,33 @@ class WarpCapture(Strategy):
     """Of Warp's launches alone, on a CPU too. device: torch's; of_warp: the same as Warp's."""
 
     def __init__(self, device: torch.device, of_warp) -> None:
-        self.device, self.of_warp = device, of_warp
+        self.device, self.of_warp, self.cuda = device, of_warp, device.type == "cuda"
+        self._last: tuple | None = None
 
     def _stream(self):
-        """torch's current one."""
-        cuda = self.device.type == "cuda"
-        return wp.stream_from_torch(torch.cuda.current_stream(self.device)) if cuda else None
+        """torch's current one, as it was last made into Warp's."""
+        if not self.cuda:
+            return None
+        current = torch.cuda.current_stream(self.device)
+        if self._last is None or self._last[0] != current:
+            self._last = current, wp.stream_from_torch(current)
+        return self._last[1]
 
     def run(self, body: Body) -> None:
         stream = self._stream()
-        with nullcontext() if stream is None else wp.ScopedStream(stream):
+        with NOTHING if stream is None else wp.ScopedStream(stream):
             body()
 
     def capture(self, body: Body) -> Body:
-        cuda = self.device.type == "cuda"
         # on Warp's own stream: torch's default one cannot be captured
         captured = wp.ScopedCapture(device=self.of_warp, force_module_load=False)
-        with nullcontext() if cuda else ON_CPU.capturing(), uninterrupted(), captured:
+        with NOTHING if self.cuda else ON_CPU.capturing(), uninterrupted(), captured:
             body()
 
         graph = captured.graph
 
         def replay() -> None:
-            with nullcontext() if cuda else ON_CPU.launching():
+            with NOTHING if self.cuda else ON_CPU.launching():
                 wp.capture_launch(graph, stream=self._stream())
 
         return replay

@@ -63,8 +63,12 @@ class Lanes:
 
         def run(index: int):
             solver = self.solvers[index]
-            with self.buffers.workspaces() as solver.workspaces, torch.no_grad():
-                return function(solver, *(argument[index] for argument in arguments))
+            solver.workspaces = self.buffers.take()
+            try:
+                with torch.no_grad():  # which a thread knows nothing of
+                    return function(solver, *(argument[index] for argument in arguments))
+            finally:
+                self.buffers.give_back(solver.workspaces)
 
         count = len(self.solvers)
         if count == 1 or self.solvers[0].volume.is_cuda:  # in turns: while one captures a graph no other may touch the stream

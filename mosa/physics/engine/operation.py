@@ -10,14 +10,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from mosa.physics.contact.motion import Poses
 from mosa.physics.engine.lanes import Lanes
 from mosa.physics.engine.numerics import State, Steps
-from mosa.physics.engine.solver import SegmentSolver
+from mosa.physics.engine.solver import SegmentSolver, Windows
 from mosa.physics.engine.workspace import Workspace
 from mosa.physics.launching import copies
 
@@ -28,7 +27,7 @@ class Kept:
     """What a forward pass leaves for the backward pass. windows: of the grid that it used; tape: `Workspace.tape`, [] where the
     states are to be made again."""
 
-    def __init__(self, windows: tuple, tape: list[Tensor]) -> None:
+    def __init__(self, windows: Windows, tape: list[Tensor]) -> None:
         self.windows, self.tape = windows, tape
 
     def take(self) -> list[Tensor]:
@@ -103,7 +102,7 @@ class Stretch(ABC):
 
     def _loaded(
         self, solver: SegmentSolver, state: State, acting: Sequence[Tensor | None], poses: Sequence[Tensor],
-        windows: tuple[np.ndarray, np.ndarray], full: bool,
+        windows: Windows, full: bool,
     ) -> Workspace:  # fmt: skip
         work, held = self.buffers(solver, acting, full)
         work.set_window(*windows)
@@ -121,7 +120,7 @@ class Stretch(ABC):
             kept = differentiated and solver.has_room(self.substeps)
             full = self.full(differentiated, kept)
 
-            def launched(windows: tuple[np.ndarray, np.ndarray]) -> Workspace:
+            def launched(windows: Windows) -> Workspace:
                 work = self._loaded(solver, state, acting, poses, windows, full)
                 self.advance(work, acting)
                 return work
@@ -150,8 +149,11 @@ class Stretch(ABC):
             slot, slots, statistics = self.substeps % 2, work.adjoint_slots(), self.statistics_seeds()
             reaction, of_poses = ([], []) if work.colliders is None else (work.colliders.adj_reaction, work.colliders.adj_poses)
             targets = [*(target[slot] for target in slots), *reaction, *statistics]
-            for target, seed in zip(targets, (*seeds, *other_seeds), strict=True):
-                target.zero_() if seed is None else target.copy_(seed)
+            seeded = list(zip(targets, (*seeds, *other_seeds), strict=True))
+            if unseeded := [target for target, seed in seeded if seed is None]:
+                torch._foreach_zero_(unseeded)
+            if given := [pair for pair in seeded if pair[1] is not None]:
+                torch._foreach_copy_(*map(list, zip(*given)))
             penalised = any(seed is not None for seed in other_seeds[len(reaction) :])
             self.adjoint(work, acting, not tape, penalised)
             of_acting = self.adjoint_of(work, acting)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 import torch
@@ -20,15 +21,27 @@ WIDENED = 32
 """Most substeps of a segment whose window may be widened for particles of any speed; longer ones are cut instead."""
 
 
+Windows = tuple[np.ndarray, np.ndarray]
+"""Lowest node and nodes per axis of the grids of the worlds, (W, 3) each."""
+
+
 class LeftWindow(Exception):
     """A particle left the window of many substeps: of fewer, it has room for any speed."""
+
+
+class _Shared:
+    """Windows of several stretches of motion that are looked at together. flags: copies of each stretch's; final: state after the
+    last one."""
+
+    def __init__(self, windows: Windows) -> None:
+        self.windows, self.flags, self.final = windows, [], None
 
 
 class SegmentSolver:
     """Runs the segments of one rollout, of one world or of several in the same launches. volume: (N,) [m^3]; density: number or
     (N,) [kg/m^3]; cutoff: node mass [kg].
 
-    workspaces: by shape, those that it has while it runs (`Buffers.workspaces`).
+    workspaces: by shape, those that it has while it runs (`Buffers.take`).
     budget: for the states of all substeps, between the passes; segments that do not fit are run again in the backward pass.
     gravities: of every world [m/s^2], among which the particles are shared in equal parts; None: one world with the numerics' own.
     first_world: number of the first one, for messages, None where there is but one.
@@ -45,6 +58,7 @@ class SegmentSolver:
         self.gravities = tuple(gravities) if gravities is not None else (numerics.gravity,)
         self._first_world = first_world
         self._known: tuple | None = None
+        self._shared: _Shared | None = None
 
     @property
     def worlds(self) -> int:
@@ -60,15 +74,20 @@ class SegmentSolver:
         return self.workspaces[key]
 
     def within(
-        self, run: Callable[[tuple[np.ndarray, np.ndarray]], Workspace], state: State, time: float, margins: Sequence[int],
-        falls: bool, first: int, dt: float,
-    ) -> tuple[Workspace, State, tuple[np.ndarray, np.ndarray]]:  # fmt: skip
+        self, run: Callable[[Windows], Workspace], state: State, time: float, margins: Sequence[int], falls: bool, first: int,
+        dt: float,
+    ) -> tuple[Workspace, State, Windows]:  # fmt: skip
         """(what `run` has run in, the state after it, the windows) in the first windows that no particle leaves.
 
         The speeds at the start tell a window for `time` seconds; a body that is being accelerated may need the most that the time
         step bound allows, half a cell per substep. margins: nodes beyond what the speeds ask for, of one window after the other;
         with one alone the caller can cut what is run. falls: as `windows`; first, dt: of the substeps, for messages. Errors:
         SimulationDiverged naming substep and particle; LeftWindow of what can be cut."""
+        if self._shared is not None:
+            work = run(self._shared.windows)
+            self._shared.flags.append(work.flags.clone())
+            self._shared.final = work.final()
+            return work, self._shared.final, self._shared.windows
         for margin in margins:
             windows = self.windows(state, time, margin, falls)
             work = run(windows)
@@ -78,21 +97,51 @@ class SegmentSolver:
                 return work, final, windows
         raise LeftWindow if len(margins) == 1 else self._error(WINDOW, flags[WINDOW], first, dt)
 
+    @contextmanager
+    def one_look(self, state: State, time: float, margin: int) -> Iterator[None]:
+        """The stretches inside begin at `state` and take `time` seconds in all; they have the same windows, and the host looks at
+        them once, afterwards: until then it launches one after the other and waits for none. Errors: LeftWindow for any event;
+        the stretches one by one say which."""
+        room, self._shared = self.budget.room, _Shared(self.windows(state, time, margin, True))
+        try:
+            yield
+            with torch.no_grad():
+                fine = min(self.look(torch.stack(self._shared.flags).amin(0), self._shared.final)) == NO_EVENT
+        finally:
+            self._shared = None
+        if not fine:
+            self.budget.room = room
+            raise LeftWindow
+
     def piece(self, state: State, left: int, most: int, dt: float) -> int:
         """How many of the `left` substeps the next window is to serve: at most `most`, and so few that it is not much larger than
-        the window of `WIDENED` substeps."""
+        the window of `WIDENED` substeps; all of them where a window is shared."""
+        if self._shared is not None:
+            return left
         bounds, pieces = self.bounds(state), -(-left // most)
         if not np.isfinite(bounds).all():
             return min(left, WIDENED)
-        while (count := -(-left // pieces)) > WIDENED:
-            reach = fallen(bounds, self.gravities, count * dt)
-            long, short = (window_of(reach, self.numerics.dx, n * dt, 2)[1].prod(-1) for n in (count, WIDENED))
-            if long.sum() <= short.sum() + SMALL and long.max() <= MAX_NODES:
-                break
+        while (count := -(-left // pieces)) > WIDENED and not self._serves(bounds, count * dt, WIDENED * dt, 2):
             pieces *= 2
         return count
 
-    def windows(self, state: State, time: float, margin: int, falls: bool) -> tuple[np.ndarray, np.ndarray]:
+    def together(self, state: State, frames: int, frame_dt: float, dt: float, margin: int) -> int:
+        """How many of `frames` frames the next window is to serve: so few that it is not much larger than one frame's, or than
+        that of `WIDENED` substeps."""
+        bounds = self.bounds(state)
+        if not np.isfinite(bounds).all():
+            return 1
+        while frames > 1 and not self._serves(bounds, frames * frame_dt, min(frame_dt, WIDENED * dt), margin):
+            frames //= 2
+        return frames
+
+    def _serves(self, bounds: np.ndarray, time: float, least: float, margin: int) -> bool:
+        """Whether the windows for `time` [s] are about as small as those for the time `least`."""
+        reach = fallen(bounds, self.gravities, time)
+        long, short = window_of(reach, self.numerics.dx, np.array([time, least])[:, None, None], margin)[1].prod(-1)
+        return bool(long.sum() <= short.sum() + SMALL and long.max() <= MAX_NODES)
+
+    def windows(self, state: State, time: float, margin: int, falls: bool) -> Windows:
         """The windows of the worlds, (W, 3) each, for `time` [s], with room for `margin` nodes more. falls: also for what gravity
         adds to the speeds at the start. Errors: SimulationDiverged as `grid_window`."""
         bounds = self.bounds(state)

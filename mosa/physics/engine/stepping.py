@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from mosa.errors import ConfigError
+from mosa.errors import ConfigError, SimulationDiverged
 from mosa.physics.contact.motion import Motion, Poses, Trajectory, sample_poses
+from mosa.physics.engine.adapter_chain import ChainOfSegments
 from mosa.physics.engine.adapter_interface import ANSWER, AdapterOperator, MaterialState
 from mosa.physics.engine.budget import room, substep_bytes
 from mosa.physics.engine.chain_schedule import SEGMENT, Chains
@@ -23,13 +24,16 @@ from mosa.physics.engine.lanes import Lanes
 from mosa.physics.engine.material_operations import first_advance
 from mosa.physics.engine.numerics import Numerics, State, Steps, flat
 from mosa.physics.engine.operation import wants_gradient
-from mosa.physics.engine.segment import advance_segment
+from mosa.physics.engine.segment import HeldSegment, advance_segment
+from mosa.physics.engine.solver import LeftWindow
 from mosa.types import ParticleState
 
 LONGEST = 256
 """Most substeps of a segment of which no gradient is wanted, on CUDA: each segment costs a look at the host."""
 LONGEST_KEPT = 96
 """The same where a gradient is wanted and all states are kept; its buffers hold those of a segment once more."""
+AHEAD = 256
+"""Most substeps, of whole frames, that are launched before the host looks at them, on CUDA: what fails is done again."""
 
 
 @dataclass
@@ -37,7 +41,8 @@ class Prepared:
     """The bodies of one rollout: the parameters of their law, packed, what an adapter answered last, and what advances them.
 
     ask: (adapter, F, C_affine, packed, collect) -> its answer by name. gathers: whether a stretch of motion has as many substeps as
-    it can: segments are long, and an adapter that is a torch module is asked inside, in a chain of segments."""
+    it can, and is launched before the last one was looked at: segments are long, and an adapter that is a torch module is asked
+    inside, in a chain of segments."""
 
     numerics: Numerics
     ask: Callable[..., dict[str, Tensor | None]]
@@ -54,12 +59,12 @@ class Prepared:
         self.held, self.chains = {"parameters": self.packed, **dict.fromkeys(ANSWER)}, None
         alone = len(self.lanes.solvers) == 1 and self.stride is not None and getattr(self.adapter, "flow", None) is None
         if self.gathers and alone and isinstance(self.adapter, nn.Module):
-            self.chains = Chains(self.lanes, self.adapter, self.ask, self.packed, self.collect)
+            self.chains = Chains(self.lanes, self.adapter, self.ask, self.packed, self.collect is not None)
 
     def first_advance(self, state: State, dt: float) -> State:
         """The advance of F by dt [s] with which a motion begins."""
         C, F, F_tot = state.C_affine, state.F, state.F_tot
-        numerics = replace(self.numerics, dt=dt)
+        numerics = self.numerics if dt == self.numerics.dt else replace(self.numerics, dt=dt)
         if not numerics.law.plastic:
             F = first_advance(numerics, F, C, self.packed)
             return state._replace(F=F, F_tot=F)
@@ -86,7 +91,7 @@ class Prepared:
         wanted = wants_gradient((*state, *self.held.values(), *poses, *weights))
         if gives:
             self.give_memory(substeps, wanted)
-        self.most_alone = SEGMENT
+        self.most_alone, self._ahead, self._most_ahead = SEGMENT, [], AHEAD
         if self.chains is not None:
             self.chains.begin(state, substeps, self.stride, wanted)
         elif self.gathers and not variable and not wanted:
@@ -102,10 +107,49 @@ class Prepared:
 
     def frame(self, state: State, frame: Frame, poses: tuple[Tensor, ...], alike: int = 0) -> tuple[State, Tensor | None]:
         """(state after a frame, reactions (substeps, W K, 6) or None). poses: of W worlds with K colliders at its substeps, ()
-        where there are none; alike: frames that follow and are known to have as many substeps and no poses."""
+        where there are none; alike: frames that follow and are known to have as many substeps and no poses, of which some may be
+        done now. The state is then the one of the frame before."""
+        while not self._ahead:
+            count = self._together(state, frame, 1 + alike)
+            if count == 1:
+                state, forces, collected = self._one(state, frame, poses)
+                self._collect(collected)
+                return state, forces
+            done, collected = [state], []
+            try:
+                with self.lanes.solvers[0].one_look(state, count * frame.count * frame.dt, self._margin):
+                    for k in range(count):
+                        after, _, more = self._one(done[-1], frame._replace(first=frame.first + k * frame.count), poses)
+                        done.append(after)
+                        collected += more
+            except (LeftWindow, SimulationDiverged) as error:
+                # what can be had of these frames still is, and the one that fails says how
+                self._most_ahead = count // 2 * frame.count if isinstance(error, LeftWindow) else 0
+                continue
+            self._ahead = done[1:]
+            self._collect(collected)
+        return self._ahead.pop(0), None
+
+    @property
+    def _margin(self) -> int:
+        return (HeldSegment if self.chains is None else ChainOfSegments).margin
+
+    def _together(self, state: State, frame: Frame, frames: int) -> int:
+        """How many of `frames` frames alike are launched before the host looks at them."""
+        frames = min(frames, self._most_ahead // frame.count)
+        if frames < 2 or not self.gathers or len(self.lanes.solvers) > 1 or (self.adapter is not None and self.chains is None):
+            return 1
+        return self.lanes.solvers[0].together(state, frames, frame.count * frame.dt, frame.dt, self._margin)
+
+    def _collect(self, statistics: list) -> None:
+        for each in statistics:
+            self.collect(each)
+
+    def _one(self, state: State, frame: Frame, poses: tuple[Tensor, ...]) -> tuple[State, Tensor | None, list]:
+        """(as `frame`, of this frame alone, statistics of a chain's evaluations)."""
         lengths, first, steps = self.lengths(frame), frame.first, frame.steps
         if self.chains is not None:
-            return self.chains.frame(state, lengths, first, poses, steps, alike)
+            return self.chains.frame(state, lengths, first, poses, steps)
         forces, done = [], 0
         flow = getattr(self.adapter, "flow", None)
         for length in lengths:
@@ -118,7 +162,7 @@ class Prepared:
             forces += [torch.cat(reaction, -1)] if reaction else []
             steps = None if steps is None else Steps(steps.dt, steps.dt)
             done += length
-        return state, torch.cat(forces) if forces else None
+        return state, torch.cat(forces) if forces else None, []
 
 
 def segments(substeps: int, stride: int | None, most: int = 0) -> list[int]:

@@ -100,6 +100,7 @@ class Workspace:
         self.cutoff = 0.0
         self.nodes = self.capacity = self.allocations = 0
         self._placed: np.ndarray | None = None
+        self._given: tuple[np.ndarray, np.ndarray] | None = None  # the windows that are placed; nobody changes them
         self._pulled: tuple | None = None
         self.steps = Steps(numerics.dt, numerics.dt)
         strategy = WarpCapture(numerics.device, self.flags_wp.device)
@@ -129,11 +130,13 @@ class Workspace:
 
     def grid_slots(self) -> Tensor:
         """(2, slots, nodes of the windows, 4): momentum and mass, velocity."""
-        return self.fields[:, :, : self.nodes]
+        return self.fields.narrow(2, 0, self.nodes)
 
     def set_window(self, origins: np.ndarray, dims: np.ndarray) -> None:
         """Place the grids: lowest node and number of nodes per axis, (W, 3), or (3,) for all worlds. Buffers and graphs are new
         where there is no room for them."""
+        if self._given is not None and origins is self._given[0] and dims is self._given[1]:
+            return
         rows = np.zeros((self.worlds, 3, 3), dtype=np.int32)
         rows[:, 0], rows[:, 1] = origins, dims
         ends = rows[:, 1].prod(-1, dtype=np.int64).cumsum()
@@ -143,15 +146,17 @@ class Workspace:
         if self._placed is None or not np.array_equal(rows, self._placed):
             self.window.copy_(torch.from_numpy(rows).flatten(0, 1), non_blocking=True)  # CUDA stages it before it returns
             self._placed, self.nodes = rows, nodes
+        self._given = origins, dims
 
     @torch.inference_mode(False)  # another rollout may want gradients
     def _allocate_nodes(self, count: int) -> None:
         self.allocations += 1
         self._graphs.forget()
-        self.capacity = 0  # until all is there: memory may run out
+        self.capacity, self._given = 0, None  # until all is there: memory may run out
         self.fields = self.grid_wp = self.velocity_wp = None  # freed before there are others
-        self.adj_grid = self.adj_grid_wp = self.adj_velocity = self.adj_velocity_wp = None
-        grids, vec4 = self.substeps if self.with_adjoint else 1, self.kernels.vec4
+        self.adj_grid = self.adj_grid_wp = self.adj_velocity_wp = None
+        # where only the last one is wanted a second one, which is cleared while the first is read
+        grids, vec4 = self.substeps if self.with_adjoint else 2, self.kernels.vec4
         self.fields = torch.zeros((2, grids, count, 4), dtype=self.numerics.dtype, device=self.numerics.device)
         self.grid_wp, self.velocity_wp = ([wp.from_torch(t, dtype=vec4) for t in slots] for slots in self.fields)
         if self.exact:
@@ -160,7 +165,7 @@ class Workspace:
             self.colliders.set_nodes(count)
         if self.with_adjoint:
             self.adj_grid, self.adj_grid_wp = self.array((count, 4), vec4)
-            self.adj_velocity, self.adj_velocity_wp = self.array((count, 4), vec4)
+            _, self.adj_velocity_wp = self._per_slot(2, (count, 4), vec4)
         self.capacity = count
 
     def load(
@@ -282,16 +287,17 @@ class Workspace:
         if self.colliders is not None and first == 0:
             self.colliders.reset()
         for step in range(first, first + count):
-            a, b, g = step % states, (step + 1) % states, step % grids
-            if not self.exact:
+            a, b, g, s = step % states, (step + 1) % states, step % grids, step % len(self.tau)
+            if step == 0 and not self.exact:
                 self.over_nodes(kernels.clear, [self.grid_wp[g]])
-            self.run(self.stress, n, self._stress_arguments(a, g))
+            cleared = self.grid_wp[(step + 1) % grids] if step + 1 < self.substeps and not self.exact else None
+            self.run(self.stress, n, self._stress_arguments(a, s))
             self.run(kernels.p2g, n, [
-                self.x_wp[a], self.v_wp[a], self.C_affine_wp[a], self.F_wp[a], self.tau_wp[g], self.mass_wp, self.volume_wp,
+                self.x_wp[a], self.v_wp[a], self.C_affine_wp[a], self.F_wp[a], self.tau_wp[s], self.mass_wp, self.volume_wp,
                 *(geometry if step else kicked), int(numerics.check_J), step, self.flags_wp, self._added_to(self.grid_wp[g]),
             ])  # fmt: skip
             self._settle(self.grid_wp[g])
-            self.over_nodes(self.update.grid_update, [*self._grid_arguments(g, step), self.velocity_wp[g]])
+            self.over_nodes(self.update.grid_update, [*self._grid_arguments(g, step), self.velocity_wp[g], cleared])
             if self.colliders is not None:
                 self.colliders.apply(step, self._collider_place(g), self._kick(step), self.velocity_wp[g])
             self.run(kernels.g2p, n, [
@@ -320,19 +326,21 @@ class Workspace:
                     self.adj_F_wp[a], self.adj_C_affine_wp[b], held["parameters"], held["plastic_G"], held["plastic_h"],
                     0.0, 0.0, 0, self.adj_F_wp[b],
                 ])  # fmt: skip
-            if not self.exact:
-                self.over_nodes(kernels.clear, [self.adj_velocity_wp])
+            adj_velocity = self.adj_velocity_wp[a]
+            if step == self.substeps - 1 and not self.exact:
+                self.over_nodes(kernels.clear, [adj_velocity])
+            cleared = self.adj_velocity_wp[b] if step > 0 and not self.exact else None
             self.run(kernels.adj_g2p, n, [
                 self.x_wp[step], self.F_tot_wp[step], self.velocity_wp[step], self.C_affine_wp[step + 1], *geometry,
                 self.adj_x_wp[b], self.adj_v_wp[b], self.adj_C_affine_wp[b], self.adj_F_tot_wp[b],
-                self.adj_x_wp[a], self.adj_F_tot_wp[a], self._added_to(self.adj_velocity_wp),
+                self.adj_x_wp[a], self.adj_F_tot_wp[a], self._added_to(adj_velocity),
             ])  # fmt: skip
-            self._settle(self.adj_velocity_wp)
+            self._settle(adj_velocity)
             if self.colliders is not None:
                 # the velocities that the colliders found are cheaper to compute again than to keep
-                self.over_nodes(self.update.grid_update, [*self._grid_arguments(step, step), self.colliders.before_wp])
-                self.colliders.adjoint(step, self._collider_place(step), self._kick(step), self.adj_velocity_wp)
-            self.over_nodes(self.update.adj_grid, [*self._grid_arguments(step, step), self.adj_velocity_wp, self.adj_grid_wp])
+                self.over_nodes(self.update.grid_update, [*self._grid_arguments(step, step), self.colliders.before_wp, None])
+                self.colliders.adjoint(step, self._collider_place(step), self._kick(step), adj_velocity)
+            self.over_nodes(self.update.adj_grid, [*self._grid_arguments(step, step), adj_velocity, self.adj_grid_wp, cleared])
             if self.colliders is not None:
                 self.colliders.add_mass(self.adj_grid_wp)
             self.run(kernels.adj_p2g, n, [

@@ -60,10 +60,10 @@ PARTS = "const auto x = value.c[0], y = value.c[1], z = value.c[2], w = {};"
 
 @cache
 def node_access(scalar) -> SimpleNamespace:
-    """load4, load3, store3, store4, add3, add4 on arrays of 4-vectors of wp.float32 or wp.float64.
+    """load4, load3, store3, store4, add3, add4, clear on arrays of 4-vectors of wp.float32 or wp.float64.
 
     load(field, i), for memory that nothing in the same launch writes; store and add(field, i, value), add for memory that nothing
-    in the same launch reads. The functions on 3-vectors leave the fourth number out; a store sets it to 0.
+    in the same launch reads; clear(field, i). The functions on 3-vectors leave the fourth number out; a store sets it to 0.
     """
     vec3 = wp.types.vector(length=3, dtype=scalar)
     vec4 = wp.types.vector(length=4, dtype=scalar)
@@ -96,7 +96,12 @@ def node_access(scalar) -> SimpleNamespace:
     )
     def add3(field: field4, i: int, value: vec3): ...
 
-    return SimpleNamespace(load4=load4, load3=load3, store4=store4, store3=store3, add4=add4, add3=add3)
+    @wp.func
+    def clear(field: field4, i: int):
+        z = scalar(0.0)
+        store4(field, i, vec4(z, z, z, z))
+
+    return SimpleNamespace(load4=load4, load3=load3, store4=store4, store3=store3, add4=add4, add3=add3, clear=clear)
 
 
 @cache

@@ -36,7 +36,7 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
     vec4 = wp.types.vector(length=4, dtype=scalar)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
     memory, stencil, nodes_of = node_access(scalar), stencil_functions(scalar), node_functions(scalar).nodes_of
-    load3, load4, store4 = memory.load3, memory.load4, memory.store4
+    load3, load4, clear_node = memory.load3, memory.load4, memory.clear
     adding = exact_node_access(scalar) if exact else memory
     add3, add4, settle_node = adding.add3, adding.add4, exact_node_access(scalar).settle_node
     added_to = wp.array2d(dtype=wp.int64) if exact else wp.array(dtype=vec4)
@@ -48,11 +48,10 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def clear(window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4)):
-        z = scalar(0.0)
         world = wp.tid() / threads
         first, end = nodes_of(window, world)
         for node in range(first + wp.tid() - world * threads, end, threads):
-            store4(grid, node, vec4(z, z, z, z))
+            clear_node(grid, node)
 
     @wp.kernel(module=module, enable_backward=False)
     def settle(

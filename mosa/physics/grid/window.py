@@ -71,8 +71,8 @@ def grid_window(
     return low, dims
 
 
-def window_of(bounds: np.ndarray, dx: float, time: float, margin: int) -> tuple[np.ndarray, np.ndarray]:
-    """As `grid_window`, of extents (..., 12) and of any size."""
+def window_of(bounds: np.ndarray, dx: float, time: float | np.ndarray, margin: int) -> tuple[np.ndarray, np.ndarray]:
+    """As `grid_window`, of extents (..., 12) and of any size; time: one, or some that broadcast with (..., 1)."""
     bounds = np.asarray(bounds, dtype=np.float64)
     speeds = _OUTWARDS * bounds[..., 6:]
     turned = TURNED * np.abs(speeds).max(-1, keepdims=True)  # by the largest component of a velocity
