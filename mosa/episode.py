@@ -237,7 +237,8 @@ class Episode:
             after = exponential(self.frame_dt * w) @ R if turns else R
             last.append([end.get("position", x + self.frame_dt * v), end.get("rotation", after)])
         axis = 1 + len(self._leading())
-        poses = Poses(*(torch.stack(parts, axis) for parts in zip(*columns)))
+        # of one collider without a copy: what is the same at all substeps stays one row
+        poses = Poses(*(torch.stack(parts, axis) if len(parts) > 1 else parts[0].unsqueeze(axis) for parts in zip(*columns)))
         return poses, tuple(torch.stack(parts, axis - 1) for parts in zip(*last))
 
     def _twist(self, command: dict[str, Tensor], x: Tensor, R: Tensor) -> tuple[Tensor, Tensor, dict[str, Tensor]]:

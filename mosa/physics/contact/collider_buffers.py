@@ -60,8 +60,7 @@ class ColliderBuffers:
 
     def load(self, poses: tuple[Tensor, ...]) -> None:
         """Copy the poses of a segment's substeps in."""
-        for target, value in zip(self.poses, poses, strict=True):
-            target.copy_(value)
+        torch._foreach_copy_(list(self.poses), list(poses))
 
     def reset(self) -> None:
         """Before a segment: no reaction yet."""

@@ -56,6 +56,7 @@ class SegmentSolver:
         self.workspaces: dict[tuple, Workspace] = {}
         self.budget = Budget()
         self.gravities = tuple(gravities) if gravities is not None else (numerics.gravity,)
+        self._pull = np.array(self.gravities)
         self._first_world = first_world
         self._known: tuple | None = None
         self._shared: _Shared | None = None
@@ -137,7 +138,7 @@ class SegmentSolver:
 
     def _serves(self, bounds: np.ndarray, time: float, least: float, margin: int) -> bool:
         """Whether the windows for `time` [s] are about as small as those for the time `least`."""
-        reach = fallen(bounds, self.gravities, time)
+        reach = fallen(bounds, self._pull, time)
         long, short = window_of(reach, self.numerics.dx, np.array([time, least])[:, None, None], margin)[1].prod(-1)
         return bool(long.sum() <= short.sum() + SMALL and long.max() <= MAX_NODES)
 
@@ -145,7 +146,7 @@ class SegmentSolver:
         """The windows of the worlds, (W, 3) each, for `time` [s], with room for `margin` nodes more. falls: also for what gravity
         adds to the speeds at the start. Errors: SimulationDiverged as `grid_window`."""
         bounds = self.bounds(state)
-        bounds = fallen(bounds, self.gravities, time) if falls else bounds
+        bounds = fallen(bounds, self._pull, time) if falls else bounds
         x, v = (self._apart(t) for t in state[:2])
         return grid_window(x, v, self.numerics.dx, time, margin, bounds=bounds, name=self._named)
 

@@ -247,8 +247,14 @@ class Stepper:
         for name, part, shape in zip(Poses._fields, poses, ((3,), (3, 3), (3,), (3,)), strict=True):
             if tuple(part.shape) != (*leading, *shape):
                 raise ConfigError(f"poses: {name}: expected shape {(*leading, *shape)}, found {tuple(part.shape)}")
-        poses = [part.to(dtype=numerics.dtype, device=numerics.device) for part in poses]
+        poses = [self._moved(part) for part in poses]
         return tuple(poses if self.worlds is None else (part.flatten(1, 2) for part in poses))
+
+    def _moved(self, part: Tensor) -> Tensor:
+        """In the simulator's type and on its device: one row where it is the same in all."""
+        numerics, same = self.prepared.numerics, part.stride(0) == 0
+        moved = (part[:1] if same else part).to(dtype=numerics.dtype, device=numerics.device)
+        return moved.expand_as(part) if same else moved
 
     def sample(self, moment: Moment, count: int, dt: float, motions: Sequence[Motion | Trajectory], after: int = 0) -> Poses:
         """Poses (S, K, ...) float64 of colliders with these motions at `count` substeps of dt [s] from `after` substeps after
