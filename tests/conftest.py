@@ -1,6 +1,7 @@
 """Shared fixtures: the reference data's place, one thread, CUDA gate, Triton's interpreter."""
 
 import os
+from collections import Counter
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -13,7 +14,20 @@ if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # before Triton is imported: its kernels then run on CPU tensors
 
 
+LONG = ("integration", "experiments", "physics_verification", "analysis")
+"""Folders of whole runs and whole studies, whose files have few tests that take long."""
+
+
+def pytest_configure(config):
+    # xdist would begin with the files of most tests: the last ones, of one long test each, would keep one process alone
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
+
+
 def pytest_collection_modifyitems(items):
+    """The files in the order in which processes take them: whole runs first, then those of most tests."""
+    tests = Counter(item.path for item in items)
+    items.sort(key=lambda item: (item.path.parent.name not in LONG, -tests[item.path], str(item.path)))
     if not torch.cuda.is_available():
         skip = pytest.mark.skip(reason="needs a CUDA device")
         for item in items:
