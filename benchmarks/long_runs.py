@@ -14,7 +14,8 @@ Three parts, side by side where there are GPUs:
 - rollouts: `rollouts` drawn drops of one body in one process, of `frames` frames. 21,600 are a day of them on a CPU, of 4 s each.
   Every hundredth is made twice and compared.
 - equality (with --device cuda): two runs that are given the same, and two with deterministic=true; and what that costs a rollout
-  with and without gradient.
+  with and without gradient. Without it two runs are to agree within what each says that it does not know (`apart`). The first two
+  alone: --parts equality --pairs plain.
 
 One table at the end; exit code 1 where a row is not as asked: figures that differ, a process, half-written file or lock that is
 left, memory, file handles or threads that grow. The launchers are the extra `sweep`; a part whose launcher is not installed fails.
@@ -50,8 +51,14 @@ MARKS = (".partial", ".tmp", ".lock")
 PARTS = ("runs", "rollouts", "equality")
 GROWTH = 20.0
 """MB that a process's memory may differ by after thousands of rollouts: an allocator's pools, not a leak of each."""
+FASTEST = 2.0
+"""[m/s] along each axis, of drawn drops."""
 AGREE = 0.05
-"""Share by which figures of two equal runs on a GPU may differ, where sums are added in any order."""
+"""Share that two equal runs on a GPU, where sums are added in any order, may add to what a run says it does not know, and share by
+which their errors may differ."""
+SPREADS = (2 * ((1 + AGREE) ** 2 - 1)) ** 0.5
+"""Standard deviations that two equal runs may be apart, 0.45: each is then off their middle by that over the root of two, and such
+a scatter of its own widens a standard deviation s to s (1 + SPREADS^2 / 2)^(1/2) = (1 + AGREE) s."""
 
 
 class Row(NamedTuple):
@@ -119,10 +126,15 @@ def told(row: Row) -> Row:
 # -------------------------------------------------------------------------------------------------------------------------- runs
 
 
-def by_themselves(sets: list[list[str]], folder: Path, common: list[str], workers: int) -> list[dict]:
-    """The runs, each in a process of its own, `workers` beside each other; their figures."""
+def by_themselves(sets: list[list[str]], folder: Path, common: list[str], workers: int, within: float) -> list[dict | None]:
+    """The runs, each in a process of its own, `workers` beside each other; their figures, None for one that would have begun after
+    `within` seconds."""
 
-    def one(k: int) -> dict:
+    began = time.perf_counter()
+
+    def one(k: int) -> dict | None:
+        if time.perf_counter() - began > within:
+            return None
         code = started([*common, *sets[k], f"hydra.run.dir={folder}/{k}"], folder / f"{k}.log").wait(900)
         return figures(folder / str(k)) if code == 0 else {"exit code": code}
 
@@ -188,15 +200,17 @@ def killed_sweep(sets: list[list[str]], folder: Path, common: list[str], launche
 def runs(options: argparse.Namespace, folder: Path) -> list[Row]:
     generator, rows = random.Random(options.seed), []
     sets = drawn(options.runs, generator)
-    common = [*SMALL, "simulation.particles=100", f"scene.cache={folder}/cache"]
+    common = [*SMALL, "simulation.particles=100", *options.smaller, f"scene.cache={folder}/cache"]
     (folder / "alone").mkdir()
     began = time.perf_counter()
-    alone = by_themselves(sets, folder / "alone", common, options.workers)
+    alone = by_themselves(sets, folder / "alone", common, options.workers, options.within)
+    sets, alone = [s for s, found in zip(sets, alone) if found is not None], [found for found in alone if found is not None]
     wrong = [k for k, found in enumerate(alone) if "exit code" in found or "metrics.json" in found]
     for k in wrong:
         print(f"run {k} failed: {' '.join(sets[k])}: {(folder / 'alone' / f'{k}.log').read_text()[-1500:]}")
-    rows.append(told(Row(f"{len(sets)} drawn runs, {options.workers} beside each other", "all complete",
-                                 f"{len(sets) - len(wrong)}, {time.perf_counter() - began:.0f} s", not wrong)))  # fmt: skip
+    rows.append(told(Row(f"drawn runs, {options.workers} beside each other", f"{options.runs}, all complete",
+                         f"{len(sets) - len(wrong)} of {len(sets)}, {time.perf_counter() - began:.0f} s",
+                         not wrong and len(sets) == options.runs)))  # fmt: skip
     for launcher, count, kills in (("joblib", len(sets), options.kills), ("submitit_local", options.launched, 1)):
         chosen = sets[:count]
         if not chosen:
@@ -262,7 +276,8 @@ def rollouts(options: argparse.Namespace, folder: Path) -> list[Row]:
     for k in range(options.rollouts):
         if k == max(1, options.rollouts // 10):
             early = {name: count() for name, count in counts.items()}
-        speed, turn = torch.randn(3, generator=generator), torch.randn(4, generator=generator)
+        # one drop in thousands is so fast that it leaves the world's box, and is refused
+        speed, turn = torch.randn(3, generator=generator).clamp(-FASTEST, FASTEST), torch.randn(4, generator=generator)
         height = 0.1 + 0.2 * float(torch.rand(1, generator=generator))
         start = {"rotation": [*turn[:3].tolist(), 90 * float(turn[3])], "height": height, "velocity": speed.tolist(),
                  "frames": options.frames}  # fmt: skip
@@ -294,20 +309,61 @@ def rollouts(options: argparse.Namespace, folder: Path) -> list[Row]:
 # ---------------------------------------------------------------------------------------------------------------------- equality
 
 
-def apart(a: Path, b: Path) -> tuple[list[str], float, float]:
-    """(figures of two runs that differ, the largest relative difference of E, nu and errors, of positions [m])."""
+class Compared(NamedTuple):
+    """A figure of two equal runs. far: how far they are apart in `unit`s of which at most `bound` are allowed."""
+
+    name: str
+    values: str
+    far: float
+    unit: str
+    bound: float
+
+    @property
+    def line(self) -> str:
+        return f"{self.name} {self.values}, {self.far:.3g} {self.unit} apart (bound {self.bound:.2g})"
+
+
+def rms(vectors: np.ndarray) -> float:
+    """Root of the mean square length."""
+    return float(np.sqrt(np.square(vectors).sum(-1).mean()))
+
+
+def arrays(path: Path) -> dict[str, np.ndarray]:
+    if not path.is_file():
+        return {}
+    with np.load(path) as stored:
+        return {key: stored[key] for key in stored.files}
+
+
+def apart(a: Path, b: Path) -> tuple[list[str], list[Compared]]:
+    """(names of the figures and motions of two runs that are not the same bits, what is compared of them, the worst first).
+
+    A number of the law is counted in the standard deviations that the runs' own posterior gives it, a motion in those that it
+    predicts for the positions, an error of positions in that error: relative differences of a number that is near 0 (nu is) would
+    say nothing."""
     one, other = figures(a), figures(b)
     differ = sorted(name for name in {*one, *other} if one.get(name) != other.get(name))
-    compared = [name for name in one if name in ("id/E", "id/nu", "train/rms_m", "test/rms_m", "prior/test/rms_m")]
-    share = max((abs(one[n] - other.get(n, np.inf)) / max(abs(one[n]), 1e-12) for n in compared), default=np.inf)
-    distance = 0.0
+    found: list[Compared] = []
+    for name, key in {"E": "E_relative_sd", "nu": "nu_sd", "stiffness_ratio": "stiffness_ratio_sd"}.items():
+        x, y, sd = one.get(f"id/{name}"), other.get(f"id/{name}"), one.get(f"posterior/{key}")
+        if x is not None and y is not None and sd is not None:
+            sd = sd * x if key == "E_relative_sd" else sd
+            found.append(Compared(name, f"{x:.4g} and {y:.4g}", abs(x - y) / sd, "standard deviations", SPREADS))
+    for name in ("train/rms_m", "test/rms_m", "prior/train/rms_m", "prior/test/rms_m"):
+        if name in one and name in other:
+            x, y = one[name], other[name]
+            found.append(Compared(name, f"{1e3 * x:.2f} and {1e3 * y:.2f} mm", abs(x - y) / x, "of the error", AGREE))
     for name in ("rollout.npz", "prior.npz"):
-        if (a / name).is_file() and (b / name).is_file():
-            with np.load(a / name) as x, np.load(b / name) as y:
-                same = [key for key in x.files if x[key].shape == y[key].shape]
-                differ += [f"{name}:{key}" for key in x.files if key not in same or not np.array_equal(x[key], y[key])]
-                distance = max([distance, *(float(np.abs(x[k] - y[k]).max()) for k in same if k.endswith("/x"))])
-    return differ, share, distance
+        x, y, spread = arrays(a / name), arrays(b / name), arrays(a / "uncertainty.npz")
+        same = [key for key in x if key in y and x[key].shape == y[key].shape]
+        differ += [f"{name}:{key}" for key in {*x, *y} if key not in same or not np.array_equal(x[key], y[key])]
+        for key in same:
+            sd = spread.get(f"{key.removesuffix('/x')}/sd")
+            if name == "rollout.npz" and key.endswith("/x") and sd is not None:
+                far, most = x[key].astype(float) - y[key], float(np.sqrt(np.square(sd).mean()))
+                said = f"{1e3 * rms(far):.2f} mm rms, {1e3 * np.linalg.norm(far, axis=-1).max():.2f} at most"
+                found.append(Compared(f"motion {key}", said, rms(far) / most, "standard deviations", SPREADS))
+    return differ, sorted(found, key=lambda c: -c.far / c.bound)
 
 
 def price(gpu: int | None = None) -> str:
@@ -359,44 +415,54 @@ def timed(exact: bool, device: str = "cuda") -> None:
 
 
 def equality(options: argparse.Namespace, folder: Path) -> list[Row]:
-    """Two pairs of runs, the pairs beside each other so that their times compare."""
+    """Two runs of each kind (`--pairs`), all beside each other so that their times compare."""
     where = ["trainer=gpu"] if options.device != "cpu" else []
     common = [*(options.equal or ["debug=default"]), *where, "evaluation.video=false", "logger=none"]
-    began, pairs = time.perf_counter(), [(exact, k) for exact in (False, True) for k in (0, 1)]
-    short = ["fit.prior.iterations=1", "fit.joint.iterations=0", "fit.prior_eta.iterations=0", "evaluation.floor=false"]
-    # kernels: what it says of itself does not count
-    started([*common, *short, f"scene.cache={folder}/warm_cache", f"hydra.run.dir={folder}/warm"], folder / "warm.log").wait(900)
+    began, pairs = time.perf_counter(), [(kind, k) for kind in options.pairs for k in (0, 1)]
+    if len(options.pairs) > 1:  # kernels: the time to compile them is no price of anything
+        short = ["fit.prior.iterations=1", "fit.joint.iterations=0", "fit.prior_eta.iterations=0", "evaluation.floor=false"]
+        places = [f"scene.cache={folder}/warm_cache", f"hydra.run.dir={folder}/warm"]
+        started([*common, *short, *places], folder / "warm.log").wait(900)
 
-    def one(pair: tuple[bool, int]) -> int:
-        exact, k = pair
-        name = f"{'exact' if exact else 'plain'}_{k}"
+    def one(pair: tuple[str, int]) -> int:
+        name = f"{pair[0]}_{pair[1]}"
         # XDG_CACHE_HOME stays: of kernels; a reconstruction that is found in a cache would be the same without any merit
-        return started([*common, f"deterministic={str(exact).lower()}", f"scene.cache={folder}/{name}_cache",
+        return started([*common, f"deterministic={str(pair[0] == 'exact').lower()}", f"scene.cache={folder}/{name}_cache",
                         f"hydra.run.dir={folder}/{name}"], folder / f"{name}.log").wait(900)  # fmt: skip
 
-    with ThreadPoolExecutor(4) as pool:
+    with ThreadPoolExecutor(len(pairs)) as pool:
         codes = list(pool.map(one, pairs))
     if any(codes):
-        logs = "\n".join((folder / f"{'exact' if e else 'plain'}_{k}.log").read_text()[-1500:] for e, k in pairs)
+        logs = "\n".join((folder / f"{kind}_{k}.log").read_text()[-1500:] for kind, k in pairs)
         return [told(Row("equal runs on a GPU", "complete", f"exit codes {codes}\n{logs}", False))]
-    times = {exact: [json.loads((folder / f"{name}_{k}" / "metrics.json").read_text()) for k in (0, 1)]
-             for exact, name in ((False, "plain"), (True, "exact"))}  # fmt: skip
-    plain, exact = (apart(folder / f"{name}_0", folder / f"{name}_1") for name in ("plain", "exact"))
-    stages = ("reconstruction", "starts", "fit", "evaluation")
-    spent = {key: [sum(found[k].get(f"time/{s}_s", 0.0) for s in stages) for k in (0, 1)] for key, found in times.items()}
-    rows = [
-        Row("two equal runs on a GPU", f"E, nu and errors within {AGREE:.0%}",
-            f"within {plain[1]:.2%}; positions within {1e3 * plain[2]:.3g} mm; {len(plain[0])} figures and arrays are not "
-            f"bit-equal, {time.perf_counter() - began:.0f} s", plain[1] <= AGREE),
-        Row("two with deterministic=true", "all figures and motions bit for bit",
-            f"{len(exact[0])} differ{': ' + ', '.join(exact[0][:6]) if exact[0] else ''}", not exact[0]),
-        Row("price of it: a whole run, four beside each other", "reported",
-            f"{sum(spent[False]) / 2:.0f} -> {sum(spent[True]) / 2:.0f} s "
-            + ", ".join(f"{s} {times[False][0].get(f'time/{s}_s', 0):.0f} -> {times[True][0].get(f'time/{s}_s', 0):.0f}"
-                        for s in stages), True),
-        Row("price of it: a frame of 64 substeps", "reported", price(), True),
-    ]  # fmt: skip
+    rows = []
+    if "plain" in options.pairs:
+        differ, compared = apart(folder / "plain_0", folder / "plain_1")
+        print("two equal runs:\n" + "\n".join(f"  {each.line}" for each in compared), flush=True)
+        asked = f"the law and the motions within {SPREADS:.2f} of their own standard deviations, errors within {AGREE:.0%}"
+        over = [each for each in compared if each.far > each.bound]
+        found = (f"{len(over)} of {len(compared)} beyond; nearest to its bound: {compared[0].line if compared else 'nothing'}; "
+                 f"{len(differ)} figures and arrays are not bit-equal, {time.perf_counter() - began:.0f} s")  # fmt: skip
+        rows.append(Row(f"two equal runs on {options.device}", asked, found, bool(compared) and not over))
+    if "exact" in options.pairs:
+        differ, _ = apart(folder / "exact_0", folder / "exact_1")
+        names = f": {', '.join(differ[:6])}" if differ else ""
+        rows.append(Row("two with deterministic=true", "all figures and motions bit for bit", f"{len(differ)} differ{names}",
+                        not differ))  # fmt: skip
+    if len(options.pairs) > 1:
+        rows += prices(folder)
     return [told(row) for row in rows]
+
+
+def prices(folder: Path) -> list[Row]:
+    """Of deterministic=true: seconds of the runs, two of each kind, and of a frame."""
+    stages = ("reconstruction", "starts", "fit", "evaluation")
+    spent = {kind: np.mean([[json.loads((folder / f"{kind}_{k}" / "metrics.json").read_text()).get(f"time/{stage}_s", 0.0)
+                             for stage in stages] for k in (0, 1)], axis=0) for kind in ("plain", "exact")}  # fmt: skip
+    each = ", ".join(f"{stage} {a:.0f} -> {b:.0f}" for stage, a, b in zip(stages, spent["plain"], spent["exact"]))
+    whole = f"{spent['plain'].sum():.0f} -> {spent['exact'].sum():.0f} s {each}"
+    return [Row("price of it: a whole run, four beside each other", "reported", whole, True),
+            Row("price of it: a frame of 64 substeps", "reported", price(), True)]  # fmt: skip
 
 
 # -------------------------------------------------------------------------------------------------------------------------- main
@@ -418,6 +484,8 @@ def main() -> None:
     parser.add_argument("--device", default="cpu", help="of rollouts and equality: cpu | cuda")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--runs", type=int, default=4)
+    parser.add_argument("--within", type=float, default=1e9, help="seconds after which no further run begins; fewer runs fail")
+    parser.add_argument("--smaller", nargs="+", default=[], metavar="KEY=VALUE", help="further overrides of the drawn runs")
     parser.add_argument("--workers", type=int, default=2, help="runs beside each other")
     parser.add_argument("--kills", type=int, default=2, help="of joblib's sweep; submitit's is killed once")
     parser.add_argument("--between", type=float, nargs=2, default=(15.0, 60.0), help="seconds until a kill")
@@ -427,6 +495,8 @@ def main() -> None:
     parser.add_argument("--particles", type=int, default=100, help="of the body that is rolled out")
     parser.add_argument("--seconds", type=float, default=1e9, help="for rollouts; fewer than asked fail")
     parser.add_argument("--equal", nargs="+", default=None, metavar="KEY=VALUE", help="overrides of the runs that are compared")
+    parser.add_argument("--pairs", nargs="+", choices=("plain", "exact"), default=("plain", "exact"),
+                        help="equality: runs without, with deterministic=true; the price is measured where both run")
     parser.add_argument("--rows", type=Path, default=None, help="write the rows there, as JSON")
     options = parser.parse_args()
     if options.device != "cpu" and not torch.cuda.is_available():

@@ -2,7 +2,7 @@
 
     python benchmarks/robustness.py                     # all groups, about two CPU-minutes
     python benchmarks/robustness.py --only data,npz     # some of them
-    python benchmarks/robustness.py --only cuda         # what a GPU answers otherwise (minutes)
+    python benchmarks/robustness.py --only cuda,gpu_memory  # what a GPU answers otherwise (minutes)
     python benchmarks/robustness.py --runs              # and whole processes: exit codes, a sweep of failures (minutes)
     python benchmarks/robustness.py --only running      # kills, disks, screens, folders, limits (a quarter of an hour or more)
 
@@ -25,7 +25,7 @@ from pathlib import Path
 import attacks_on_calls as calls
 import attacks_on_data as data
 import attacks_on_files as files
-from attacks_on_cuda import cuda
+from attacks_on_cuda import cuda, gpu_memory
 from attacks_on_meaning import MORE
 from attacks_on_running import running
 
@@ -34,9 +34,10 @@ from mosa.errors import MosaError
 GROUPS = {"checkpoints": files.checkpoints, "npz": files.npz, "overrides": calls.overrides, "colliders": calls.colliders,
           "calls": calls.calls, "data": data.data, "meshes": data.meshes, "caches": files.caches, "poses": data.poses,
           "resumed": files.resumed, "runs": calls.runs} | MORE | {"running": running, "cuda": cuda}  # fmt: skip
+GROUPS["gpu_memory"] = gpu_memory
 """Name -> pairs of what is done and a function that does it, in a folder."""
 PATIENCE = 60
-LONGER = {"runs": 300, "cuda": 300, "running": 600}
+LONGER = {"runs": 300, "cuda": 300, "gpu_memory": 300, "running": 600}
 """Seconds until an attack counts as a hang; of whole processes."""
 HEAD = "| group | tried | one clear message | traceback or hang | ran |\n|---|---|---|---|---|"
 

@@ -21,6 +21,7 @@ from mosa.physics.contact.colliders import reach
 from mosa.physics.contact.motion import Poses, exponential, rotation_matrices, rotation_vector
 from mosa.physics.engine.clock import Moment
 from mosa.physics.engine.numerics import State, flat
+from mosa.twin_start import check_wants_no_gradients
 from mosa.types import ParticleState
 
 TWISTS, TARGETS = ("velocity", "angular_velocity"), ("position", "rotation")
@@ -148,6 +149,8 @@ class Episode:
     def step(self, action: Mapping[str, Any] | None = None) -> Stepped:
         """One step on. action: by the names of colliders, see `Twin.step`. Errors: ConfigError naming the collider, before anything
         moves; SimulationDiverged."""
+        if not self.differentiable:
+            check_wants_no_gradients(action=action)
         with self._gradients():
             commands = self._checked(action or {})
             driven = self._driven.clone()

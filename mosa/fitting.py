@@ -21,6 +21,7 @@ from mosa.errors import DataError, MosaError, SimulationDiverged
 from mosa.loggers import build_loggers
 from mosa.modules.learned_numbers import read_numbers
 from mosa.modules.lit_mosa import LitMosa
+from mosa.refused import lacks_memory
 from mosa.run import device_names
 
 
@@ -66,10 +67,12 @@ def fit(cfg, module: LitMosa, data: MultiViewDataModule, folder: Path, device: s
     except SystemExit:  # Lightning's answer to Ctrl-C
         raise KeyboardInterrupt from None
     except torch.linalg.LinAlgError as error:
+        if lacks_memory(error):
+            raise
         raise SimulationDiverged(f"the fit came to numbers that cannot be solved with ({' '.join(str(error).split())[:200]}); "
                                  "check the checkpoint that it goes on from, or lower simulation.courant") from error
     except (ArithmeticError, AttributeError, FileNotFoundError, LookupError, RuntimeError, TypeError, ValueError) as error:
-        if begun or cfg.ckpt_path is None:
+        if begun or cfg.ckpt_path is None or lacks_memory(error):
             raise
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:300]  # Lightning takes its own entries as they are
         raise DataError(f"ckpt_path: {cfg.ckpt_path}: the fit cannot go on from it ({reason})") from error

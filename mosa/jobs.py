@@ -5,7 +5,6 @@ Imported by every process of a sweep, whatever its launcher, through `hydra.call
 
 from __future__ import annotations
 
-import errno
 import fcntl
 import hashlib
 import os
@@ -26,15 +25,13 @@ from omegaconf import DictConfig, OmegaConf
 
 from mosa.commands import fail
 from mosa.errors import ConfigError, MosaError
+from mosa.refused import explained, let_go
 from mosa.screen import outlived
 
 FAILED = "failed"
 """Folder in that of a sweep: one file for each job that ended in an error, named after its number, with the message."""
 LONGEST = 120
 """Bytes of a job's folder name that its overrides may have: a file system takes 255 for the whole of it."""
-DISK = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.EIO, errno.ENOTDIR,
-        errno.EISDIR, errno.EFBIG, errno.EEXIST}  # fmt: skip
-"""What a disk or a folder's rights refuse, which is no mistake of the program."""
 
 
 def folder_name(overrides: str) -> str:
@@ -145,35 +142,6 @@ def terminated(number: int, *_) -> None:
     raise KeyboardInterrupt
 
 
-def disk_message(error: OSError) -> str | None:
-    """One sentence on what the disk refused; None for any other error."""
-    if error.errno in (errno.EMFILE, errno.ENFILE):
-        return f"{error.filename or 'a file'}: cannot be opened ({error.strerror}); allow more of them at once with ulimit -n"
-    if error.errno == errno.ENOENT and isinstance(error.filename, (str, os.PathLike)) and not Path(error.filename).parent.is_dir():
-        return f"{error.filename}: cannot be written or read: its folder has been removed meanwhile; give the command again"
-    if error.errno not in DISK:
-        return None
-    return (f"{error.filename or 'a file'}: cannot be written or read ({error.strerror}); free space, or choose other folders with "
-            "hydra.run.dir= and scene.cache= (eval.py: cache=)")
-
-
-NO_MEMORY = ("can't allocate memory", "out of memory", "Failed to allocate", "Cannot allocate memory", "failed to map segment")
-"""What torch, Warp and the system's loader of libraries say where the machine, or a GPU, has no more: errors of types that are also
-others'."""
-
-
-def memory_message(error: BaseException) -> str | None:
-    """One sentence on memory that there is not, of the machine or of a GPU; None for any other error."""
-    while not isinstance(error, MemoryError) and not any(text in str(error) for text in NO_MEMORY):
-        if (error := error.__cause__ or error.__context__) is None:
-            return None
-    told = " ".join(str(error).split())[:200] or "the machine has no more"
-    if "cuda" in told.lower():
-        return (f"the GPU has no memory left ({told}); stop what else runs there, lower simulation.particles or scene.scale, or "
-                "take trainer=cpu (eval.py and others: device=cpu)")
-    return f"{told}; lower the sizes (simulation.particles, scene.scale)"
-
-
 @contextmanager
 def held(folder: str | Path) -> Iterator[None]:
     """A run's folder as this process's own. The system's lock on it ends with the process, however that ends, and leaves no file.
@@ -247,18 +215,14 @@ def attempted(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> flo
         sys.exit(143 if signal.SIGTERM in signals else 130)
     except MosaError as error:
         message = f"{type(error).__name__}: {error}"
-    except (MemoryError, RuntimeError, ImportError) as error:
-        if (reason := memory_message(error)) is None:
+    except Exception as error:
+        if (message := explained(error, folder)) is None:
             raise
-        message = f"MemoryError: {reason}"
-    except OSError as error:
-        if (reason := disk_message(error)) is None:
-            raise
-        message = f"DataError: {reason}"
     fail(message)
     if HydraConfig.get().mode != RunMode.MULTIRUN:
         sys.exit(2)
     keep(message)
+    let_go()
     return float("inf")
 
 

@@ -42,6 +42,7 @@ from mosa.run import (
     shared_starts,
 )  # fmt: skip
 from mosa.twin import Twin
+from mosa.whole_files import write_whole
 
 log = logging.getLogger(__name__)
 
@@ -145,7 +146,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     if cfg.plan is not None:
         ranked = plan(twin, count=cfg.plan)
         log.info("\n%s", plan_text(ranked))
-        (folder / "plan.md").write_text(plan_text(ranked) + "\n")
+        write_whole(folder / "plan.md", plan_text(ranked) + "\n")
         return -ranked[0].gain
     show(twin.body, cfg.appearance)
     simulate = plain(cfg.simulate)

@@ -21,12 +21,11 @@ from mosa.checkpoints import check_same_run, read_checkpoint
 from mosa.config import plain
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body import Body, Start
+from mosa.refused import LAST
 from mosa.whole_files import written_whole
 
 log = logging.getLogger(__name__)
 
-LAST = Path("checkpoints", "last.ckpt")
-"""In a run's folder."""
 MOST_PARTICLES = {"cpu": 6000, "cuda": 30000}
 """Of simulation.particles=auto: what a machine identifies in the time that a user waits for a first result."""
 SPECIAL = {"Infinity": math.inf, "-Infinity": -math.inf, "NaN": math.nan}

@@ -21,7 +21,7 @@ from mosa.analysis.comparison import ground_lines, on_ground
 from mosa.analysis.figures import side_by_side, to_uint8, write_video
 from mosa.checkpoints import TENSORS, check_kinds, checked, checked_posterior, checked_splats, read_checkpoint
 from mosa.config import build_body, build_world
-from mosa.data.splat_files import check_formats, save_frames
+from mosa.data.splat_files import check_formats, drop_later_frames, save_frames
 from mosa.episode import Episode, Stepped, TwinState
 from mosa.errors import ConfigError, DataError, MosaError
 from mosa.limits import named_device
@@ -37,9 +37,18 @@ from mosa.rollout_file import poses, save_rollout
 from mosa.shown_body import FILE as BODY_FILE
 from mosa.shown_body import save_body
 from mosa.shown_solids import with_solids
-from mosa.twin_start import check_differentiable, check_frames, check_variant, checked_dt, checked_substeps, start_in
+from mosa.twin_start import (
+    check_differentiable,
+    check_frames,
+    check_variant,
+    check_wants_no_gradients,
+    checked_dt,
+    checked_substeps,
+    start_in,
+)
 from mosa.twin_worlds import TwinWorlds
 from mosa.types import Cameras, Rollout
+from mosa.whole_files import written_whole
 
 
 class Twin:
@@ -90,7 +99,6 @@ class Twin:
         others = rival_motions(self.body, self.posterior, lambda: self.simulate(**start).x)
         return rollout, total_spread(torch.stack(found), self.posterior.model_error, among_forms(rollout.x, others))
 
-    @torch.no_grad()
     def simulate(
         self,
         *,
@@ -110,16 +118,17 @@ class Twin:
         of the body's centre, None for a number that is left as it is; height [m] of the lowest point above the ground, in place
         of the position along `up`; velocity [m/s]; angular_velocity [rad/s]; what is left out is taken from the training
         sequence. colliders: rigid solids instead of the world's, or entries as a configuration has them; `reactions` of the result
-        holds the forces on them. No gradients: `reset(differentiable=True)` and `step` have them. Errors: ConfigError naming the
-        argument (also a solid that the body starts in), SimulationDiverged (the body leaves the box of the scene).
+        holds the forces on them. No gradients: `reset(differentiable=True)` and `step` have them, and a tensor that requires them
+        is refused. Errors: ConfigError naming the argument (also a solid that the body starts in), SimulationDiverged (the body
+        leaves the box of the scene).
         """
         check_frames(frames, len(self.body.rest))
         check_variant(variant)
-        start, world = start_in(
-            self.body, self.world, self.training_start, rotation=rotation, height=height, position=position, velocity=velocity,
-            angular_velocity=angular_velocity, colliders=colliders,
-        )  # fmt: skip
-        with tqdm(total=frames - 1, desc="simulate", unit="frame", disable=not progress) as bar:
+        given = {"rotation": rotation, "height": height, "position": position, "velocity": velocity,
+                 "angular_velocity": angular_velocity, "colliders": colliders}  # fmt: skip
+        check_wants_no_gradients(**given)
+        with torch.no_grad(), tqdm(total=frames - 1, desc="simulate", unit="frame", disable=not progress) as bar:
+            start, world = start_in(self.body, self.world, self.training_start, **given)
             model = self.body.model(variant)
             return self.body.simulate(start, world, frames, self.frame_dt, model=model, progress=lambda _: bar.update())
 
@@ -143,15 +152,17 @@ class Twin:
         rotation, height, position, velocity, angular_velocity, colliders, variant: as `simulate`. control_dt [s]: of a step, the
         `frame_dt` of the training by default; substeps: of every step, None for as many as the time step bound asks for in a
         motion of `frames` steps, `simulate(frames=...)`'s. differentiable: whether gradients reach tensors among these arguments
-        (a rotation as a matrix), the actions, and the law's parameters; it keeps states between the passes. Errors: ConfigError.
+        (a rotation as a matrix), the actions, and the law's parameters; it keeps states between the passes. Without it tensors that
+        require gradients are refused. Errors: ConfigError.
         """
         check_frames(frames, len(self.body.rest))
         check_variant(variant)
         check_differentiable(differentiable)
-        start, world = start_in(
-            self.body, self.world, self.training_start, rotation=rotation, height=height, position=position, velocity=velocity,
-            angular_velocity=angular_velocity, colliders=colliders,
-        )  # fmt: skip
+        given = {"rotation": rotation, "height": height, "position": position, "velocity": velocity,
+                 "angular_velocity": angular_velocity, "colliders": colliders}  # fmt: skip
+        if not differentiable:
+            check_wants_no_gradients(**given)
+        start, world = start_in(self.body, self.world, self.training_start, **given)
         self._episode = Episode(
             self.body, world, checked_dt(control_dt, self.frame_dt), start, variant=variant, frames=frames,
             substeps=checked_substeps(substeps), differentiable=differentiable,
@@ -246,14 +257,21 @@ class Twin:
             raise ConfigError(f"export: expected a folder that can be written, found {str(folder)[:100]!r} ({error})") from error
         save_body(folder / BODY_FILE, self.body, self.world)
         save_rollout(folder / "rollout.npz", {"simulation": rollout}, solids)
-        for t, x in enumerate(rollout.x.cpu().numpy()):
-            write_ply(folder / "ply" / f"{t:03d}.ply", x, self.body.colors.cpu().numpy())
+        write_frames(folder / "ply", rollout.x.cpu().numpy(), self.body.colors.cpu().numpy())
         save_frames(seen(self.body, rollout.x, rollout.F_tot), folder / "splats", formats, rate=1 / self.frame_dt, up=self.world.up)
         if video:
             moments = [f"frame {t}, {time:.3f} s" for t, time in enumerate(rollout.times.tolist())]
             frames = side_by_side({title: self.render(rollout, colliders=solids)}, footer=moments)
             write_video(folder / "simulation.mp4", frames, fps=max(5.0, 0.3 / self.frame_dt))
         return folder
+
+
+def write_frames(folder: Path, x: np.ndarray, colors: np.ndarray) -> None:
+    """A PLY for each frame of x (T, N, 3), each whole or not there."""
+    drop_later_frames(folder, ".ply", len(x))
+    for t, points in enumerate(x):
+        with written_whole(folder / f"{t:03d}.ply") as partial:
+            write_ply(partial, points, colors)
 
 
 def write_ply(path: str | Path, points: np.ndarray, colors: np.ndarray) -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
 
 import torch
 from scipy.spatial.transform import Rotation
@@ -56,6 +57,30 @@ def check_differentiable(value: bool) -> None:
     """Errors: ConfigError."""
     if not isinstance(value, bool):
         raise ConfigError(f"differentiable: expected True or False, found {value!r}")
+
+
+def check_wants_no_gradients(**given: Any) -> None:
+    """Nothing among the arguments of a motion without gradients asks for one: it would wait for it in vain, and be told nothing.
+    Errors: ConfigError naming the argument. Under `torch.no_grad()` nothing asks."""
+    if not torch.is_grad_enabled():
+        return
+    for name, value in given.items():
+        if asks_for_gradients(value):
+            raise ConfigError(f"{name}: expected a tensor without gradients, found one that requires them: they come through "
+                              "reset(differentiable=True) and step alone; else pass tensor.detach(), or call it in torch.no_grad()")
+
+
+def asks_for_gradients(value: Any) -> bool:
+    """Whether a tensor does, among lists, entries of a mapping and parts of a collider too."""
+    if isinstance(value, Tensor):
+        return value.requires_grad
+    if isinstance(value, Mapping):
+        return any(map(asks_for_gradients, value.values()))
+    if isinstance(value, (list, tuple)):
+        return any(map(asks_for_gradients, value))
+    if is_dataclass(value) and not isinstance(value, type):
+        return any(asks_for_gradients(getattr(value, field.name)) for field in fields(value))
+    return False
 
 
 def checked_substeps(value: int | None) -> int | None:

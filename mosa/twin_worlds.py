@@ -16,6 +16,7 @@ from mosa.twin_start import (
     check_differentiable,
     check_frames,
     check_variant,
+    check_wants_no_gradients,
     checked_dt,
     checked_substeps,
     numbers,
@@ -51,6 +52,8 @@ class TwinWorlds:
         check_frames(frames, self.count * len(self.body.rest))
         check_variant(variant)
         check_differentiable(differentiable)
+        if not differentiable:
+            check_wants_no_gradients(starts=starts, colliders=colliders, gravity=gravity)
         found = self._found(starts, range(self.count), colliders)
         if gravity is not None:
             gravity = numbers("gravity", gravity, f"finite numbers ({self.count}, 3)")

@@ -20,6 +20,7 @@ from mosa.errors import ConfigError, DataError, MosaError
 from mosa.limits import named_device
 from mosa.live import Live
 from mosa.live_viewer import LiveViewer
+from mosa.refused import explained
 from mosa.twin import Twin
 from mosa.viewing import add_ground, aim, beside_panel, open_server, view_of
 
@@ -230,6 +231,11 @@ def main(arguments: Sequence[str]) -> None:
         viewer = opened(chosen)
     except MosaError as error:
         print(f"\n{type(error).__name__}: {error}", file=sys.stderr)
+        sys.exit(2)
+    except Exception as error:
+        if (reason := explained(error)) is None:
+            raise
+        print(f"\n{reason}", file=sys.stderr)
         sys.exit(2)
     port = viewer.server.get_port()
     if port != int(chosen["port"]):

@@ -33,6 +33,12 @@ def written_whole(path: str | Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
+def write_whole(path: str | Path, text: str) -> None:
+    """A text, as `written_whole` writes; lines end as they are given."""
+    with written_whole(path) as partial:
+        partial.write_bytes(text.encode())
+
+
 def _runs(number: str) -> bool:
     """Whether a process of this machine has that number."""
     try:

@@ -120,3 +120,28 @@ def test_a_calibration_s_table_says_whether_its_posteriors_are_honest(monkeypatc
     *rows, _, last = calibration.table([record, record]).splitlines()
     assert [row.split(" | ")[-3] for row in rows[2:]] == ["2.00", "1.00"] * 2
     assert last.endswith("1.58 (4 numbers)") and len({row.count("|") for row in rows}) == 1
+
+
+def equal_run(folder, *, E: float, nu: float, moved: float, error: float):
+    """What a run leaves, as far as two are compared."""
+    folder.mkdir()
+    figures = {"id/E": E, "id/nu": nu, "posterior/E_relative_sd": 0.1, "posterior/nu_sd": 0.02, "test/rms_m": error}
+    (folder / "metrics.json").write_text(json.dumps(figures | {"time/fit_s": 1.0}))
+    np.savez(folder / "rollout.npz", **{"train/x": np.full((3, 10, 3), moved), "train/v": np.zeros((3, 10, 3))})
+    np.savez(folder / "uncertainty.npz", **{"train/sd": np.full((3, 10), 0.004)})
+    return folder
+
+
+def test_two_equal_runs_are_compared_in_what_they_say_they_do_not_know(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    long_runs = importlib.import_module("long_runs")
+    one = equal_run(tmp_path / "a", E=1e5, nu=0.03, moved=0.0, error=0.01)
+    other = equal_run(tmp_path / "b", E=1.04e5, nu=0.04, moved=0.001, error=0.0102)
+    differ, compared = long_runs.apart(one, other)
+    assert set(differ) == {"id/E", "id/nu", "test/rms_m", "rollout.npz:train/x"}
+    far = {each.name: each.far for each in compared}
+    assert far == pytest.approx({"E": 0.4, "nu": 0.5, "test/rms_m": 0.02, "motion train/x": 0.001 * 3**0.5 / 0.004}, rel=1e-6)
+    assert [each.name for each in compared if each.far > each.bound] == ["nu"] == [compared[0].name]
+    assert long_runs.apart(one, one)[0] == [] and not any(each.far for each in long_runs.apart(one, one)[1])
+    widened = (1 + long_runs.SPREADS**2 / 2) ** 0.5  # of a standard deviation, by two runs that are so far apart
+    assert widened == pytest.approx(1 + long_runs.AGREE)

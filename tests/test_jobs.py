@@ -15,6 +15,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
+from mosa import refused
 from mosa.errors import ConfigError
 from mosa.jobs import LONGEST, Failures, attempt, check_folders, folder_name, held, quoted
 from mosa.npz import write_npz
@@ -103,6 +104,30 @@ def test_what_the_machine_has_not_is_one_message(sweep, capsys, error):
     assert len(said.splitlines()) == 1 and ("simulation.particles" in said or "ulimit -n" in said)
     with pytest.raises(RuntimeError):
         attempt(fail(RuntimeError("another one")), None)
+
+
+def test_an_error_of_a_gpus_libraries_counts_as_memory_where_the_gpu_is_full_alone(sweep, capsys, monkeypatch):
+    """Warp raises a plain Exception for a module that finds no room, cuBLAS says that it is not initialised."""
+    for error in (Exception("Failed to load CUDA module 'p2g'"), RuntimeError("CUDA error: CUBLAS_STATUS_NOT_INITIALIZED")):
+        monkeypatch.setattr(refused, "gpu_memory", lambda: (0.2e9, 150e9))
+        attempt(fail(error), None)
+        assert "the GPU has no memory left" in capsys.readouterr().err
+        for room in (None, (60e9, 150e9)):
+            monkeypatch.setattr(refused, "gpu_memory", lambda r=room: r)
+            with pytest.raises(type(error)):
+                attempt(fail(error), None)
+    monkeypatch.setattr(refused, "gpu_memory", lambda: (0.2e9, 150e9))
+    with pytest.raises(ZeroDivisionError):  # a mistake of the program stays one, full as the GPU may be
+        attempt(lambda _: 1 / 0, None)
+
+
+def test_a_message_about_memory_names_the_checkpoint_that_is_kept(tmp_path):
+    assert refused.explained(MemoryError(), tmp_path) == refused.explained(MemoryError())
+    (tmp_path / refused.LAST).parent.mkdir()
+    (tmp_path / refused.LAST).write_text("")
+    assert f"the fit is kept in {tmp_path / refused.LAST}" in refused.explained(MemoryError(), tmp_path)
+    assert refused.explained(ValueError("x"), tmp_path) is None
+    assert "simulation.particles" in refused.explained(OSError(errno.ENOMEM, os.strerror(errno.ENOMEM)))
 
 
 def test_a_long_name_is_cut_and_stays_its_own():

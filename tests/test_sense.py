@@ -14,8 +14,8 @@ from mosa.commands.experiment import arguments, run
 from mosa.environments.arena import simulator_named
 from mosa.environments.tasks import TASKS, task_named
 from mosa.errors import ConfigError, DataError, MosaError
-from mosa.jobs import memory_message
 from mosa.limits import named_device
+from mosa.refused import memory_message
 from mosa.twin import Twin
 from mosa.viewer import options
 from mosa.viewing import open_server

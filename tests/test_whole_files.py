@@ -4,9 +4,13 @@ import errno
 import os
 import subprocess
 import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
 
+import mosa.twin
+from mosa.twin import write_frames
 from mosa.whole_files import written_whole
 
 
@@ -48,3 +52,22 @@ def test_a_disk_that_fills_up_is_said_with_the_file(tmp_path):
     with pytest.raises(OSError, match=r"No space left on device: '.*a\.npz'") as caught, written_whole(tmp_path / "a.npz"):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert caught.value.filename == str(tmp_path / "a.npz") and not list(tmp_path.iterdir())
+
+
+def test_frames_of_an_export_are_whole_and_of_this_motion_alone(tmp_path, monkeypatch):
+    """A shorter motion in the folder of a longer one would be played on into that one."""
+    x, colors = np.zeros((5, 4, 3)), np.full((4, 3), 0.5)
+    (tmp_path / "notes.ply").write_text("mine")
+    write_frames(tmp_path, x, colors)
+    write_frames(tmp_path, x[:3] + 1, colors)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["000.ply", "001.ply", "002.ply", "notes.ply"]
+    before = (tmp_path / "001.ply").read_bytes()
+
+    def full(path, *_):
+        Path(path).write_bytes(before[:20])
+        raise OSError(errno.ENOSPC, "full")
+
+    monkeypatch.setattr(mosa.twin, "write_ply", full)
+    with pytest.raises(OSError, match="full"):
+        write_frames(tmp_path, x[:3], colors)
+    assert (tmp_path / "000.ply").read_bytes() == before and not list(tmp_path.glob("*.partial"))

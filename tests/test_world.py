@@ -111,3 +111,37 @@ def test_a_start_is_put_beside_where_the_training_was():
     for wrong in ([0.1, 0.2], "here", [0.0, float("inf"), 0.0], [True, 0.0]):
         with pytest.raises(ConfigError, match="position: expected three finite numbers"):
             made.simulate(position=wrong)
+
+
+@pytest.mark.parametrize(("given", "named"), [
+    ({"velocity": torch.zeros(3, requires_grad=True)}, "velocity"),
+    ({"position": [torch.tensor(0.1, requires_grad=True), 0.4, 0.0]}, "position"),
+    ({"rotation": torch.eye(3).requires_grad_()}, "rotation"),
+    ({"colliders": [{"type": "sphere", "radius": 0.1, "position": torch.ones(3).requires_grad_()}]}, "colliders"),
+])  # fmt: skip
+def test_a_tensor_that_waits_for_gradients_is_not_left_without(given, named):
+    """The motion came without them, and whoever asked for them was told nothing."""
+    falling = twin()
+    for begin in (lambda: falling.simulate(frames=2, **given), lambda: falling.reset(frames=2, **given)):
+        with pytest.raises(ConfigError, match=rf"^{named}: expected a tensor without gradients.*reset\(differentiable=True\)"):
+            begin()
+    started = {k: v for k, v in given.items() if k != "colliders"}
+    with pytest.raises(ConfigError, match="expected a tensor without gradients"):
+        falling.worlds(2).reset(started, colliders=given.get("colliders"), frames=2)
+
+
+def test_gradients_that_nobody_asks_for_are_no_mistake():
+    falling, velocity = twin(), torch.zeros(3, requires_grad=True)
+    plain = falling.simulate(velocity=velocity.detach(), frames=2).x
+    with torch.no_grad():
+        assert torch.equal(falling.simulate(velocity=velocity, frames=2).x, plain)
+    assert not plain.requires_grad
+    paddle = {"type": "sphere", "name": "paddle", "radius": 0.02, "position": [0.5, 0.5, 0.5]}
+    falling.reset(frames=2, colliders=[paddle])
+    push = torch.zeros(3, requires_grad=True)
+    with pytest.raises(ConfigError, match="action: expected a tensor without gradients"):
+        falling.step({"paddle": {"velocity": push}})
+    falling.step({"paddle": {"velocity": push.detach()}})
+    falling.reset(frames=2, velocity=velocity, colliders=[paddle], differentiable=True)
+    state, _ = falling.step({"paddle": {"velocity": push}})
+    assert torch.autograd.grad(state.positions.sum(), velocity)[0].abs().max() > 0

@@ -39,6 +39,7 @@ from mosa.config import plain
 from mosa.errors import ConfigError, DataError
 from mosa.guards import check_capture
 from mosa.progress import tqdm
+from mosa.whole_files import write_whole
 
 log = logging.getLogger(__name__)
 
@@ -110,7 +111,7 @@ def capture(values: Mapping[str, Any]) -> dict[str, Any]:
         centres = centres - [0, height, 0]
         write_transforms(folder, phones, times, world)
     found = figures(values, phones, clips, tracks, fall, free, knowledge, world, times, centres, radius, floor, gains)
-    (folder / FILE).write_text(json.dumps(found, indent=1))
+    write_whole(folder / FILE, json.dumps(found, indent=1))
     write_report(folder, found, phones, fall, exposures, world, times)
     for line in found["warnings"]:
         log.warning("warning: %s", line)

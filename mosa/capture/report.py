@@ -16,6 +16,7 @@ from mosa.capture.fall import Fall
 from mosa.capture.phones import Phone
 from mosa.capture.resampling import Exposure
 from mosa.capture.world import World
+from mosa.whole_files import write_whole
 
 TILE = 180
 """[px] height of a picture on the contact sheet."""
@@ -34,7 +35,7 @@ def write_report(
     """capture.md, contact.png and fall.png into the folder."""
     cv2.imwrite(str(folder / "contact.png"), contact_sheet(folder, [phone.name for phone in phones], len(times)))
     draw_fall(folder / "fall.png", phones, fall, exposures, world)
-    (folder / "capture.md").write_text(page(found))
+    write_whole(folder / "capture.md", page(found))
 
 
 def page(found: dict[str, Any]) -> str:

@@ -17,6 +17,7 @@ from mosa.data.footage import OPENGL_TO_OPENCV, Footage, matrix, number, read_js
 from mosa.data.transforms import read_transforms
 from mosa.errors import DataError
 from mosa.reconstruction.hull import occupancy
+from mosa.whole_files import write_whole
 
 FILE = "capture.json"
 REACH, PITCH = 2.2, 1 / 20
@@ -114,7 +115,7 @@ def write_transforms(folder: Path, phones: list[Phone], times: np.ndarray, world
                 "camera_model": "OPENCV_FISHEYE" if camera.fisheye else "OPENCV",
             })  # fmt: skip
     file = folder / "transforms.json"
-    file.write_text(json.dumps({"frames": entries}, indent=1))
+    write_whole(file, json.dumps({"frames": entries}, indent=1))
     return file
 
 

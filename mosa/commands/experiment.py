@@ -11,7 +11,7 @@ from pathlib import Path
 
 from mosa.commands import configuration
 from mosa.errors import ConfigError, MosaError
-from mosa.jobs import disk_message
+from mosa.refused import explained
 from mosa.screen import outlived
 
 RESULTS = Path("docs/results")
@@ -59,10 +59,10 @@ def code_of(words: list[str] | None) -> int:
     except MosaError as error:
         print(f"\n{type(error).__name__}: {error}", file=sys.stderr)
         code = 2
-    except OSError as error:
-        if (reason := disk_message(error)) is None:
+    except Exception as error:
+        if (reason := explained(error)) is None:
             raise
-        print(f"\nDataError: {reason}", file=sys.stderr)
+        print(f"\n{reason}", file=sys.stderr)
         code = 2
     except KeyboardInterrupt:
         print("\nstopped; the same command goes on from here", file=sys.stderr)

@@ -6,6 +6,7 @@ turned with the body, and a factor of the colours becomes part of the harmonics,
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -114,8 +115,9 @@ def save_usd(path: str | Path, frames: Sequence[Appearance], *, rate: float, up:
                           "itself") from error
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.unlink(missing_ok=True)
-    stage = Usd.Stage.CreateNew(str(path))
+    unfinished = path.with_name(f"{path.stem}.{os.getpid()}.partial{path.suffix}")  # USD tells its format by the name
+    unfinished.unlink(missing_ok=True)
+    stage = Usd.Stage.CreateNew(str(unfinished))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z if int(up.abs().argmax()) == 2 else UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     stage.SetTimeCodesPerSecond(rate)
@@ -135,6 +137,8 @@ def save_usd(path: str | Path, frames: Sequence[Appearance], *, rate: float, up:
         reach = 3 * splats.scales.amax()
         field.GetExtentAttr().Set(vectors(torch.stack([splats.means.amin(0) - reach, splats.means.amax(0) + reach])), t)
     stage.Save()
+    with written_whole(path) as partial:
+        os.replace(unfinished, partial)
     return path
 
 
@@ -144,6 +148,13 @@ def check_formats(formats: Sequence[str]) -> None:
         raise ConfigError(f"formats: expected some of {', '.join(FORMATS)}, found {unknown[0]!r}")
 
 
+def drop_later_frames(folder: Path, suffix: str, count: int) -> None:
+    """What a longer motion left in the folder before: a viewer would go on from this one into it."""
+    for old in folder.glob(f"*{suffix}"):
+        if old.stem.isdecimal() and int(old.stem) >= count:
+            old.unlink()
+
+
 def save_frames(shown: Seen, folder: str | Path, formats: Sequence[str], *, rate: float = 30.0, up: Tensor | None = None) -> Path:
     """Write every frame of moving Gaussians: `<folder>/ply/000.ply`, `splat/000.splat`, `spz/000.spz`, and `splats.usdc` for all.
 
@@ -151,6 +162,8 @@ def save_frames(shown: Seen, folder: str | Path, formats: Sequence[str], *, rate
     """
     check_formats(formats)
     folder, frames = Path(folder), []
+    for kind in ("ply", "splat", "spz"):
+        drop_later_frames(folder / kind, f".{kind}", len(shown.means))
     for t in range(len(shown.means)):
         frame = splats_at(shown, t)
         if "ply" in formats:

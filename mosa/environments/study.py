@@ -25,6 +25,7 @@ from mosa.environments.policies import Found, LinearPolicy, Search, by_elites, b
 from mosa.environments.task import Task
 from mosa.environments.tasks import task_named
 from mosa.errors import ConfigError, DataError
+from mosa.whole_files import write_whole, written_whole
 
 log = logging.getLogger(__name__)
 
@@ -321,8 +322,8 @@ def write_table(
     ]  # fmt: skip
     folder.mkdir(parents=True, exist_ok=True)
     page = folder / f"{task.name}.md"
-    page.write_text("\n\n".join(text) + "\n")
-    with open(folder / f"{task.name}.csv", "w", newline="") as file:
+    write_whole(page, "\n\n".join(text) + "\n")
+    with written_whole(folder / f"{task.name}.csv") as partial, open(partial, "w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["task", "trained_in", "seed", "tested_in", "trial", "success", "loss"])
         for (name, seed), record in sorted(records.items()):
@@ -353,7 +354,7 @@ def put_into(page: Path, table: Path, task: str) -> None:
     if not found or not closed:
         raise DataError(f"page: {page}: expected a line '{begin.strip()}' and after it a line '{end}', found none")
     content = table.read_text().split("\n", 2)[2]
-    page.write_text(f"{head}{begin}{content}{end}{tail}")
+    write_whole(page, f"{head}{begin}{content}{end}{tail}")
 
 
 def _mean(counts: Sequence[int], trials: int) -> str:

@@ -27,6 +27,7 @@ from mosa.experiments.specification import Experiment
 from mosa.modules.body import Body
 from mosa.modules.material import material_states
 from mosa.twin import Twin
+from mosa.whole_files import written_whole
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +45,7 @@ def prefix(record: Record) -> str:
 
 
 def write_table(path: Path, header: Sequence[str], rows: Sequence[Sequence]) -> None:
-    with open(path, "w", newline="") as file:
+    with written_whole(path) as partial, open(partial, "w", newline="") as file:
         csv.writer(file).writerows([header, *rows])
 
 

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure as Canvas
 
 from mosa.experiments.collecting import Cell
 from mosa.experiments.specification import Experiment
+from mosa.whole_files import written_whole
 
 Tables = Mapping[str, Mapping[str, Mapping[str, Cell | None]]]
 
@@ -18,8 +19,10 @@ Tables = Mapping[str, Mapping[str, Mapping[str, Cell | None]]]
 def save(canvas: Canvas, stem: Path) -> Path:
     """<stem>.png and .pdf; the path of the first."""
     with matplotlib.rc_context({"pdf.fonttype": 42}):
-        canvas.savefig(stem.with_suffix(".pdf"), bbox_inches="tight", metadata={"CreationDate": None})
-        canvas.savefig(stem.with_suffix(".png"), dpi=150, bbox_inches="tight", metadata={"Software": None})
+        with written_whole(stem.with_suffix(".pdf")) as partial:
+            canvas.savefig(partial, format="pdf", bbox_inches="tight", metadata={"CreationDate": None})
+        with written_whole(stem.with_suffix(".png")) as partial:
+            canvas.savefig(partial, format="png", dpi=150, bbox_inches="tight", metadata={"Software": None})
     return stem.with_suffix(".png")
 
 

@@ -15,7 +15,7 @@ from mosa.errors import ConfigError, DataError
 from mosa.experiments.collecting import Cell
 from mosa.experiments.printed import printed_table
 from mosa.experiments.specification import Claim, Experiment, Figure, load_experiment
-from mosa.whole_files import written_whole
+from mosa.whole_files import write_whole, written_whole
 
 Tables = Mapping[str, Mapping[str, Mapping[str, Cell | None]]]
 NOT_RUN = "not run"
@@ -73,7 +73,7 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
         if about["provenance"]:
             parts.append(f"All of it: [{name}.md]({results.name}/{name}.md). " + "; ".join(about["provenance"]) + ".")
     page = results.parent / "results.md"
-    page.write_text("\n\n".join(parts) + "\n")
+    write_whole(page, "\n\n".join(parts) + "\n")
     return page
 
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mosa.experiments.specification import MINUTES, Job
+from mosa.whole_files import write_whole
 
 PROGRAM = "from mosa.commands.train import main; main()"
 WAIT = 0.2
@@ -44,7 +45,7 @@ def run_jobs(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: i
                 outcome = "failed" if job.folder.name in failed else "complete"
                 minutes = (time.perf_counter() - began) / 60
                 if outcome == "complete":
-                    (job.folder / MINUTES).write_text(f"{minutes:.3f}\n")
+                    write_whole(job.folder / MINUTES, f"{minutes:.3f}\n")
                 print(f"[{done}/{total}] {job.folder.name}: {outcome} after {minutes:.1f} min", flush=True)
             making = {job.first for job, _, _ in running.values() if not reconstructed(job)} - known
             ready = next((job for job in waiting if job.first not in making), None)

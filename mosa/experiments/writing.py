@@ -16,6 +16,7 @@ from mosa.experiments.drawing import draw, save
 from mosa.experiments.page import write_json
 from mosa.experiments.printed import printed_table
 from mosa.experiments.specification import Experiment, Figure, Job, minutes_taken
+from mosa.whole_files import write_whole, written_whole
 
 
 def write_results(experiment: Experiment, jobs: Sequence[Job], folder: Path, command: str) -> Path:
@@ -27,7 +28,7 @@ def write_results(experiment: Experiment, jobs: Sequence[Job], folder: Path, com
     tables = {figure.label: table(experiment, records, figure) for figure in experiment.figures}
     name = experiment.name + ("_quick" if experiment.quick else "")
     write_csv(folder / f"{name}.csv", experiment, records)
-    (folder / f"{name}.tex").write_text(latex(experiment, tables))
+    write_whole(folder / f"{name}.tex", latex(experiment, tables))
     pictures = []
     if experiment.plot is not None and (figure := draw(experiment, tables)) is not None:
         pictures.append(save(figure, folder / name))
@@ -37,8 +38,8 @@ def write_results(experiment: Experiment, jobs: Sequence[Job], folder: Path, com
         pictures += more
     page = folder / f"{name}.md"
     lines = provenance(experiment, jobs, records, command)
-    page.write_text(markdown_page(experiment, jobs, tables, pictures, extra, lines))
     write_json(folder / f"{name}.json", tables, extra, lines, pictures)
+    write_whole(page, markdown_page(experiment, jobs, tables, pictures, extra, lines))
     return page
 
 
@@ -117,7 +118,7 @@ def commit() -> str:
 
 def write_csv(path: Path, experiment: Experiment, records: Sequence[Record]) -> None:
     """One line for each cell, seed and figure, in the unit of metrics.json times `scale`; empty where it is missing."""
-    with open(path, "w", newline="") as file:
+    with written_whole(path) as partial, open(partial, "w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow([*experiment.axes, "seed", "label", "figure", "value", "run"])
         for record in records:

@@ -1,7 +1,9 @@
 """The harness of the paper's tables: files that compose, jobs made once, tables of made-up figures, and one experiment for real."""
 
+import errno
 import json
 import math
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +13,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from mosa import whole_files
 from mosa.commands.experiment import arguments, run, shown
 from mosa.config import rehearse
 from mosa.errors import ConfigError, DataError
@@ -301,6 +304,29 @@ def test_every_kind_of_picture_is_drawn_also_where_cells_are_missing(tmp_path, p
     found, jobs = made_up(tmp_path / "runs")
     write_results(replace(found, plot=plot), jobs, tmp_path / "results", "")
     assert (tmp_path / "results" / "made.png").is_file() == (plot is not None)
+
+
+def test_results_that_cannot_be_written_leave_the_ones_before(tmp_path, monkeypatch):
+    """A full disk in the middle of each file in turn: the old file stands, and nothing half-written beside it."""
+    found, jobs = made_up(tmp_path / "runs")
+    results = tmp_path / "results"
+    write_results(found, jobs, results, "the first command")
+    before = {file.name: file.read_bytes() for file in results.iterdir()}
+    assert {"made.csv", "made.tex", "made.md", "made.json", "made.png", "made.pdf"} <= set(before)
+    replace_file = os.replace
+    for name in before:
+        now = (results / name).read_bytes()
+
+        def full(source, target, name=name):
+            if Path(target).name == name:
+                raise OSError(errno.ENOSPC, "full")
+            replace_file(source, target)
+
+        monkeypatch.setattr(whole_files.os, "replace", full)
+        with pytest.raises(OSError, match="full"):
+            write_results(found, jobs, results, "the second command")
+        assert (results / name).read_bytes() == now
+        assert {file.name for file in results.iterdir()} == set(before)
 
 
 def test_nothing_complete_is_a_page_without_figures(tmp_path):
