@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mosa.capture.alignment import centres_at, coarse_offsets
 from mosa.capture.fall import SCANS, Fall, Knowledge, fit_fall
+from mosa.capture.impact import through_impact
 from mosa.capture.mattes import Matting, Track, follow, matting_of
 from mosa.capture.outline import corrected, radius_of
 from mosa.capture.phones import Phone
@@ -179,6 +180,7 @@ def found_fall(
             log.warning("warning: the mattes have no common hull in the free fall: poses, or mattes, are off")
             break
         fall = fit_fall(phones, better, fall.offsets, knowledge, fall.window if flight is None else flight)
+        fall = through_impact(phones, better, fall, knowledge)
     return fall
 
 
