@@ -26,7 +26,7 @@ STEP = 0.006
 OUTLINE = 0.016
 """Radii by which the outline of a body that deforms is off from the common path, in the picture of one phone."""
 BEND = 0.3
-"""Radii of change in the curve's third differences from knot to knot: one standard deviation. A collision at 20 m/s is within it."""
+"""Radii of change in the curve's third differences from knot to knot, one standard deviation: collisions at 20 m/s are within."""
 LEAST = 4
 """Frames of each phone after the free fall, below which there is no impact to be seen."""
 
@@ -86,20 +86,21 @@ class Impact(Problem):
 
 
 def through_impact(phones: list[Phone], tracks: list[Track], fall: Fall, knowledge: Knowledge) -> Fall:
-    """The fall with clocks, readouts and a path that are the impact's too; as it is where some phone does not see what followed.
+    """The fall with clocks and a path that are the impact's too; as it is where some phone does not see what followed.
 
-    Scale and down stay those of the free flight alone: what is read of a collision pulls at the parabola's bend, of the scale of a
-    rigid body by more than a percent.
+    Scale, down and readouts stay those of the free flight alone: what is read of a collision pulls at the parabola's bend, of the
+    scale of a rigid body by more than a percent, of the readouts by two milliseconds.
     """
-    problem = Impact(phones, tracks, fall, knowledge)
+    readouts = {phone.name: float(readout) for phone, readout in zip(phones, fall.readouts)}
+    problem = Impact(phones, tracks, fall, replace(knowledge, readout=readouts))
     if not problem.seen:
         return fall
     solution = problem.solve(problem.begin(), fall.noise)
-    (position, velocity, acceleration), offsets, readouts, shifts = problem.parts(solution.x)
+    (position, velocity, acceleration), offsets, _, shifts = problem.parts(solution.x)
     data = np.concatenate([miss.ravel() for miss in problem.misses(solution.x)]) / fall.noise
     covariance = np.linalg.pinv(solution.jac.T @ solution.jac) * max(1.0, float(np.square(data).mean()))
     sd, V = np.sqrt(np.diag(covariance)), len(phones)
     return replace(
-        fall, position=position, velocity=velocity, acceleration=acceleration, offsets=offsets, readouts=readouts, shifts=shifts,
-        offsets_sd=np.concatenate([[0.0], sd[9 : 8 + V]]), readouts_sd=sd[8 + V : 8 + 2 * V],
+        fall, position=position, velocity=velocity, acceleration=acceleration, offsets=offsets, shifts=shifts,
+        offsets_sd=np.concatenate([[0.0], sd[9 : 8 + V]]),
     )  # fmt: skip
