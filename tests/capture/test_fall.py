@@ -116,15 +116,15 @@ def test_a_beginning_that_may_still_hang_is_left_out():
 
 
 def test_an_impact_is_one_moment_for_phones_whose_poses_are_a_little_off(made):
-    """Focal lengths off by 0.4 %, which in a fall alone pass for clocks."""
+    """Focal lengths off by 0.8 %, which in a fall alone pass for clocks."""
     films, phones, tracks, offsets = made
     knowledge = Knowledge(gravity=G)
-    off = [replace(p, camera=replace(p.camera, K=p.camera.K @ np.diag([f, f, 1]))) for p, f in zip(phones, (1.004, 0.996) * 3)]
+    off = [replace(p, camera=replace(p.camera, K=p.camera.K @ np.diag([f, f, 1]))) for p, f in zip(phones, (1.008, 0.992) * 3)]
     fall = fit_fall(off, tracks, offsets, knowledge)
     better = through_impact(off, tracks, fall, knowledge)
     true = np.array([film.begin for film in films]) - films[0].begin
     before, after = (float(np.std(found.offsets - true)) for found in (fall, better))
-    assert after < 0.6 * before and after < 0.5e-3, (before, after)
+    assert after < 0.5 * before and before > 0.4e-3, (before, after)
 
 
 def test_without_an_impact_the_fall_stays_as_it_is(made):
