@@ -138,17 +138,16 @@ def rough_window(
 
 class Problem:
     """Residuals of a window. Numbers: position, velocity, acceleration in units of depth, then per phone offset (but the first's),
-    readout, shift."""
+    readout, shift. until [s]: end of the frames that are read, of the window's where None."""
 
-    def __init__(self, phones, tracks, offsets, window, knowledge: Knowledge):
+    def __init__(self, phones, tracks, offsets, window, knowledge: Knowledge, until: float | None = None):
         self.phones, self.knowledge, self.window = phones, knowledge, window
+        end = window[1] if until is None else until
         self.origin = 0.5 * (window[0] + window[1])
         self.start = offsets
         self.times, self.pixels, self.shares, self.sigma, self.frames = [], [], [], [], []
         for phone, track, offset in zip(phones, tracks, offsets):
-            inside = np.flatnonzero(
-                track.seen & (track.times + offset >= window[0] - 1e-9) & (track.times + offset <= window[1] + 1e-9)
-            )
+            inside = np.flatnonzero(track.seen & (track.times + offset >= window[0] - 1e-9) & (track.times + offset <= end + 1e-9))
             self.frames.append(inside)
             self.times.append(track.times[inside])
             self.pixels.append(track.centres[inside])
@@ -175,15 +174,20 @@ class Problem:
         motion = numbers[:9].reshape(3, 3) * self.depth
         offsets = self.start + np.concatenate([[0.0], numbers[9 : 8 + V]])
         readouts = numbers[8 + V : 8 + 2 * V]
-        return motion, offsets, readouts, numbers[8 + 2 * V :].reshape(V, 2)
+        return motion, offsets, readouts, numbers[8 + 2 * V : 8 + 4 * V].reshape(V, 2)
+
+    def path(self, numbers: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """(n, 3) of the centre, times (n,) [s] counted from the origin."""
+        position, velocity, acceleration = self.parts(numbers)[0]
+        return position + velocity * times[:, None] + 0.5 * acceleration * times[:, None] ** 2
 
     def misses(self, numbers: np.ndarray) -> list[np.ndarray]:
         """Per phone (n, 2) [px]: seen minus expected."""
-        motion, offsets, readouts, shifts = self.parts(numbers)
+        _, offsets, readouts, shifts = self.parts(numbers)
         found = []
         for v, phone in enumerate(self.phones):
             t = self.times[v] + offsets[v] + readouts[v] * self.shares[v] - self.origin
-            points = motion[0] + motion[1] * t[:, None] + 0.5 * motion[2] * t[:, None] ** 2
+            points = self.path(numbers, t)
             expected = phone.camera.project(points) if len(points) else np.zeros((0, 2))
             found.append(self.pixels[v] - expected - shifts[v])
         return found

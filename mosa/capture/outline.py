@@ -87,3 +87,21 @@ def corrected(phones: list[Phone], tracks: list[Track], fall: Fall, knowledge: K
         t = np.clip(track.times + fall.offsets[v], *fall.window) - fall.origin
         found.append(replace(track, centres=track.centres - (curve[0] * t[:, None] ** 2 + curve[1] * t[:, None] + curve[2])))
     return found
+
+
+def without_common(phones: list[Phone], fall: Fall) -> np.ndarray:
+    """(V, 2) [px] by which phones see the body beside the fall, less what a shift of the body as a whole would explain best: that
+    belongs to the fall, and would move the body against the floor."""
+    step = 1e-4 * float(np.linalg.norm(phones[0].camera.centre - fall.position))
+    moved = [[(phone.camera.project((fall.position + step * axis)[None]) - phone.camera.project(fall.position[None]))[0] / step
+              for axis in np.eye(3)] for phone in phones]  # fmt: skip
+    matrix = np.array(moved).transpose(0, 2, 1).reshape(-1, 3)
+    shifts = fall.shifts.ravel()
+    return (shifts - matrix @ np.linalg.lstsq(matrix, shifts, rcond=None)[0]).reshape(-1, 2)
+
+
+def shifted(phone: Phone, shift: np.ndarray) -> Phone:
+    """A phone whose picture of everything lies shift (2,) [px] further on: to first order one that is turned by a little."""
+    K = phone.camera.K.copy()
+    K[:2, 2] += shift
+    return replace(phone, camera=replace(phone.camera, K=K))
