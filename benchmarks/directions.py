@@ -16,7 +16,6 @@ reconstruction. `draw` makes the figure and the page of all that was fitted.
 from __future__ import annotations
 
 import json
-import platform
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -40,6 +39,7 @@ from mosa.experiments.writing import commit
 from mosa.modules.body import Body
 from mosa.modules.lit_mosa import LitMosa
 from mosa.prediction import determined
+from mosa.run import device_label
 
 TWIN = "_twin"
 """At the end of a name: the same body without fibres and with one stiffness everywhere."""
@@ -136,13 +136,14 @@ def fit(path: Path, particles: int, more: list[str], seed: int, noise: float, de
         joint = module.identifying(module.stages[-1])
         fits.iterated(joint, module.stages[-1].iterations)
         posterior = joint.posterior()
+    learned_mm, body = away(), body.cpu()
     print(f"  {path.stem}: learned after {time.perf_counter() - began:.0f} s", flush=True)
     angles, n = in_plane(truth.material, 37)
     true, learned, w = true_modulus(path.stem.removesuffix(TWIN), "isotropic" if path.stem.endswith(TWIN) else "anisotropic", n), \
         learned_modulus(body, n).detach(), redistribution(body, n)  # fmt: skip
     record = {
         "body": path.stem, "method": "black box" if black_box else "ours", "set": more, "particles": len(body.rest), "seed": seed,
-        "noise": noise, "prior_mm": prior_mm, "learned_mm": away(), "degrees": torch.rad2deg(angles).tolist(),
+        "noise": noise, "prior_mm": prior_mm, "learned_mm": learned_mm, "degrees": torch.rad2deg(angles).tolist(),
         "E_along": learned.tolist(), "true_E_along": true.tolist(), "E_off_largest": float((learned / true - 1).abs().max()),
         "w": w.detach().tolist(), "w_range": float(w.max() - w.min()), "fibre_deg": None, "cone_deg": None,
     } | {name: float(value.detach()) for name, value in body.material.physical().items()}  # fmt: skip
@@ -159,7 +160,8 @@ def fit(path: Path, particles: int, more: list[str], seed: int, noise: float, de
         record["plates"] = {"degrees": torch.rad2deg(angles).tolist(), "true": compared(reference, reference)["E"],
                             "prior": compared(pressed_modulus(body, "prior", n), reference),
                             "learned": compared(pressed_modulus(body, "adapted", n), reference)}  # fmt: skip
-    return record | {"seconds": time.perf_counter() - began, "commit": commit()}
+    return record | {"seconds": time.perf_counter() - began, "commit": commit(),
+                     "machine": device_label(device)}
 
 
 HEADS = ("body", "law", "particles", "rms [mm]", "largest error of E [%]", "largest less smallest w", "stiffest over softest",
@@ -224,7 +226,7 @@ def draw(records: list[dict], folder: Path) -> None:
         "- command: `python benchmarks/directions.py make`, `fit --plates` (`--black-box`) and `draw`",
         f"- version {mosa.__version__}, commit {', '.join(sorted({r['commit'] for r in records}))}",
         f"- seed {', '.join(sorted({str(r['seed']) for r in records}))}; error of the motion: "
-        f"{100 * records[0]['noise']:.1f} % of the height; Python {platform.python_version()}, on a CPU", ""]))  # fmt: skip
+        f"{100 * records[0]['noise']:.1f} % of the height; {', '.join(sorted({r['machine'] for r in records}))}", ""]))  # fmt: skip
 
 
 def main() -> None:
