@@ -34,8 +34,8 @@ from mosa.analysis.tables import markdown
 from mosa.data.builtin.hidden_material import HiddenMaterial
 from mosa.data.builtin.objects import BuiltinObject, object_named
 from mosa.experiments.analyses import force_at, learned_modulus, pressed_modulus, redistribution, true_modulus
+from mosa.experiments.commits import commit
 from mosa.experiments.drawing import save
-from mosa.experiments.writing import commit
 from mosa.modules.body import Body
 from mosa.modules.lit_mosa import LitMosa
 from mosa.prediction import determined
