@@ -442,8 +442,8 @@ def test_the_page_says_of_figures_that_the_program_has_changed_since(monkeypatch
     monkeypatch.setattr(commits, "git", lambda *words: asked.append(words) or count)
     found = older(["command: `mosa-experiment all`", "version 0.1.0, commit 0123456789ab, with changes", "seeds: 0"])
     assert asked == [("rev-list", "--count", "0123456789ab..HEAD", "--", "mosa", "conf")]
-    assert found == ["**These figures are of an older commit, 0123456789ab:** 3 commits have changed the program (`mosa/`, `conf/`) "
-                     "since, up to when this page was made. What it gives now was not run."] * said
+    assert found == ["**These figures are of an older commit, 0123456789ab:** 3 commits have changed the program (`mosa/`, "
+                     "`conf/`) since, up to when this page was made. What it gives now was not run."] * said
     assert older(["version 0.1.0, commit unknown"]) == [] and len(asked) == 1
 
 
