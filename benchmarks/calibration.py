@@ -11,6 +11,7 @@ reconstruction; what is in are the grid, the time step, the starts of the search
 
 from __future__ import annotations
 
+import argparse
 import math
 import time
 from dataclasses import replace
@@ -26,16 +27,19 @@ from omegaconf import OmegaConf
 from mosa.config import build_body, build_criterion, build_identification, build_stages, build_world
 from mosa.data.builtin import BOX
 from mosa.data.builtin.drop import GRAVITY, simulate
-from mosa.data.builtin.objects import object_named
+from mosa.data.builtin.hidden import Hidden
+from mosa.data.builtin.objects import BuiltinObject, object_named
+from mosa.data.builtin.published import PublishedMaterial
 from mosa.data.builtin.shapes import SHAPES
 from mosa.data.builtin.surface import bind, extract_surface, fill
 from mosa.experiments.specification import SHARED, options_of, read_yaml
 from mosa.metrics import identification_errors
 from mosa.modules.body import Start
 from mosa.modules.identification import Identification
+from mosa.modules.takes import Take
 from mosa.prediction import determined
+from mosa.reconstruction.cues import neighbourhood, neighbourhood_cues
 from mosa.reconstruction.resolution import grid_spacing
-from mosa.types import MotionCues
 
 CONF = Path(__file__).parents[1] / "conf"
 NOISE = 0.004
@@ -49,24 +53,33 @@ def overrides_of(name: str) -> list[str]:
     return list(next(option.overrides for option in stand_ins if option.name == name))
 
 
-def configuration(name: str, more: list[str]) -> dict:
+def composed(overrides: list[str]) -> dict:
     with initialize_config_dir(str(CONF.resolve()), version_base=None):
-        cfg = compose("train", overrides=[*overrides_of(name), "adapter=none", "heterogeneity.enabled=false", *more])
+        cfg = compose("train", overrides=overrides)
     return OmegaConf.to_container(cfg, resolve=True)
 
 
-def make(name: str, folder: Path, seed: int) -> Path:
-    """The true motion of a scene: rest (N, 3), positions (T, N, 3) [m]."""
-    began, body = time.perf_counter(), object_named(name)
+def configuration(name: str, more: list[str]) -> dict:
+    return composed([*overrides_of(name), "adapter=none", "heterogeneity.enabled=false", *more])
+
+
+def keep(path: Path, body: BuiltinObject, material: Hidden | PublishedMaterial, seed: int) -> Path:
+    """The true motion of a body's training drop: rest (N, 3), positions (T, N, 3) [m]."""
+    began = time.perf_counter()
     surface = extract_surface(SHAPES[body.shape], body.pitch, np.random.default_rng([seed, 1]))
     particles = fill(SHAPES[body.shape], body.spacing, np.random.default_rng([seed, 2]))
-    fall = simulate(body, body.material, particles, surface.vertices, body.drops["train"], body.drops["train"])
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{name}.npz"
+    fall = simulate(body, material, particles, surface.vertices, body.drops["train"], body.drops["train"])
+    path.parent.mkdir(parents=True, exist_ok=True)
     np.savez(path, rest=fall.rest, positions=fall.positions.astype(np.float32), velocity=fall.velocity, shape=particles,
              lowest=surface.vertices[:, 1].min())
     print(f"{path}: {len(particles)} particles, {fall.substeps} substeps a frame, {time.perf_counter() - began:.0f} s", flush=True)
     return path
+
+
+def make(name: str, folder: Path, seed: int) -> Path:
+    """The true motion of a stand-in."""
+    body = object_named(name)
+    return keep(folder / f"{name}.npz", body, body.material, seed)
 
 
 def noisy(positions: np.ndarray, rest: np.ndarray, sd: float, rng: np.random.Generator) -> np.ndarray:
@@ -80,10 +93,12 @@ def noisy(positions: np.ndarray, rest: np.ndarray, sd: float, rng: np.random.Gen
     return found
 
 
-def case_of(path: Path, particles: int, more: list[str], seed: int, noise: float, device: str) -> SimpleNamespace:
-    """A body of about so many particles with the law of the scene, what it learns from, and where its particles truly go."""
-    name, stored = path.stem, np.load(path)
-    body, cfg, rng = object_named(name), configuration(name, more), np.random.default_rng([seed, 12])
+def learner_of(
+    path: Path, body: BuiltinObject, cfg: dict, particles: int, seed: int, noise: float, device: str
+) -> SimpleNamespace:  # fmt: skip
+    """A body of about so many particles with the law of `cfg`, what it learns from, and where its particles truly go; path: what
+    `keep` wrote of the motion of `body`."""
+    stored, rng = np.load(path), np.random.default_rng([seed, 12])
     spacing = (len(stored["shape"]) * body.spacing**3 / particles) ** (1 / 3)
     points = fill(SHAPES[body.shape], spacing, rng)
     rest = points + (stored["rest"] - stored["shape"])[0]
@@ -91,8 +106,7 @@ def case_of(path: Path, particles: int, more: list[str], seed: int, noise: float
     truth = np.stack([skin.follow(x.astype(np.float64)) for x in stored["positions"]])
     seen = noisy(truth, rest, noise * np.ptp(stored["rest"][:, 1]), rng)
     tensor = lambda a: torch.as_tensor(a, dtype=torch.float32, device=device)  # noqa: E731
-    n, frames = len(rest), len(truth)
-    reach = body.reach or BOX[1][0]
+    n, reach = len(rest), body.reach or BOX[1][0]
     world = {"ground": {"height": 0.0, "mode": "sticky"}, "gravity": list(GRAVITY), "up": [0.0, 1.0, 0.0],
              "box": [[-reach, BOX[0][1], -reach], [reach, BOX[1][1], reach]]}  # fmt: skip
     config = {"cfg": cfg, "world": world, "density": body.material.density, "frame_dt": 1 / body.footage.fps,
@@ -100,14 +114,19 @@ def case_of(path: Path, particles: int, more: list[str], seed: int, noise: float
     made = build_body(config, {"rest": tensor(rest), "volume": tensor(np.full(n, spacing**3)), "colors": torch.zeros(n, 3),
                                "opacities": torch.ones(n), "covariances": torch.eye(3).expand(n, 3, 3)}).to(device)  # fmt: skip
     start = Start(torch.eye(3, device=device), made.center, tensor(stored["velocity"]), torch.zeros(3, device=device))
-    cues = MotionCues(tensor(seen), torch.eye(3, device=device).expand(frames, n, 3, 3), tensor(np.ones((frames, n, 3))),
-                      tensor(np.ones((frames, n))), tensor(np.zeros((1,))))  # fmt: skip
+    cues = neighbourhood_cues(tensor(seen), torch.zeros(1, device=device), neighbourhood(tensor(rest)))
     height = rest[:, 1].min() - 0.5 * spacing
     falls = truth[:, :, 1].min(1) - 0.5 * spacing
     contact = int(np.argmax(falls < 0.02 * height))
-    take = SimpleNamespace(start=start, frame_dt=config["frame_dt"], first_contact=contact, cues=cues)
-    return SimpleNamespace(name=name, object=body, body=made, world=build_world(world), take=take, cfg=cfg, truth=tensor(truth),
-                           dx=config["dx"])  # fmt: skip
+    take = Take(start, None, cues, config["frame_dt"], contact)
+    return SimpleNamespace(object=body, body=made, world=build_world(world), take=take, cfg=cfg, truth=tensor(truth), config=config)
+
+
+def case_of(path: Path, particles: int, more: list[str], seed: int, noise: float, device: str) -> SimpleNamespace:
+    """The learner of a stand-in."""
+    case = learner_of(path, object_named(path.stem), configuration(path.stem, more), particles, seed, noise, device)
+    case.name = path.stem
+    return case
 
 
 def fit(
@@ -133,8 +152,8 @@ def fit(
     found = {name: float(value.detach()) for name, value in body.material.physical().items()}
     away = calibration.rollout(body, 0).x[contact:] - case.truth[contact:]
     return {
-        "scene": case.name, "law": body.material.law, "set": more, "particles": len(body.rest), "dx": case.dx, "seed": seed,
-        "noise": noise, "parameters": {
+        "scene": case.name, "law": body.material.law, "set": more, "particles": len(body.rest),
+        "dx": case.config["dx"], "seed": seed, "noise": noise, "parameters": {
             name: {"true": true, "start": searched[name], "found": found[name],
                    "error": identification_errors(name, found[name], true)[f"{name}_relative_error"],
                    "sd": said.get(f"posterior/{name}_relative_sd", said.get(f"posterior/{name}_sd")),
@@ -169,11 +188,16 @@ def table(records: list[dict]) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
-    parser = fits.parser_of(__doc__, "names of stand-ins", "motions")
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Of fits to true motions."""
     parser.add_argument("--particles", type=int, default=1500, help="fit: of the learner, about")
     parser.add_argument("--noise", type=float, default=NOISE, help="fit: error of the cues over the body's height")
     parser.add_argument("--seed", type=int, default=0)
+
+
+def main() -> None:
+    parser = fits.parser_of(__doc__, "names of stand-ins", "motions")
+    add_options(parser)
     parser.add_argument("--stage", default="prior", help="fit: prior; prior_eta: under the criterion, with the second grid")
     options = parser.parse_args()
     given = (options.particles, options.set, options.seed, options.noise, options.device, options.stage)

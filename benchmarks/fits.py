@@ -10,14 +10,15 @@ from pathlib import Path
 import torch
 
 from mosa.errors import MosaError
+from mosa.modules.identification import Identification
 
 
-def parser_of(description: str, inputs: str, folder: str) -> argparse.ArgumentParser:
-    """inputs: what `make` takes one of each for; folder: where it puts them by default."""
+def parser_of(description: str, inputs: str, folder: str, pictures: bool = False) -> argparse.ArgumentParser:
+    """inputs: what `make` takes one of each for; folder: where it puts them by default; pictures: whether results can be drawn."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("make", "fit", "table"))
-    parser.add_argument("inputs", nargs="+", help=f"make: {inputs}; fit: what make wrote; table: results")
-    parser.add_argument("--out", type=Path, default=Path(folder), help="make: the folder")
+    parser.add_argument("what", choices=("make", "fit", "table", *(["draw"] if pictures else [])))
+    parser.add_argument("inputs", nargs="+", help=f"make: {inputs}; fit: what make wrote; others: results")
+    parser.add_argument("--out", type=Path, default=Path(folder), help="make, draw: the folder")
     parser.add_argument("--results", type=Path, default=Path("fits.jsonl"), help="fit: a line is added for each")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--set", nargs="*", default=[], help="fit: overrides of the law and its identification")
@@ -25,11 +26,15 @@ def parser_of(description: str, inputs: str, folder: str) -> argparse.ArgumentPa
 
 
 def run(
-    options: argparse.Namespace, make: Callable[[str], object], fit: Callable[[Path], dict], table: Callable[[list[dict]], str]
-) -> None:
+    options: argparse.Namespace, make: Callable[[str], object], fit: Callable[[Path], dict], table: Callable[[list[dict]], str],
+    draw: Callable[[list[dict], Path], None] | None = None,
+) -> None:  # fmt: skip
     """What `options` ask for; a fit that fails is said, and the others go on."""
-    if options.what == "table":
-        print(table([json.loads(line) for name in options.inputs for line in Path(name).read_text().splitlines()]))
+    if options.what in ("table", "draw"):
+        records = [json.loads(line) for name in options.inputs for line in Path(name).read_text().splitlines()]
+        if options.what == "draw":
+            draw(records, options.out)
+        print(table(records))
         return
     for each in options.inputs:
         if options.what == "make":
@@ -43,3 +48,12 @@ def run(
         with options.results.open("a") as file:
             file.write(json.dumps(record) + "\n")
         print(table([record]), flush=True)
+
+
+def iterated(identification: Identification, most: int) -> int:
+    """Iterations taken, until it has converged or `most`."""
+    for i in range(most):
+        identification.iterate()
+        if identification.converged:
+            return i + 1
+    return most

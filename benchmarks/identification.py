@@ -31,7 +31,6 @@ from mosa.data.builtin.floor import floor_rollout, hidden_of
 from mosa.evaluation import true_motion
 from mosa.modules.body import Start
 from mosa.modules.gauss_newton import Posterior
-from mosa.modules.identification import Identification
 from mosa.modules.lit_mosa import LitMosa
 from mosa.modules.residuals import sampled
 from mosa.modules.takes import Take
@@ -64,7 +63,7 @@ def make(overrides: list[str], folder: Path, device: str) -> Path:
     module = made.module
     calibration = module.identifying(module.stages[0])
     calibration.search()
-    run(calibration, module.stages[0].iterations)
+    fits.iterated(calibration, module.stages[0].iterations)
     module.inform()
     sequences, hidden = {}, hidden_of(scene)
     takes = iter(module.takes)  # the sequences that are learned from come first, in their order
@@ -161,11 +160,11 @@ def identified(path: Path, overrides: list[str], device: str) -> SimpleNamespace
     module, body = case.module, case.body
     calibration = module.identifying(module.stages[0])
     calibration.search()
-    run(calibration, module.stages[0].iterations)
+    fits.iterated(calibration, module.stages[0].iterations)
     case.prior = motions(case, heterogeneity=False, adapter=False)
     body.adapter.switch_on(body.material.reference_modulus(), body.material.poisson())
     case.joint = module.identifying(module.stages[-1])
-    case.iterations = run(case.joint, module.stages[-1].iterations)
+    case.iterations = fits.iterated(case.joint, module.stages[-1].iterations)
     return case
 
 
@@ -194,14 +193,6 @@ def figures(case: SimpleNamespace) -> dict:
         "eta": float(torch.corrcoef(torch.stack([factor.float(), true]))[0, 1]) if varies else None,
         "grid": case.joint.multiple(), "iterations": case.iterations,
     } | {name: float(value.detach()) for name, value in body.material.physical().items()}  # fmt: skip
-
-
-def run(identification: Identification, most: int) -> int:
-    for i in range(most):
-        identification.iterate()
-        if identification.converged:
-            return i + 1
-    return most
 
 
 def table(records: list[dict]) -> str:

@@ -145,3 +145,26 @@ def test_two_equal_runs_are_compared_in_what_they_say_they_do_not_know(monkeypat
     assert long_runs.apart(one, one)[0] == [] and not any(each.far for each in long_runs.apart(one, one)[1])
     widened = (1 + long_runs.SPREADS**2 / 2) ** 0.5  # of a standard deviation, by two runs that are so far apart
     assert widened == pytest.approx(1 + long_runs.AGREE)
+
+
+def test_directions_are_found_from_a_true_motion(monkeypatch, tmp_path):
+    """A body and its twin from the files that `make` writes: the twin's truth has one modulus, the body's its largest along the
+    fibre, the specimens of the true law have the law's moduli, and what was fitted makes a figure and a page."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    directions = importlib.import_module("directions")
+    settings = ["heterogeneity.enabled=false", "fit.prior.newton_iterations=1", "fit.joint.newton_iterations=1"]
+    monkeypatch.setattr(directions, "PLATES", 3)
+    records = []
+    for name, plates in (("tiny", True), ("tiny_twin", False)):
+        path = directions.make(name, tmp_path, 0)
+        records.append(directions.fit(path, 150, settings, 0, 0.004, "cpu", plates, False))
+    body, twin = records
+    assert max(body["true_E_along"]) == body["true_E_along"][0] > 1.5 * min(body["true_E_along"])
+    assert max(twin["true_E_along"]) == pytest.approx(min(twin["true_E_along"]))
+    assert 0 <= body["fibre_deg"] <= 90 and twin["fibre_deg"] is None
+    assert body["plates"]["true"][0] == pytest.approx(body["true_E_along"][0], rel=0.05)
+    assert max(body["plates"]["prior"]["E"]) == pytest.approx(min(body["plates"]["prior"]["E"]), rel=0.02)
+    directions.draw(records, tmp_path / "results")
+    page = (tmp_path / "results" / "directions_from_motion.md").read_text()
+    assert (tmp_path / "results" / "directions_from_motion.png").stat().st_size > 10_000
+    assert "| tiny " in page and "| tiny_twin " in page and "commit" in page

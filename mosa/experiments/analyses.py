@@ -244,9 +244,8 @@ def heterogeneity(experiment: Experiment, records: Sequence[Record], stem: Path)
     return "Stiffness over the body:\n\n" + markdown(header, lines), [save(canvas, stem.with_name(stem.name + "_factor"))]
 
 
-def pressed_modulus(twin: Twin, variant: str, directions: Tensor) -> list[Pressed]:
+def pressed_modulus(body: Body, variant: str, directions: Tensor) -> list[Pressed]:
     """A specimen of a model's law between two plates, along unit vectors (K, 3)."""
-    body = twin.body
     model = body.model(variant)
     material, adapter = model.material, model.adapter
     adapter = adapter if adapter is not None and adapter.is_on else None
@@ -271,7 +270,7 @@ def compression(experiment: Experiment, records: Sequence[Record], stem: Path) -
             found.append(("truth", [press(hidden.law, one, k, modulus=hidden.wave_modulus(), poisson=hidden.known["nu"],
                                           density=hidden.density, stiffening=1.0) for k in n]))  # fmt: skip
         try:
-            found.append((label(experiment, record), pressed_modulus(twin, variants[prefix(record)], n)))
+            found.append((label(experiment, record), pressed_modulus(twin.body, variants[prefix(record)], n)))
         except SimulationDiverged as error:
             found.append((label(experiment, record), []))
             log.warning("%s: %s", label(experiment, record), error)

@@ -13,6 +13,7 @@ from typing import Any
 from mosa.analysis.tables import markdown
 from mosa.errors import ConfigError, DataError
 from mosa.experiments.collecting import Cell
+from mosa.experiments.commits import commits_since
 from mosa.experiments.printed import printed_table
 from mosa.experiments.specification import Claim, Experiment, Figure, load_experiment
 from mosa.whole_files import write_whole, written_whole
@@ -59,6 +60,7 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
         parts.append(f"## {experiment.title}\n\n{experiment.note.strip()}")
         found = read_tables(results / f"{name}.json")
         tables, about = found if found is not None else ({}, EMPTY)
+        parts += older(about["provenance"])
         if any(cell for rows in tables.values() for cells in rows.values() for cell in cells.values()):
             parts.append(ours(experiment, tables))
         else:
@@ -75,6 +77,16 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
     page = results.parent / "results.md"
     write_whole(page, "\n\n".join(parts) + "\n")
     return page
+
+
+def older(lines: Sequence[str]) -> list[str]:
+    """What is said of figures that an earlier state of the program made, by the lines that say where they come from."""
+    found = commits_since(lines)
+    if found is None or found[1] == 0:
+        return []
+    made, count = found
+    return [f"**These figures are of an older commit, {made}:** {count} commits have changed the program (`mosa/`, `conf/`) since, "
+            "up to when this page was made. What it gives now was not run."]
 
 
 def ours(experiment: Experiment, tables: Tables) -> str:

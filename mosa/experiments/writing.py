@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import platform
-import subprocess
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 import mosa
 from mosa.analysis.tables import markdown
 from mosa.experiments.collecting import Cell, Record, best_of, records_of, table
+from mosa.experiments.commits import commit
 from mosa.experiments.drawing import draw, save
 from mosa.experiments.page import write_json
 from mosa.experiments.printed import printed_table
@@ -99,21 +99,6 @@ def provenance(experiment: Experiment, jobs: Sequence[Job], records: Sequence[Re
         f"{len(complete)} of {len(jobs)} jobs complete, {sum(minutes):.1f} minutes of jobs, written "
         f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
     ]
-
-
-def commit() -> str:
-    """Of the checkout that the package lies in, with a mark where it has changes; `unknown` where it is installed."""
-
-    def git(*words: str) -> str:
-        return subprocess.run(
-            ["git", "-C", str(Path(mosa.__file__).parent), *words], capture_output=True, text=True, check=True
-        ).stdout
-
-    try:
-        found = git("rev-parse", "--short=12", "HEAD").strip()
-        return found + (", with changes" if git("status", "--porcelain", "--untracked-files=no").strip() else "")
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
 
 
 def write_csv(path: Path, experiment: Experiment, records: Sequence[Record]) -> None:

@@ -4,6 +4,7 @@ import errno
 import json
 import math
 import os
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -17,10 +18,10 @@ from mosa import whole_files
 from mosa.commands.experiment import arguments, run, shown
 from mosa.config import rehearse
 from mosa.errors import ConfigError, DataError
-from mosa.experiments import running
+from mosa.experiments import commits, running
 from mosa.experiments.analyses import ANALYSES
 from mosa.experiments.collecting import Cell, best_of, records_of, table
-from mosa.experiments.page import verdict
+from mosa.experiments.page import older, verdict
 from mosa.experiments.printed import printed_table
 from mosa.experiments.specification import (
     CROWD,
@@ -458,6 +459,23 @@ def test_the_page_has_what_was_run_and_says_what_was_not(tmp_path):
     (tmp_path / "docs" / "results" / "table_generalisation.json").write_text("{}")
     with pytest.raises(DataError, match=r"table_generalisation\.json"):
         run(arguments(["--page", "--results", str(tmp_path / "docs" / "results")]))
+
+
+@pytest.mark.parametrize(("count", "said"), [("3", True), ("0", False), (None, False)])
+def test_the_page_says_of_figures_that_the_program_has_changed_since(monkeypatch, count, said):
+    """Of no change, or of a commit that this checkout does not know, it says nothing."""
+    asked = []
+    monkeypatch.setattr(commits, "git", lambda *words: asked.append(words) or count)
+    found = older(["command: `mosa-experiment all`", "version 0.1.0, commit 0123456789ab, with changes", "seeds: 0"])
+    assert asked == [("rev-list", "--count", "0123456789ab..HEAD", "--", "mosa", "conf")]
+    assert found == ["**These figures are of an older commit, 0123456789ab:** 3 commits have changed the program (`mosa/`, "
+                     "`conf/`) since, up to when this page was made. What it gives now was not run."] * said
+    assert older(["version 0.1.0, commit unknown"]) == [] and len(asked) == 1
+
+
+def test_the_commit_of_a_result_is_that_of_the_checkout():
+    assert re.fullmatch(r"unknown|[0-9a-f]{12}(, with changes)?", commits.commit())
+    assert commits.git("no-such-command") is None
 
 
 def test_a_claim_of_a_figure_or_row_that_is_not_there_is_a_mistake_of_the_file():

@@ -1,0 +1,243 @@
+"""What directions a drop determines: the law of a body with fibres, and of its twin without, from true motions.
+
+    python benchmarks/directions.py make --out motions cylinder mandarin mandarin_twin        # a minute each on a CPU
+    python benchmarks/directions.py fit motions/cylinder.npz --particles 1500 --plates --results fits.jsonl
+    python benchmarks/directions.py table fits.jsonl
+    python benchmarks/directions.py draw fits.jsonl --out docs/results
+
+`make` simulates the training drop of a built-in body on its own fine grid. `fit` fills the shape with other and fewer particles,
+carries them along the true motion, adds an error to every frame (`calibration.noisy`), calibrates the isotropic prior on that and
+identifies the directions by the joint stage of a run (`adapter=operator`). With `--plates` a specimen of the true law, of the
+isotropic one and of the learned one is then pressed between two plates, over half a turn (`mosa.analysis.compression`).
+`--black-box` learns `adapter=direct` by as many steps of Adam as a run takes, on the same motion. What is left out is the
+reconstruction. `draw` makes the figure and the page of all that was fitted.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import calibration
+import fits
+import torch
+from matplotlib.figure import Figure as Canvas
+from torch import Tensor
+
+import mosa
+from mosa.analysis.anisotropy import directions_in_plane
+from mosa.analysis.compression import Pressed, press
+from mosa.analysis.stiffness import angle_between, stiffest
+from mosa.analysis.tables import markdown
+from mosa.data.builtin.hidden_material import HiddenMaterial
+from mosa.data.builtin.objects import BuiltinObject, object_named
+from mosa.experiments.analyses import force_at, learned_modulus, pressed_modulus, redistribution, true_modulus
+from mosa.experiments.commits import commit
+from mosa.experiments.drawing import save
+from mosa.modules.body import Body
+from mosa.modules.lit_mosa import LitMosa
+from mosa.prediction import determined
+from mosa.run import device_label
+
+TWIN = "_twin"
+"""At the end of a name: the same body without fibres and with one stiffness everywhere."""
+PLATES = 13
+"""Directions that a specimen is pressed in, over half a turn."""
+STRAIN = 0.04
+"""At which the plates' forces are compared."""
+
+
+def object_of(name: str) -> BuiltinObject:
+    body = object_named(name.removesuffix(TWIN))
+    return replace(body, material=body.material.isotropic()) if name.endswith(TWIN) else body
+
+
+def make(name: str, folder: Path, seed: int) -> Path:
+    body = object_of(name)
+    return calibration.keep(folder / f"{name}.npz", body, body.material, seed)
+
+
+def in_plane(material: HiddenMaterial, count: int) -> tuple[Tensor, Tensor]:
+    """Angles (K,) [rad] from the fibre and unit vectors (K, 3), in its plane with the axis that it is furthest from."""
+    fibre = torch.tensor(material.fibre).double()
+    across = torch.eye(3).double()[int(fibre.abs().argmin())]
+    return directions_in_plane(fibre.tolist(), across.tolist(), count)
+
+
+def pressed_truth(material: HiddenMaterial, directions: Tensor) -> list[Pressed]:
+    """A specimen of the true law, without its variation over the body."""
+    one = {key: value[0] for key, value in replace(material, amplitude=0.0).parameters(torch.zeros(1, 3)).items()}
+    return [press(material.law, one, n, modulus=material.wave_modulus(), poisson=material.known["nu"], density=material.density,
+                  stiffening=1.0) for n in directions]  # fmt: skip
+
+
+def compared(found: list[Pressed], true: list[Pressed]) -> dict:
+    """Young's moduli [Pa], and the largest relative error of them and of the forces."""
+    E = [each.modulus for each in found]
+    off = [abs(a.modulus / b.modulus - 1) for a, b in zip(found, true)]
+    forces = [abs(force_at(a, STRAIN) / force_at(b, STRAIN) - 1) for a, b in zip(found, true)]
+    return {"E": E, "E_off_mean": sum(off) / len(off), "E_off_largest": max(off), "force_off_largest": max(forces)}
+
+
+class NoImages:
+    """In place of a take's observations, where no loss term asks for images."""
+
+    cameras = (None,)
+
+    def select(self, views: list[int], frames: int) -> None:
+        return None
+
+
+def learn_black_box(module: LitMosa, body: Body) -> None:
+    """The joint stage of a run by Adam, on positions, rotations and stretches."""
+    module.takes = [replace(take, observations=NoImages()) for take in module.takes]
+    stage = module.stages[-1]
+    module.stage_index = len(module.stages) - 1
+    module.begin(stage)
+    module.weights = {name: value for name, value in module.weights.items() if name not in ("image", "mask", "flow")}
+    optimizer = torch.optim.Adam(module.groups(stage), betas=(0.9, 0.95))
+    for iteration in range(stage.iterations):
+        for group in optimizer.param_groups:
+            group["lr"] = group["rate"] * stage.decay(iteration)
+        optimizer.zero_grad()
+        for gain in module.criterion.gains:
+            terms, _ = module.terms(stage, [0], module.active_frames(stage, iteration, module.takes[0]), gain=gain)
+            (sum(module.weights[name] * value for name, value in terms.items()) / len(module.criterion.gains)).backward()
+        module.gradient_norms(optimizer, stage, iteration)
+        optimizer.step()
+        body.contact.project()
+
+
+def fit(path: Path, particles: int, more: list[str], seed: int, noise: float, device: str, plates: bool, black_box: bool) -> dict:
+    """Of one body: calibration, joint stage, and what its laws are, along the directions of a plane."""
+    began, truth = time.perf_counter(), object_of(path.stem)
+    words = [f"scene={path.stem.removesuffix(TWIN)}", "prior=neo_hookean", *(["adapter=direct"] if black_box else []), *more]
+    case = calibration.learner_of(path, truth, calibration.composed(words), particles, seed, noise, device)
+    body, take = case.body, case.take
+    module = LitMosa.from_config(case.config, body, takes=[take], background=torch.ones(3, device=device))
+    calibrated = module.identifying(module.stages[0])
+    calibrated.search()
+    fits.iterated(calibrated, module.stages[0].iterations)
+    body.freeze("prior")
+    print(f"  {path.stem}: calibrated after {time.perf_counter() - began:.0f} s", flush=True)
+
+    def away() -> float:
+        with torch.no_grad():
+            rollout = body.simulate(take.start, case.world, len(case.truth), take.frame_dt)
+        return 1e3 * float((rollout.x - case.truth)[take.first_contact :].square().sum(-1).mean().sqrt())
+
+    prior_mm, posterior = away(), None
+    if black_box:
+        learn_black_box(module, body)
+    else:
+        body.adapter.switch_on(body.material.reference_modulus(), body.material.poisson())
+        joint = module.identifying(module.stages[-1])
+        fits.iterated(joint, module.stages[-1].iterations)
+        posterior = joint.posterior()
+    learned_mm, body = away(), body.cpu()
+    print(f"  {path.stem}: learned after {time.perf_counter() - began:.0f} s", flush=True)
+    angles, n = in_plane(truth.material, 37)
+    true, learned, w = true_modulus(path.stem.removesuffix(TWIN), "isotropic" if path.stem.endswith(TWIN) else "anisotropic", n), \
+        learned_modulus(body, n).detach(), redistribution(body, n)  # fmt: skip
+    record = {
+        "body": path.stem, "method": "black box" if black_box else "ours", "set": more, "particles": len(body.rest), "seed": seed,
+        "noise": noise, "prior_mm": prior_mm, "learned_mm": learned_mm, "degrees": torch.rad2deg(angles).tolist(),
+        "E_along": learned.tolist(), "true_E_along": true.tolist(), "E_off_largest": float((learned / true - 1).abs().max()),
+        "w": w.detach().tolist(), "w_range": float(w.max() - w.min()), "fibre_deg": None, "cone_deg": None,
+    } | {name: float(value.detach()) for name, value in body.material.physical().items()}  # fmt: skip
+    if not black_box:
+        body.adapter.follow(body.material.poisson())
+        axis, ratio = stiffest(body.adapter.stiffness().detach().cpu())
+        record["stiffness_ratio"] = float(ratio)
+        record["cone_deg"] = determined(body, posterior)["posterior/stiffest_cone_deg"]
+        if truth.material.ratio > 1:
+            record["fibre_deg"] = float(angle_between(axis, torch.tensor(truth.material.fibre)))
+    if plates:
+        angles, n = in_plane(truth.material, PLATES)
+        reference = pressed_truth(truth.material, n)
+        record["plates"] = {"degrees": torch.rad2deg(angles).tolist(), "true": compared(reference, reference)["E"],
+                            "prior": compared(pressed_modulus(body, "prior", n), reference),
+                            "learned": compared(pressed_modulus(body, "adapted", n), reference)}  # fmt: skip
+    return record | {"seconds": time.perf_counter() - began, "commit": commit(),
+                     "machine": device_label(device)}
+
+
+HEADS = ("body", "law", "particles", "rms [mm]", "largest error of E [%]", "largest less smallest w", "stiffest over softest",
+         "stiffest from the fibre [deg]", "95 % cone [deg]", "E between plates off, mean and largest [%]",
+         "force off, largest [%]", "s")  # fmt: skip
+
+
+def shown(value: float | None, digits: int, scale: float = 1.0) -> str:
+    return "" if value is None else f"{scale * value:.{digits}f}"
+
+
+def off(plates: dict | None) -> list[str]:
+    """Of one law's specimens from the true one's."""
+    if plates is None:
+        return ["", ""]
+    return [f"{100 * plates['E_off_mean']:.1f}, {100 * plates['E_off_largest']:.1f}", shown(plates["force_off_largest"], 1, 100)]
+
+
+def table(records: list[dict]) -> str:
+    rows = []
+    for r in records:
+        plates = r.get("plates") or {}
+        prior = off(plates.get("prior"))
+        rows.append([r["body"], "isotropic", r["particles"], shown(r["prior_mm"], 1), "", "", "", "", "", *prior, ""])
+        rows.append([r["body"], r["method"], r["particles"], shown(r["learned_mm"], 1), shown(r["E_off_largest"], 1, 100),
+                     shown(r["w_range"], 3), shown(r.get("stiffness_ratio"), 3), shown(r["fibre_deg"], 0), shown(r["cone_deg"], 0),
+                     *off(plates.get("learned")), shown(r["seconds"], 0)])  # fmt: skip
+    return markdown(HEADS, [row for i, row in enumerate(rows) if row not in rows[:i]])
+
+
+def draw(records: list[dict], folder: Path) -> None:
+    """directions_from_motion.png, .md and .json: E(theta), between plates where specimens were pressed, and w(theta)."""
+    names = list(dict.fromkeys(r["body"] for r in records))
+    canvas = Canvas(figsize=(1.5 + 3.6 * len(names), 6.0), layout="constrained")
+    grid = canvas.subplots(2, len(names), squeeze=False)
+    top = max(0.05, max(max(r["w"]) for r in records))
+    for column, name in enumerate(names):
+        above, below = grid[:, column]
+        for r in (r for r in records if r["body"] == name):
+            plates = r.get("plates")
+            degrees = plates["degrees"] if plates else r["degrees"]
+            if not above.lines:
+                above.plot(degrees, [e / 1e3 for e in (plates["true"] if plates else r["true_E_along"])], "k--", label="truth")
+                if plates:
+                    above.plot(degrees, [e / 1e3 for e in plates["prior"]["E"]], label="isotropic")
+            above.plot(degrees, [e / 1e3 for e in (plates["learned"]["E"] if plates else r["E_along"])], label=r["method"])
+            below.plot(r["degrees"], r["w"], label=r["method"])
+            above.set_ylabel("E between plates [kPa]" if plates else "E [kPa]")
+        above.set_ylim(bottom=0)
+        above.set_title(name.replace(TWIN, ", isotropic twin"), fontsize=10)
+        above.legend(fontsize=8)
+        below.set_ylim(0, 1.05 * top)
+        below.set_ylabel("w")
+        below.set_xlabel("angle from the fibre [degrees]")
+    folder.mkdir(parents=True, exist_ok=True)
+    stem = folder / "directions_from_motion"
+    picture = save(canvas, stem)
+    stem.with_suffix(".json").write_text(json.dumps(records, indent=1))
+    stem.with_suffix(".md").write_text("\n".join([
+        "# Directions from true motions", "", __doc__.split("\n\n")[2].strip(), "", table(records), "",
+        f"![E and w over the angle from the fibre]({picture.name})", "",
+        "- command: `python benchmarks/directions.py make`, `fit --plates` (`--black-box`) and `draw`",
+        f"- version {mosa.__version__}, commit {', '.join(sorted({r['commit'] for r in records}))}",
+        f"- seed {', '.join(sorted({str(r['seed']) for r in records}))}; error of the motion: "
+        f"{100 * records[0]['noise']:.1f} % of the height; {', '.join(sorted({r['machine'] for r in records}))}", ""]))  # fmt: skip
+
+
+def main() -> None:
+    parser = fits.parser_of(__doc__, "names of built-in bodies with fibres, _twin behind those without", "motions", pictures=True)
+    calibration.add_options(parser)
+    parser.add_argument("--plates", action="store_true", help="fit: press specimens between plates too")
+    parser.add_argument("--black-box", action="store_true", help="fit: adapter=direct in place of ours")
+    options = parser.parse_args()
+    given = (options.particles, options.set, options.seed, options.noise, options.device, options.plates, options.black_box)
+    fits.run(options, lambda name: make(name, options.out, options.seed), lambda path: fit(path, *given), table, draw)
+
+
+if __name__ == "__main__":
+    main()
