@@ -42,3 +42,15 @@ def reference_data() -> Path:
     if not root.is_dir():
         pytest.skip(f"no reference data at {root}; set MOSA_DATA")
     return root
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory):
+    """Folder of the tiny scene and its reconstruction, for tests that do not care where these come from.
+
+    Of all processes that share the tests: two may make the same reconstruction at once, as two runs may."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        return tmp_path_factory.mktemp("cache")
+    folder = tmp_path_factory.getbasetemp().parent / "cache"
+    folder.mkdir(exist_ok=True)
+    return folder

@@ -378,10 +378,10 @@ def test_errors_frame_by_frame_are_those_of_the_motions(tmp_path):
 
 # ------------------------------------------------------------------------------------------------ one for real
 @pytest.mark.slow
-def test_a_quick_variant_runs_to_its_table_and_is_not_run_again(tmp_path, capsys):
+def test_a_quick_variant_runs_to_its_table_and_is_not_run_again(cache, tmp_path, capsys):
     words = ["table_generalisation", "figure_heterogeneity", "--quick", "--runs", str(tmp_path / "runs"), "--seeds", "0",
              "--only", "method=ours"]  # fmt: skip
-    more = [f"scene.cache={tmp_path / 'cache'}", "evaluation.samples=500", "evaluation.assignment=100"]
+    more = [f"scene.cache={cache}", "evaluation.samples=500", "evaluation.assignment=100"]
     words += [word for each in more for word in ("--set", each)]
     assert run(arguments(words)) == 0
     assert "1 jobs, 1 to run" in capsys.readouterr().out  # both read the same run
