@@ -280,7 +280,7 @@ def test_a_message_is_kept_where_nobody_reads_the_screen(sweep, tmp_path, monkey
 
 @pytest.mark.parametrize(("text", "message"), [
     (b"simulation:\n\tparticles: 200\n", "cannot start any token"), (b"seed: 1\nseed: 2\n", "found duplicate key"),
-    ("scene:\n  path: /h\u00f6hle\n".encode("latin-1"), "invalid continuation byte"),
+    ("scene:\n  path: /h\u00f6hle\n".encode("latin-1"), "invalid start byte"),
 ])  # fmt: skip
 @pytest.mark.parametrize("words", [["--config-dir={}"], ["--config-dir", "{}"], ["-cd", "{}"]])
 def test_yaml_that_cannot_be_read_is_named_with_its_file(tmp_path, capsys, text, message, words):
