@@ -22,6 +22,7 @@ from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
+from yaml import YAMLError
 
 from mosa.commands import fail
 from mosa.errors import ConfigError, MosaError
@@ -89,6 +90,29 @@ def check_folders(arguments: Sequence[str]) -> None:
             sys.exit(2)
 
 
+def check_files(arguments: Sequence[str], conf: Path) -> None:
+    """Exit with 2 and a message for a YAML file among the arguments that cannot be read, to which Hydra answers with a traceback: a
+    tab, a key that stands twice, another encoding. conf: the folder of the groups; --config-dir adds one."""
+    folders, named = [conf], []
+    for word, following in zip(arguments, [*arguments[1:], ""]):
+        flag, mark, value = word.partition("=")
+        if flag in ("--config-dir", "-cd"):
+            folders.append(Path(value if mark else following))
+        elif flag in ("--config-name", "-cn"):
+            named.append((value if mark else following).removesuffix(".yaml"))
+        elif mark and not flag.startswith("-"):
+            group = flag.lstrip("+").partition("@")[0]
+            named += [f"{group}/{each.strip()}" for each in value.strip("'\"[]").removesuffix(".yaml").split(",")]
+    for file in (folder / f"{name}.yaml" for folder in folders for name in named if "\0" not in name and len(name) < LONGEST):
+        try:
+            if file.is_file():
+                OmegaConf.load(file)
+        except (YAMLError, UnicodeDecodeError, OSError) as error:
+            reason = " ".join(str(error).split())[:300]
+            print(f"\nConfigError: {file}: expected YAML, found what cannot be read ({reason})", file=sys.stderr)
+            sys.exit(2)
+
+
 def run_command(run: Callable[[], None], conf: str | Path) -> None:
     """Run Hydra's `run` with what stands on the command line; conf: the folder of its groups.
 
@@ -98,6 +122,7 @@ def run_command(run: Callable[[], None], conf: str | Path) -> None:
     with outlived():
         check_arguments(sys.argv[1:], Path(conf))
         check_folders(sys.argv[1:])
+        check_files(sys.argv[1:], Path(conf))
         try:
             run()
         except SystemExit as ended:

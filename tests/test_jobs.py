@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 
 from mosa import refused
 from mosa.errors import ConfigError
-from mosa.jobs import LONGEST, Failures, attempt, check_folders, folder_name, held, quoted
+from mosa.jobs import LONGEST, Failures, attempt, check_files, check_folders, folder_name, held, quoted
 from mosa.npz import write_npz
 
 ROOT = Path(__file__).parents[1]
@@ -276,3 +276,23 @@ def test_a_message_is_kept_where_nobody_reads_the_screen(sweep, tmp_path, monkey
     assert attempt(fail(ConfigError("seed: wrong")), None) == float("inf")
     os.close(nowhere)
     assert (tmp_path / "failed" / "3.txt").read_text() == "ConfigError: seed: wrong\n"
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    (b"simulation:\n\tparticles: 200\n", "cannot start any token"), (b"seed: 1\nseed: 2\n", "found duplicate key"),
+    ("scene:\n  path: /h\u00f6hle\n".encode("latin-1"), "invalid start byte"),
+])  # fmt: skip
+@pytest.mark.parametrize("words", [["--config-dir={}"], ["--config-dir", "{}"], ["-cd", "{}"]])
+def test_yaml_that_cannot_be_read_is_named_with_its_file(tmp_path, capsys, text, message, words):
+    """Hydra answers with a traceback."""
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_bytes(text)
+    (tmp_path / "experiment" / "good.yaml").write_text("seed: 1\n")
+    told = [word.format(tmp_path) for word in words]
+    check_files([*told, "+experiment=good", "seed=0"], ROOT / "conf")
+    for named in ("experiment=mine", "+experiment=good,mine", "experiment=[good,mine]"):
+        with pytest.raises(SystemExit) as ended:
+            check_files([*told, named], ROOT / "conf")
+        assert ended.value.code == 2
+        said = capsys.readouterr().err.strip()
+        assert said.startswith(f"ConfigError: {tmp_path}/experiment/mine.yaml: expected YAML") and message in said

@@ -48,6 +48,35 @@ def read_image(path: Path) -> np.ndarray:
     return np.clip(pixels, 0, 1)
 
 
+FAINT = 0.1
+"""Of a matte that has anything in it at least: labels are numbers from 1 on, of 255."""
+SLIVER = 50
+"""Pixels of a matte that may all be so faint: the edge of an object that is nearly out of the picture."""
+GREY = 8 / 255
+"""By which the channels of a grey mask differ at most, which JPEG may have written."""
+
+
+def matte_of(path: Path, pixels: np.ndarray) -> np.ndarray:
+    """(H, W) of a mask's pixels, white = object. Errors: DataError for colours, whose first channel would be taken for it, for an
+    alpha channel beside them, and for labels of 1, 2, ..., which are nearly black."""
+    if pixels.shape[2] == 4 and float(np.ptp(pixels[..., 3])) > GREY:
+        raise DataError(f"{path}: expected a grey mask, white = object, found an alpha channel that differs over the picture; "
+                        "write it as the mask, or leave mask_path out where the image itself has that alpha")
+    if pixels.shape[2] >= 3 and float((pixels[..., :3].max(-1) - pixels[..., :3].min(-1)).max()) > GREY:
+        raise DataError(f"{path}: expected a grey mask, white = object, found colours (a label's palette, or the picture itself); "
+                        "write white where the object is")
+    return faintless(path, np.ascontiguousarray(pixels[..., 0]))
+
+
+def faintless(path: Path, matte: np.ndarray) -> np.ndarray:
+    """The matte. Errors: DataError where all of it that is not empty is nearly so."""
+    most = float(matte.max())
+    if most < FAINT and int((matte > 0).sum()) > SLIVER:
+        raise DataError(f"{path}: expected a matte that is white (255) where the object is, found {255 * most:.3g} at most: the "
+                        "number of a label? write 255 in its place")
+    return matte
+
+
 def check_pixels(path: Path) -> None:
     """The header says how large a picture is, before any of it is decoded. Errors: DataError."""
     with Image.open(path) as picture:

@@ -23,7 +23,7 @@ from mosa.data.footage import (
     scaled,
     world_to_camera,
 )  # fmt: skip
-from mosa.data.images import check_amount, composite, expect_size, fill_holes, read_image, resize, scaled_size
+from mosa.data.images import check_amount, composite, expect_size, faintless, fill_holes, matte_of, read_image, resize, scaled_size
 from mosa.data.lens import COEFFICIENTS, FOREIGN, is_fisheye, lens_of
 from mosa.data.scene_from_footage import scene_from_footage
 from mosa.errors import DataError
@@ -226,12 +226,12 @@ def read_shot(shot: Shot) -> tuple[np.ndarray, np.ndarray]:
     if shot.mask is not None:
         mask = read_image(shot.mask)
         expect_size(shot.mask, mask, *pixels.shape[1::-1], reason=f"as {shot.image.name}")
-        return color, np.ascontiguousarray(mask[..., 0])
+        return color, matte_of(shot.mask, mask)
     if pixels.shape[2] != 4:
         raise DataError(
             f"{shot.image}: no matte: expected an alpha channel, or a mask_path in {shot.where}, found {pixels.shape[2]} channels"
         )
-    return color, np.ascontiguousarray(pixels[..., 3])
+    return color, faintless(shot.image, np.ascontiguousarray(pixels[..., 3]))
 
 
 def camera_matrix(shot: Shot, width: int, height: int) -> np.ndarray:
