@@ -253,8 +253,7 @@ def habits_running(folder: Path) -> Iterator[Attack]:
 
     python = sys.executable
     for name, shell in {
-        "O": "PYTHONOPTIMIZE=1 {}", "OO": "PYTHONOPTIMIZE=2 {}", "warnings_are_errors": "PYTHONWARNINGS=error::UserWarning {}",
-        "all_warnings_are_errors": "PYTHONWARNINGS=error {}", "no_bytecode": "PYTHONDONTWRITEBYTECODE=1 {}",
+        "O": "PYTHONOPTIMIZE=1 {}", "OO": "PYTHONOPTIMIZE=2 {}", "no_bytecode": "PYTHONDONTWRITEBYTECODE=1 {}",
         "dev_mode": "PYTHONDEVMODE=1 {}", "hash_seed": "PYTHONHASHSEED=7 {}", "ascii_screen": "PYTHONIOENCODING=ascii:strict {}",
         "no_input": "{} <&-", "umask": "umask 077; {}", "narrow_screen": "TERM=dumb COLUMNS=1 {}",
         "turkish": "LC_ALL=tr_TR.UTF-8 {}",
@@ -265,6 +264,9 @@ def habits_running(folder: Path) -> Iterator[Attack]:
         "matplotlib": "MPLBACKEND=TkAgg DISPLAY= {}", "proxy": "http_proxy=http://127.0.0.1:1 https_proxy=http://127.0.0.1:1 {}",
     }.items():  # fmt: skip
         yield f"goes on: {name}", lambda n=name, s=shell: same(n, s)
+    for name in ("error::UserWarning", "error"):  # one of ours, or of a library's import, ends it
+        yield f"PYTHONWARNINGS={name}", lambda n=name: (program(*words(fitted(n)), shell=f"PYTHONWARNINGS={n} {{}}", wanted=2),
+                                                        refuse("one message"))  # fmt: skip
     yield "from another folder", lambda: elsewhere(fitted, words, whole, folder, python)
 
     def stopped_twice(name: str, pause: float) -> None:

@@ -87,6 +87,9 @@ def explained(error: Exception, folder: str | Path | None = None) -> str | None:
     checkpoint the message names."""
     if isinstance(error, OSError) and (reason := disk_message(error)) is not None:
         return f"DataError: {reason}"
+    if isinstance(error, Warning):
+        said = " ".join(str(error).split())[:300]
+        return f"{type(error).__name__}: {said} (a warning, which -W error or PYTHONWARNINGS makes an error)"
     if (reason := memory_message(error)) is None:
         return None
     last = None if folder is None else Path(folder) / LAST

@@ -121,6 +121,13 @@ def test_an_error_of_a_gpus_libraries_counts_as_memory_where_the_gpu_is_full_alo
         attempt(lambda _: 1 / 0, None)
 
 
+def test_a_warning_that_was_made_an_error_is_one_message(sweep, capsys):
+    """PYTHONWARNINGS=error, as continuous integrations set it: Python raises it wherever it arises."""
+    attempt(fail(UserWarning("simulation.particles: thin parts")), None)
+    said = capsys.readouterr().err.strip()
+    assert said.startswith("UserWarning: simulation.particles: thin parts") and "PYTHONWARNINGS" in said
+
+
 def test_a_message_about_memory_names_the_checkpoint_that_is_kept(tmp_path):
     assert refused.explained(MemoryError(), tmp_path) == refused.explained(MemoryError())
     (tmp_path / refused.LAST).parent.mkdir()
