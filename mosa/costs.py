@@ -30,6 +30,7 @@ from mosa.physics.engine.budget import KEPT_ON_CPU
 from mosa.prediction import DRAWS
 from mosa.reconstruction.observed import object_windows
 from mosa.reconstruction.resolution import grid_spacing
+from mosa.reconstruction.response import MODES
 from mosa.rendering.rasterizer import rasterize
 from mosa.types import Cameras, Scene
 
@@ -257,8 +258,11 @@ def seconds_of_fit(module: LitMosa, speeds: Speeds, frames: int, processes: int 
     step = (BACKWARD * rollout + views * frames * speeds.picture) * -(-len(module.takes) // processes)
     again = module.config["cfg"]["reconstruction"].get("informed") or {}
     looks = max(1, sum(stage.looks_again for stage in module.stages))
-    each = 0.7 * again.get("iterations", 0) * again.get("views", 1) * len(module.takes) * (frames - 1) * speeds.picture
+    pictures = len(module.takes) * (frames - 1) * speeds.picture
+    each = 0.7 * again.get("iterations", 0) * again.get("views", 1) * pictures
     total = KERNELS + looks * each
+    if each and again.get("response", 0) and any(stage.newton and not stage.calibrates for stage in module.stages):
+        total += each + 0.15 * 3 * MODES * again["response"] * pictures
     for stage in module.stages:
         adapted = ADAPTER_COST if stage.learns_adapter and networks else 1.0
         stiff = STIFFNESS_COST if stage.learns_adapter and body.adapter is not None else 1.0

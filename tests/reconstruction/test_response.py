@@ -119,3 +119,11 @@ def test_the_response_of_another_sequence_is_refused(known):
     assert SecondLook.response(Body, None) is None
     with pytest.raises(ConfigError, match=r"mosa\.responses.*another sequence"):
         SecondLook.response(Body, good.written() | {"about": torch.zeros(T + 1, N, 3)})
+
+
+def test_a_part_of_large_pictures_tells_what_all_of_them_do(bent, monkeypatch):  # noqa: F811
+    windows, body, true = bent
+    whole = image_matrices(body, body, windows, OFFSETS, torch.ones(3), true, reach=0.1, views=6)
+    monkeypatch.setattr("mosa.reconstruction.response.VALUES", windows.images[0].numel() // 5)
+    part = image_matrices(body, body, windows, OFFSETS, torch.ones(3), true, reach=0.1, views=6)
+    assert not torch.equal(part, whole) and float((part - whole).norm() / whole.norm()) < 0.2
