@@ -197,7 +197,7 @@ def habits_keys(folder: Path) -> Iterator[Attack]:
         return ["--config-dir", str(folder / "conf"), f"experiment={name}"]
 
     def one_message(*words: str) -> None:
-        told = program(*words, f"hydra.run.dir={folder}/run", wanted=2)
+        told = program(*([] if "hydra.run.dir=" in words else [f"hydra.run.dir={folder}/run"]), *words, wanted=2)
         if not told.strip():
             raise AssertionError("nothing said")
         refuse("one message")

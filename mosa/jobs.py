@@ -82,6 +82,9 @@ def check_folders(arguments: Sequence[str]) -> None:
         key, _, value = argument.partition("=")
         if key not in ("hydra.run.dir", "hydra.sweep.dir") or "$" in value:
             continue
+        if not value.strip("'\" "):
+            print(f"\nConfigError: {key}: expected a folder, found nothing; . is the one that this was started in", file=sys.stderr)
+            sys.exit(2)
         place = Path(value.strip("'\"")).absolute()
         there = next(folder for folder in (place, *place.parents) if os.path.lexists(folder))
         if not there.is_dir() or not os.access(there, os.W_OK):
