@@ -214,7 +214,7 @@ def habits_keys(folder: Path) -> Iterator[Attack]:
         "trainer.accelerator=mps", "trainer.devices=cuda", "extensions=[no_such_module]",
         "extensions=no_such_module", "world.colliders=sphere", "scene.path=", "hydra.run.dir=",
         "+experiment=none", "resume=true", "ckpt_path=outputs", "logger=tensorbord",
-        "+simulation={particles: 5", "prior.parameters={E:1e5}", "scene.also_train=test_60,test_40",
+        "+simulation={particles: 5", "scene.also_train=test_60,test_40",
     ]  # fmt: skip
     for words in wrong:
         yield words, lambda w=words: one_message("debug=default", w)
