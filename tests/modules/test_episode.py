@@ -142,7 +142,9 @@ def test_gradients_of_a_control_sequence_are_central_differences():
 def test_without_differentiable_no_graph_is_kept():
     made = twin()
     made.reset(colliders=[PUSHER])
-    state, reactions = made.step({"pusher": torch.zeros(3, requires_grad=True)})
+    with pytest.raises(ConfigError, match=r"action: .*differentiable=True"):  # it would get no gradient
+        made.step({"pusher": torch.zeros(3, requires_grad=True)})
+    state, reactions = made.step({"pusher": torch.zeros(3)})
     assert not state.x.requires_grad and not reactions.requires_grad
     made.reset(colliders=[PUSHER], differentiable=True)
     with torch.no_grad():
