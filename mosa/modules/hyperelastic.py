@@ -33,6 +33,7 @@ NUMBERS = 19
 
 
 @lru_cache(maxsize=8)
+@torch.inference_mode(False)  # who asks first may not want gradients, and others do
 def anisotropic_basis(dtype: torch.dtype, device: torch.device) -> Tensor:
     """(19, 6, 6) orthonormal symmetric matrices in Mandel scaling, orthogonal to I and to 1x1: no sum of them is isotropic."""
     basis = []

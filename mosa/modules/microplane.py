@@ -20,6 +20,7 @@ LOWER = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
 
 
 @lru_cache(maxsize=16)
+@torch.inference_mode(False)  # who asks first may not want gradients, and others do
 def _triangles(dtype: torch.dtype, device: torch.device) -> Tensor:
     """(2, 6, 9) maps from the entries of the upper and the lower triangle to a flat 3x3 matrix."""
     result = torch.zeros(2, 6, 9, dtype=dtype)
@@ -30,6 +31,7 @@ def _triangles(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 @lru_cache(maxsize=16)
+@torch.inference_mode(False)  # who asks first may not want gradients, and others do
 def _placement(dtype: torch.dtype, device: torch.device) -> Tensor:
     """(27, 36) map from the entries of (C_x, C_y, C_z) to the 6x6 matrix that gives the normals and the averaged shears."""
     result = torch.zeros(3, 3, 3, 6, 6, dtype=dtype)
@@ -101,6 +103,7 @@ def isotropic_stiffness(poisson: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=16)
+@torch.inference_mode(False)  # who asks first may not want gradients, and others do
 def _constants(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, ...]:
     """I (6, 6), 1x1 (6, 6), `MANDEL` (6,), and the unit matrices (36, 6, 6)."""
     one = torch.tensor([1.0, 1, 1, 0, 0, 0], dtype=dtype)

@@ -101,6 +101,7 @@ DIRECTIONS = 24
 
 
 @functools.cache
+@torch.inference_mode(False)  # who asks first may not want gradients, and others do
 def _projections() -> tuple[Tensor, dict[int, Tensor]]:
     """Directions (n, 3) spread over the sphere and the pseudo-inverse (2 l + 1, n) of the harmonics of each degree there."""
     place = torch.arange(DIRECTIONS, dtype=torch.float64) + 0.5

@@ -64,6 +64,7 @@ def _tiles(hidden: int) -> list[_Tile]:
 
 
 @lru_cache
+@torch.inference_mode(False)  # who asks first may not want gradients, and others do
 def _order(shapes: tuple[torch.Size, ...], device: torch.device) -> tuple[Tensor, Tensor]:
     """(index, factor) of each packed number among all weights and a final zero."""
     numbers, start = [], 0
