@@ -18,6 +18,7 @@ from torch import Tensor
 
 from mosa.reconstruction.cues import polar
 from mosa.reconstruction.dynamic import DynamicSettings, Objective, Predicted, Scaffold, minimise
+from mosa.reconstruction.modes import coefficients_of
 from mosa.reconstruction.motion import ModalMotion
 from mosa.reconstruction.observed import Windows
 from mosa.reconstruction.uniform_adam import UniformAdam
@@ -59,10 +60,8 @@ def laid_onto(predicted: Tensor, seen: Tensor) -> Tensor:
 
 def project(motion: ModalMotion, scaffold: Scaffold, positions: Tensor) -> None:
     """Set the amplitudes to those whose particles are nearest to positions (T, N, 3) [m], frame by frame."""
-    values, rest = scaffold.modes.values, scaffold.splats.means
-    away = positions - rest - motion.offsets[:, None]
-    # columns of the modes are orthogonal, of squared length N
-    coefficients = torch.einsum("nk,tnd->tkd", values, away) / len(rest)
+    away = positions - scaffold.splats.means - motion.offsets[:, None]
+    coefficients = coefficients_of(away, scaffold.modes.values)
     with torch.no_grad():
         motion.amplitude.copy_(coefficients / motion.unit[:, None])
 

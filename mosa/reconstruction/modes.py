@@ -32,6 +32,15 @@ class Modes:
     gradient: Tensor
     energy: Tensor
 
+    def displacement(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+        """Displacement (S, N, 3) [m] and its gradient (S, N, 3, 3) under coefficients (S, K, 3) [m]."""
+        S, K, _ = coefficients.shape
+        N = len(self.values)
+        columns = coefficients.permute(1, 0, 2).reshape(K, S * 3)
+        shift = (self.values @ columns).reshape(N, S, 3).transpose(0, 1)
+        gradient = (self.gradient.reshape(N * 3, K) @ columns).reshape(N, 3, S, 3).permute(2, 0, 3, 1)
+        return shift, gradient
+
     def at(self, points: Tensor, rest: Tensor, *, neighbours: int = 8) -> Modes:
         """The same modes at other points (M, 3) [m]: first-order expansions around the nearest particles, blended by distance.
 
@@ -49,6 +58,12 @@ class Modes:
             values += w * (self.values[j] + torch.einsum("njm,nj->nm", slope, points - rest[j]))
             gradient += w[..., None] * slope
         return Modes(values, gradient, self.energy)
+
+
+def coefficients_of(displacement: Tensor, values: Tensor) -> Tensor:
+    """(..., K, 3) [m] of the modes `values` (N, K) whose displacement is nearest to the given one (..., N, 3) [m]."""
+    # columns of the modes are orthogonal, of squared length N
+    return torch.einsum("nk,...nd->...kd", values, displacement) / len(values)
 
 
 def bending_matrix(around: Neighbourhood) -> sparse.csr_matrix:

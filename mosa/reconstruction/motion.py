@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from mosa.reconstruction.cues import Neighbourhood
 from mosa.reconstruction.modes import Modes
-from mosa.rendering.covariance import covariance_from, quaternion_multiply, quaternion_to_matrix
+from mosa.rendering.covariance import carried_covariance, covariance_from, quaternion_multiply
 from mosa.types import Splats
 
 
@@ -56,20 +56,18 @@ class ModalMotion(nn.Module):
 
     def displacement(self, frames: Tensor, modes: Modes) -> tuple[Tensor, Tensor]:
         """Displacement (S, N, 3) [m] and deformation gradient (S, N, 3, 3)."""
-        c = self.coefficients(frames)
-        S, K, _ = c.shape
-        N = len(modes.values)
-        columns = c.permute(1, 0, 2).reshape(K, S * 3)
-        shift = (modes.values @ columns).reshape(N, S, 3).transpose(0, 1) + self.offsets[frames][:, None]
-        gradient = (modes.gradient.reshape(N * 3, K) @ columns).reshape(N, 3, S, 3).permute(2, 0, 3, 1)
-        return shift, gradient + torch.eye(3, dtype=c.dtype, device=c.device)
+        return self.displaced(self.coefficients(frames), frames, modes)
+
+    def displaced(self, coefficients: Tensor, frames: Tensor, modes: Modes) -> tuple[Tensor, Tensor]:
+        """The same under other coefficients (S, K, 3) [m], of frames (S,), or (1,) for all of them."""
+        shift, gradient = modes.displacement(coefficients)
+        return shift + self.offsets[frames][:, None], gradient + torch.eye(3, dtype=gradient.dtype, device=gradient.device)
 
     def forward(self, frames: Tensor, splats: Splats, modes: Modes, around: Neighbourhood | None = None) -> MotionSample:
         shift, deformation = self.displacement(frames, modes)
         positions = splats.means + shift
         if self.shape_amplitude is None:
-            axes = deformation @ (quaternion_to_matrix(splats.rotations) * splats.scales[:, None, :])
-            return MotionSample(positions, axes @ axes.transpose(-1, -2), deformation)
+            return MotionSample(positions, carried_covariance(deformation, splats.scales, splats.rotations), deformation)
         moving = (frames > 0).to(self.turn)[:, None, None]
         shape = modes.values @ (moving * self.shape_amplitude[frames] * self.turn[:, None])
         scales = splats.scales * shape[..., :3].exp()

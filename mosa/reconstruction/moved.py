@@ -22,7 +22,7 @@ from mosa.reconstruction.motion import MotionSample
 from mosa.reconstruction.observed import Windows, object_windows
 from mosa.reconstruction.response import MODES, Response, image_matrices, response_of
 from mosa.reconstruction.settings import ReconstructionSettings
-from mosa.rendering.covariance import quaternion_to_matrix
+from mosa.rendering.covariance import carried_covariance
 from mosa.rendering.rasterizer import rasterize
 from mosa.threads import threaded
 from mosa.types import MotionCues, Reconstruction, Scene, Splats
@@ -125,7 +125,7 @@ class SecondLook:
         """predicted: (T, N, 3) [m] of the particles in the training frames; seen: what was found of them before, None for the
         reconstruction's own."""
         seen = self._seen(seen)
-        found = self._found(predicted, seen)
+        found = self._found(predicted, seen, self._windows())
         return self.cues(seen if found is None else found[0])
 
     def with_response(
@@ -136,16 +136,17 @@ class SecondLook:
 
         first_contact: index of the first frame after it: until then predictions do not differ."""
         seen, scene, parts, settings = self._seen(seen), self.scene, self.reconstruction.moving, self.settings.informed
-        found = self._found(predicted, seen)
+        windows = self._windows()
+        found = self._found(predicted, seen, windows)
         if found is None:
             return self.cues(seen), None
         positions, about = found
-        second = self._found(other, seen) if settings.response and first_contact < len(positions) else None
+        second = self._found(other, seen, windows) if settings.response and first_contact < len(positions) else None
         if second is None:
             return self.cues(positions), None
         frames = len(positions) - 1
         with tqdm(total=frames, desc=f"what images of {scene.sequence} tell", disable=not self.progress, leave=False) as steps:
-            matrices = image_matrices(parts.scaffold, parts.carried, self._windows(), parts.centres, self._background(), positions,
+            matrices = image_matrices(parts.scaffold, parts.carried, windows, parts.centres, self._background(), positions,
                                       reach=parts.reach, views=settings.response, progress=steps.update)
         response, strength, left = response_of(parts.scaffold.modes, matrices, about, positions, second[1], second[0],
                                                first_contact)
@@ -177,12 +178,12 @@ class SecondLook:
     def _background(self) -> Tensor:
         return self.scene.background.to(self.reconstruction.moving.centres)
 
-    def _found(self, predicted: Tensor, seen: Tensor) -> tuple[Tensor, Tensor] | None:
+    def _found(self, predicted: Tensor, seen: Tensor, windows: Windows) -> tuple[Tensor, Tensor] | None:
         """(positions, the shapes that they were sought from), (T, N, 3) [m] each; None where the prediction is no guide."""
         parts, settings, sequence = self.reconstruction.moving, self.settings, self.scene.sequence
         title = f"motion of {sequence} about the prediction"
         with tqdm(total=settings.informed.iterations, desc=title, disable=not self.progress, leave=False) as steps:
-            found = informed_motion(parts.scaffold, parts.carried, self._windows(), parts.centres, self._background(),
+            found = informed_motion(parts.scaffold, parts.carried, windows, parts.centres, self._background(),
                                     predicted.to(seen), seen, settings.informed, settings.dynamic, reach=parts.reach,
                                     seed=self.seed, progress=steps.update)  # fmt: skip
         if found is None:
@@ -196,5 +197,5 @@ class SecondLook:
         """Of positions (T, N, 3) [m] that `about` found, for instance those in a checkpoint."""
         splats = self.reconstruction.splats.to(self.device)
         around, positions = neighbourhood(splats.means, neighbours=self.settings.neighbours), positions.to(splats.means)
-        deformed = around.deformation(positions) @ (quaternion_to_matrix(splats.rotations) * splats.scales[:, None, :])
-        return neighbourhood_cues(positions, deformed @ deformed.mT, around)
+        covariances = carried_covariance(around.deformation(positions), splats.scales, splats.rotations)
+        return neighbourhood_cues(positions, covariances, around)

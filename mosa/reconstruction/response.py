@@ -24,10 +24,10 @@ from torch import Tensor
 
 from mosa.reconstruction.dynamic import Scaffold
 from mosa.reconstruction.informed import project
-from mosa.reconstruction.modes import Modes
+from mosa.reconstruction.modes import Modes, coefficients_of
 from mosa.reconstruction.motion import ModalMotion
 from mosa.reconstruction.observed import Windows
-from mosa.rendering.covariance import quaternion_to_matrix
+from mosa.rendering.covariance import carried_covariance
 from mosa.rendering.rasterizer import rasterize
 
 MODES = 60
@@ -58,7 +58,7 @@ class Response:
 
     def coefficients(self, positions: Tensor, frame: int) -> Tensor:
         """(..., K, 3) [m] of the modes in U (positions - predicted); positions: (..., N, 3) [m] in that frame."""
-        away = torch.einsum("nk,...nd->...kd", self.values, positions - self.about[frame]) / len(self.values)
+        away = coefficients_of(positions - self.about[frame], self.values)
         left = torch.einsum("ij,...j->...i", self.share[frame], away.flatten(-2))
         return left.unflatten(-1, away.shape[-2:])
 
@@ -99,17 +99,15 @@ def image_matrices(
     motion = ModalMotion(offsets, scaffold.modes.energy, reach=reach)
     project(motion, scaffold, found)
     splats, device, every = carried.splats, found.device, len(scaffold.modes.energy)
-    axes = quaternion_to_matrix(splats.rotations) * splats.scales[:, None, :]
     size, matrices = 3 * min(MODES, every), []
     directions = torch.eye(size, 3 * every, device=device).unflatten(1, (every, 3))
 
     def images(c: Tensor, frame: int, window: Windows) -> Tensor:
         """(S, P) pixels under S coefficients (S, K, 3)."""
-        shift = torch.einsum("nk,skd->snd", carried.modes.values, c) + motion.offsets[frame]
-        moved = (torch.einsum("nik,skd->sndi", carried.modes.gradient, c) + torch.eye(3, device=device)) @ axes
+        shift, deformation = motion.displaced(c, torch.tensor([frame], device=device), carried.modes)
         colour, alpha = rasterize(
             splats.means + shift,
-            moved @ moved.mT,
+            carried_covariance(deformation, splats.scales, splats.rotations),
             splats.opacities,
             splats.colors[None],
             window.cameras.select([0] * len(c)),
@@ -181,7 +179,7 @@ def response_of(
     values, late = modes.values[:, :count], slice(max(1, first_contact), None)
 
     def change(one: Tensor, other: Tensor) -> Tensor:
-        return (torch.einsum("nk,tnd->tkd", values, one - other) / len(values))[late].double().flatten(1)
+        return coefficients_of(one - other, values)[late].double().flatten(1)
 
     share, unit = responses(matrices, modes.energy[:count])
     a, left = measured(share, unit, change(other_about, about), change(other_found, found))

@@ -51,6 +51,12 @@ def covariance_from(scales: Tensor, rotations: Tensor) -> Tensor:
     return (axes[..., :, None, :] * axes[..., None, :, :]).sum(-1)
 
 
+def carried_covariance(deformation: Tensor, scales: Tensor, rotations: Tensor) -> Tensor:
+    """F R diag(s^2) R^T F^T, (..., 3, 3) [m^2], of Gaussians that follow a deformation gradient (..., 3, 3)."""
+    axes = deformation @ (quaternion_to_matrix(rotations) * scales[..., None, :])
+    return axes @ axes.mT
+
+
 def project_gaussians(means: Tensor, covariances: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
     """Centres (B, N, 2) [px] and low-passed covariances (B, N, 3) [px^2] as (xx, xy, yy), one camera per batch entry.
 
