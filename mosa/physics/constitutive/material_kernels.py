@@ -88,12 +88,12 @@ def stress_kernel(stress, uses_rotation: bool, scalar, adapted: bool, strain: st
             if wp.static(factorised):
                 U, S, V = svd(Fi)
                 E = mandel(material_strain(wp.static(measure), Fi, S, V))
-                T = T + conjugate_stress(wp.static(measure), Fi, S, V, unmandel(modulus * (own.matrix66(G, i) * E)))
+                T = T + conjugate_stress(wp.static(measure), Fi, S, V, unmandel(modulus * own.times66(G, i, E)))
             else:
-                T = T + green_stress(Fi, unmandel(modulus * (own.matrix66(G, i) * mandel(green_strain(Fi)))))
+                T = T + green_stress(Fi, unmandel(modulus * own.times66(G, i, mandel(green_strain(Fi)))))
         elif wp.static(adapted):
             s = vech(wp.transpose(R) * T * R)
-            T = T + R * unvech(own.matrix66(G, i) * s + own.vector6(h, i)) * wp.transpose(R)
+            T = T + R * unvech(own.times66(G, i, s) + own.vector6(h, i)) * wp.transpose(R)
         tau[i] = field33(T)
 
     return stress_of_particles
@@ -124,7 +124,7 @@ def return_kernel(return_map, scalar, adapted: bool):
         E = deviator(H)
         if wp.static(adapted):
             # as an increment, so that a zero operator leaves the plain map bit for bit
-            E = E + deviator(unvech(own.matrix66(G, i) * vech(E) + own.vector6(h, i)))
+            E = E + deviator(unvech(own.times66(G, i, vech(E)) + own.vector6(h, i)))
         mapped, yielded = return_map(
             trial, Fi, Ci, R, U, S, V, H, wp.ddot(E, E), norm_eps, own.parameters(parameters, i), dt
         )

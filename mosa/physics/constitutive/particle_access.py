@@ -44,9 +44,46 @@ ADD = """
     }}"""
 
 
+# of a 6 x 6 matrix and a vector, in the order of Warp's own product: neither the matrix nor its gradient is held in float64, for
+# which a GPU's thread has not enough registers
+PRODUCT = PIECE + """
+    const Piece* source = reinterpret_cast<const Piece*>(field.data + i);
+    wp::vec_t<6, double> value;
+#pragma unroll
+    for (int k = 0; k < {pieces}; ++k) {{
+        const Piece piece = source[k];
+#pragma unroll
+        for (int l = 0; l < {width}; ++l) {{
+            const int row = ({width} * k + l) / 6, column = ({width} * k + l) % 6;
+            const double term = static_cast<double>(piece.part[l]) * x[column];
+            value[row] = column == 0 ? term : value[row] + term;
+        }}
+    }}
+    return value;"""
+ADD_PRODUCT = PIECE + """
+    const Piece* source = reinterpret_cast<const Piece*>(field.data + i);
+    Piece* target = reinterpret_cast<Piece*>(adj_field.data + i);
+    wp::vec_t<6, double> sums;
+#pragma unroll
+    for (int k = 0; k < {pieces}; ++k) {{
+        const Piece piece = source[k];
+        Piece added = adj_field.data ? target[k] : piece;
+#pragma unroll
+        for (int l = 0; l < {width}; ++l) {{
+            const int row = ({width} * k + l) / 6, column = ({width} * k + l) % 6;
+            const double term = static_cast<double>(piece.part[l]) * adj_ret[row];
+            sums[column] = row == 0 ? term : sums[column] + term;
+            added.part[l] += static_cast<{scalar}>(adj_ret[row] * x[column]);
+        }}
+        if (adj_field.data) target[k] = added;
+    }}
+    adj_x += sums;"""
+
+
 @cache
 def particle_access(scalar, slots: int) -> SimpleNamespace:
-    """matrix33, vector6, matrix66 and parameters (vectors of `slots` numbers): f(field, i) -> the same in float64.
+    """matrix33, vector6, matrix66 and parameters (vectors of `slots` numbers): f(field, i) -> the same in float64; times66(field,
+    i, x) -> matrix66(field, i) * x.
 
     scalar: of the fields, wp.float32 or wp.float64. No other thread may work on particle i."""
     name, size = {wp.float32: ("float", 4), wp.float64: ("double", 8)}[scalar]
@@ -70,7 +107,13 @@ def particle_access(scalar, slots: int) -> SimpleNamespace:
     @wp.func_native(*snippets(36, "wp::mat_t<6, 6, double>"))
     def matrix66(field: field66, i: int) -> mat66: ...
 
+    width = BYTES // size
+    whole = {"scalar": name, "width": width, "pieces": 36 // width}
+
+    @wp.func_native(PRODUCT.format(**whole), ADD_PRODUCT.format(**whole))
+    def times66(field: field66, i: int, x: vec6) -> vec6: ...
+
     @wp.func_native(*snippets(slots, f"wp::vec_t<{slots}, double>"))
     def parameters(field: fields, i: int) -> vector: ...
 
-    return SimpleNamespace(matrix33=matrix33, vector6=vector6, matrix66=matrix66, parameters=parameters)
+    return SimpleNamespace(matrix33=matrix33, vector6=vector6, matrix66=matrix66, times66=times66, parameters=parameters)
