@@ -102,9 +102,9 @@ def image_matrices(
     size, matrices = 3 * min(MODES, every), []
     directions = torch.eye(size, 3 * every, device=device).unflatten(1, (every, 3))
 
-    def images(c: Tensor, frame: int, window: Windows) -> Tensor:
-        """(S, P) pixels under S coefficients (S, K, 3)."""
-        shift, deformation = motion.displaced(c, torch.tensor([frame], device=device), carried.modes)
+    def images(c: Tensor, frame: Tensor, window: Windows) -> Tensor:
+        """(S, P) pixels of a frame (1,) under S coefficients (S, K, 3)."""
+        shift, deformation = motion.displaced(c, frame, carried.modes)
         colour, alpha = rasterize(
             splats.means + shift,
             carried_covariance(deformation, splats.scales, splats.rotations),
@@ -121,16 +121,17 @@ def image_matrices(
         return values[:, :: 2 * (values.shape[1] // (2 * VALUES)) + 1]  # an odd step meets all four channels
 
     for frame in range(1, len(offsets)):
-        here = motion.coefficients(torch.tensor([frame], device=device))
+        at = torch.tensor([frame], device=device)
+        here = motion.coefficients(at)
         own = windows.of_frame(frame)
         step = max(1, len(own) // views)
         chosen = range(frame % step, len(own), step)
         H = torch.zeros(size, size, dtype=torch.float64, device=device)
         for view in chosen:
             window = own.select(torch.tensor([view], device=device))
-            base = images(here, frame, window)
+            base = images(here, at, window)
             weight = ((base - some_of(window.images, window.mattes)).abs() + ABSOLUTE).rsqrt()
-            J = torch.cat([(images(here + STEP * some, frame, window) - base) / STEP for some in directions.split(TOGETHER)])
+            J = torch.cat([(images(here + STEP * some, at, window) - base) / STEP for some in directions.split(TOGETHER)])
             J = J * weight
             H += (J @ J.T).double() / J.shape[1] / len(chosen)
         matrices.append(H)
