@@ -85,7 +85,9 @@ class ProgressiveOperator(nn.Module):
 
     def constant_corrections(self, like: Tensor) -> Tensor:
         """(4, 3, 3). The numbers are learned in units of 1/input_scale: the networks' learning rate then fits them too."""
-        bound = torch.tensor([self.alpha] * 3 + [self.alpha_normal]).to(like)[:, None]
+        # filled where they are used: a copy from the host would wait for all that a GPU has still to do
+        bounds = ((3, self.alpha), (1, self.alpha_normal))
+        bound = torch.cat([torch.full((rows, 1), value, device=like.device) for rows, value in bounds]).to(like)
         return microplane.correction(bound * torch.tanh(self.scale * self.free).to(like))
 
     def constant_operator(self) -> Tensor:
