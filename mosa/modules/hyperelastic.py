@@ -144,14 +144,14 @@ class HyperelasticAdapter(Adapter):
 
     def forward(self, state: MaterialState) -> AdapterOperator:
         """G: C0 + S - beta C0 for every particle, (N, 6, 6) in Mandel scaling and units of 2 mu; h: (beta - 1, 0, ...), see
-        `share`.
+        `share`; views of one row.
 
         Errors: ConfigError before `switch_on`."""
         self.check_on()
         n, less = len(state.w), self.share() - 1
         added = self.correction() - less * isotropic_stiffness(self._poisson().double())
         h = torch.cat([less.reshape(1), less.new_zeros(5)])
-        return AdapterOperator(added.to(state.w).expand(n, 6, 6).contiguous(), h.to(state.w).expand(n, 6).contiguous())
+        return AdapterOperator(added.to(state.w).expand(n, 6, 6), h.to(state.w).expand(n, 6))
 
     def statistics(self) -> OperatorStatistics:
         """mean_abs_C: mean |entry| of S C0^-1, which is what the paper's C does to the stress at small strain; mean: the

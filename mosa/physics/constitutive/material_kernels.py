@@ -17,7 +17,6 @@ from mosa.physics.constitutive.particle_access import particle_access
 from mosa.physics.constitutive.strain import FACTORISED, STRAINS, conjugate_stress, green_strain, green_stress, material_strain
 
 vec6 = wp.types.vector(length=6, dtype=wp.float64)
-mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float64)
 
 
 @wp.func
@@ -64,6 +63,7 @@ def stress_kernel(stress, uses_rotation: bool, scalar, adapted: bool, strain: st
 
     strain: a name of `STRAINS`; the operator is then a stiffness in units of 2 mu, G in Mandel scaling, and what is
     added is the stress of the energy mu E : G : E, to 1 + h[0] times the prior's. shear: place of mu among the law's parameters.
+    G and h of one row are those of all particles, each of which adds to a row of its own of their gradients.
     """
     field33, field6, field66, fieldp = field_types(scalar)
     energetic = adapted and strain is not None
@@ -76,6 +76,7 @@ def stress_kernel(stress, uses_rotation: bool, scalar, adapted: bool, strain: st
         G: wp.array(dtype=field66), h: wp.array(dtype=field6), tau: wp.array(dtype=field33),
     ):  # fmt: skip
         i = wp.tid()
+        place = wp.min(i, G.shape[0] - 1)
         Fi = own.matrix33(F, i)
         R = Fi
         if wp.static(needs_rotation):
@@ -84,16 +85,16 @@ def stress_kernel(stress, uses_rotation: bool, scalar, adapted: bool, strain: st
         T = stress(Fi, R, own.matrix33(C_affine, i), p)
         if wp.static(energetic):
             modulus = wp.float64(2.0) * p[wp.static(shear)]
-            T = (wp.float64(1.0) + own.vector6(h, i)[0]) * T
+            T = (wp.float64(1.0) + own.vector6(h, i, place)[0]) * T
             if wp.static(factorised):
                 U, S, V = svd(Fi)
                 E = mandel(material_strain(wp.static(measure), Fi, S, V))
-                T = T + conjugate_stress(wp.static(measure), Fi, S, V, unmandel(modulus * own.times66(G, i, E)))
+                T = T + conjugate_stress(wp.static(measure), Fi, S, V, unmandel(modulus * own.times66(G, i, place, E)))
             else:
-                T = T + green_stress(Fi, unmandel(modulus * own.times66(G, i, mandel(green_strain(Fi)))))
+                T = T + green_stress(Fi, unmandel(modulus * own.times66(G, i, place, mandel(green_strain(Fi)))))
         elif wp.static(adapted):
             s = vech(wp.transpose(R) * T * R)
-            T = T + R * unvech(own.times66(G, i, s) + own.vector6(h, i)) * wp.transpose(R)
+            T = T + R * unvech(own.times66(G, i, place, s) + own.vector6(h, i, place)) * wp.transpose(R)
         tau[i] = field33(T)
 
     return stress_of_particles
@@ -124,7 +125,7 @@ def return_kernel(return_map, scalar, adapted: bool):
         E = deviator(H)
         if wp.static(adapted):
             # as an increment, so that a zero operator leaves the plain map bit for bit
-            E = E + deviator(unvech(own.times66(G, i, vech(E)) + own.vector6(h, i)))
+            E = E + deviator(unvech(own.times66(G, i, i, vech(E)) + own.vector6(h, i, i)))
         mapped, yielded = return_map(
             trial, Fi, Ci, R, U, S, V, H, wp.ddot(E, E), norm_eps, own.parameters(parameters, i), dt
         )

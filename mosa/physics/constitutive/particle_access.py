@@ -2,8 +2,12 @@
 
 The adjoint that Warp generates for `field[i]` adds to the gradient one number at a time, atomically: 36 for a stress operator, each
 in a transaction of its own on a GPU. Here nobody else adds to particle i, so its gradient is read, added to and written back, 16
-bytes at a time where the size of a particle's part allows it. Arrays must be contiguous and begin at a multiple of 16 bytes, see
+bytes at a time where the size of a particle's part allows it; pieces to which nothing is added are left alone, which costs nothing
+where the compiler sees that a law does not read them. Arrays must be contiguous and begin at a multiple of 16 bytes, see
 `launching.aligned`.
+
+An operator may be the same for many particles: it is read at a `place` that they share, and its gradient is added to each
+particle's own.
 """
 
 from functools import cache
@@ -21,7 +25,7 @@ PIECE = """
     struct Piece {{ {scalar} part[{width}]; }};
 #endif"""
 LOAD = """
-    const Piece* source = reinterpret_cast<const Piece*>(field.data + i);
+    const Piece* source = reinterpret_cast<const Piece*>(field.data + {place});
     {result} value;
     double* target = reinterpret_cast<double*>(&value);
 #pragma unroll
@@ -37,6 +41,10 @@ ADD = """
     const double* source = reinterpret_cast<const double*>(&adj_ret);
 #pragma unroll
     for (int k = 0; k < {pieces}; ++k) {{
+        bool any = false;
+#pragma unroll
+        for (int l = 0; l < {width}; ++l) any = any || source[{width} * k + l] != 0.0;
+        if (!any) continue;
         Piece piece = target[k];
 #pragma unroll
         for (int l = 0; l < {width}; ++l) piece.part[l] += static_cast<{scalar}>(source[{width} * k + l]);
@@ -47,7 +55,7 @@ ADD = """
 # of a 6 x 6 matrix and a vector, in the order of Warp's own product: neither the matrix nor its gradient is held in float64, for
 # which a GPU's thread has not enough registers
 PRODUCT = PIECE + """
-    const Piece* source = reinterpret_cast<const Piece*>(field.data + i);
+    const Piece* source = reinterpret_cast<const Piece*>(field.data + place);
     wp::vec_t<6, double> value;
 #pragma unroll
     for (int k = 0; k < {pieces}; ++k) {{
@@ -61,7 +69,7 @@ PRODUCT = PIECE + """
     }}
     return value;"""
 ADD_PRODUCT = PIECE + """
-    const Piece* source = reinterpret_cast<const Piece*>(field.data + i);
+    const Piece* source = reinterpret_cast<const Piece*>(field.data + place);
     Piece* target = reinterpret_cast<Piece*>(adj_field.data + i);
     wp::vec_t<6, double> sums;
 #pragma unroll
@@ -82,38 +90,34 @@ ADD_PRODUCT = PIECE + """
 
 @cache
 def particle_access(scalar, slots: int) -> SimpleNamespace:
-    """matrix33, vector6, matrix66 and parameters (vectors of `slots` numbers): f(field, i) -> the same in float64; times66(field,
-    i, x) -> matrix66(field, i) * x.
+    """matrix33 and parameters (vectors of `slots` numbers): f(field, i) -> the same in float64; vector6(field, i, place) -> that at
+    `place`; times66(field, i, place, x) -> the matrix at `place` times x.
 
-    scalar: of the fields, wp.float32 or wp.float64. No other thread may work on particle i."""
+    scalar: of the fields, wp.float32 or wp.float64. No other thread may work on particle i, to whose gradients is added."""
     name, size = {wp.float32: ("float", 4), wp.float64: ("double", 8)}[scalar]
 
-    def snippets(count: int, result: str) -> tuple[str, str]:
+    def snippets(count: int, result: str, place: str = "i") -> tuple[str, str]:
         width = next(k for k in (BYTES // size, BYTES // 2 // size, 1) if count % k == 0)
-        parts = {"scalar": name, "width": width, "pieces": count // width, "result": result}
+        parts = {"scalar": name, "width": width, "pieces": count // width, "result": result, "place": place}
         return (PIECE + LOAD).format(**parts), (PIECE + ADD).format(**parts)
 
     field33, field66 = (wp.array(dtype=wp.types.matrix(shape=(k, k), dtype=scalar)) for k in (3, 6))
     field6, fields = (wp.array(dtype=wp.types.vector(length=k, dtype=scalar)) for k in (6, slots))
-    mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float64)
     vec6, vector = (wp.types.vector(length=k, dtype=wp.float64) for k in (6, slots))
 
     @wp.func_native(*snippets(9, "wp::mat_t<3, 3, double>"))
     def matrix33(field: field33, i: int) -> wp.mat33d: ...
 
-    @wp.func_native(*snippets(6, "wp::vec_t<6, double>"))
-    def vector6(field: field6, i: int) -> vec6: ...
-
-    @wp.func_native(*snippets(36, "wp::mat_t<6, 6, double>"))
-    def matrix66(field: field66, i: int) -> mat66: ...
+    @wp.func_native(*snippets(6, "wp::vec_t<6, double>", "place"))
+    def vector6(field: field6, i: int, place: int) -> vec6: ...
 
     width = BYTES // size
     whole = {"scalar": name, "width": width, "pieces": 36 // width}
 
     @wp.func_native(PRODUCT.format(**whole), ADD_PRODUCT.format(**whole))
-    def times66(field: field66, i: int, x: vec6) -> vec6: ...
+    def times66(field: field66, i: int, place: int, x: vec6) -> vec6: ...
 
     @wp.func_native(*snippets(slots, f"wp::vec_t<{slots}, double>"))
     def parameters(field: fields, i: int) -> vector: ...
 
-    return SimpleNamespace(matrix33=matrix33, vector6=vector6, matrix66=matrix66, times66=times66, parameters=parameters)
+    return SimpleNamespace(matrix33=matrix33, vector6=vector6, times66=times66, parameters=parameters)

@@ -37,7 +37,10 @@ class HeldSegment(Stretch):
 
     def buffers(self, solver: SegmentSolver, acting: Sequence[Tensor | None], full: bool) -> tuple[Workspace, dict]:
         held = dict(zip(HELD, acting, strict=True))
-        return solver.workspace(self.substeps, held["G"] is not None, held["plastic_G"] is not None, full), held
+        operator = [held[name] for name in ("G", "h") if held[name] is not None]
+        # views of one row, as `expand` makes them, are read from there by all particles
+        shared = bool(operator) and all(part.stride(0) == 0 for part in operator)
+        return solver.workspace(self.substeps, bool(operator), held["plastic_G"] is not None, full, shared), held
 
     def advance(self, work: Workspace, acting: Sequence[Tensor | None]) -> None:
         work.advance()

@@ -65,12 +65,14 @@ class SegmentSolver:
     def worlds(self) -> int:
         return len(self.gravities)
 
-    def workspace(self, substeps: int, adapted: bool, plastic_adapted: bool, with_adjoint: bool) -> Workspace:
-        key = (len(self.volume), substeps, adapted, plastic_adapted, with_adjoint, self.worlds)
+    def workspace(
+        self, substeps: int, adapted: bool, plastic_adapted: bool, with_adjoint: bool, shared: bool = False
+    ) -> Workspace:
+        key = (len(self.volume), substeps, adapted, plastic_adapted, with_adjoint, self.worlds, shared)
         if key not in self.workspaces:
             self.workspaces[key] = Workspace(
                 self.numerics, len(self.volume), substeps, adapted=adapted, plastic_adapted=plastic_adapted,
-                with_adjoint=with_adjoint, worlds=self.worlds,
+                with_adjoint=with_adjoint, worlds=self.worlds, shared=shared,
             )  # fmt: skip
         return self.workspaces[key]
 

@@ -36,14 +36,14 @@ class Workspace:
     """Buffers for N particles and `slots` stored substeps (2 states and 1 grid when nothing is stored).
 
     worlds: among which the particles are shared in equal parts, one world's after the other's; adapted, plastic_adapted: whether a
-    stress operator and a plastic operator act; with_adjoint: also buffers for the adjoint; pointed: no buffers for the operators,
-    which only `point` gives.
+    stress operator and a plastic operator act; shared: the stress operator is the same for all particles, with gradients by
+    particle; with_adjoint: also buffers for the adjoint; pointed: no buffers for the operators, which only `point` gives.
     """
 
     @torch.inference_mode(False)
     def __init__(
         self, numerics: Numerics, particles: int, substeps: int, *, adapted: bool, plastic_adapted: bool, with_adjoint: bool,
-        pointed: bool = False, worlds: int = 1,
+        pointed: bool = False, worlds: int = 1, shared: bool = False,
     ) -> None:  # fmt: skip
         self.worlds, self.size = worlds, particles // worlds
         self.numerics, self.particles, self.substeps, self.with_adjoint = numerics, particles, substeps, with_adjoint
@@ -71,8 +71,8 @@ class Workspace:
         }  # fmt: skip
         self.held, self.held_wp = {}, {}
         for name, (shape, kind) in shapes.items():
-            size = shape if name == "parameters" or not pointed else (1, *shape[1:])
-            self.held[name], self.held_wp[name] = self.array(size, kind)
+            one = name != "parameters" and (pointed or (shared and name in ("G", "h")))
+            self.held[name], self.held_wp[name] = self.array((1, *shape[1:]) if one else shape, kind)
         if with_adjoint:
             self.adj_x, self.adj_x_wp = self._per_slot(2, (n, 3), self.kernels.vec3)
             self.adj_v, self.adj_v_wp = self._per_slot(2, (n, 3), self.kernels.vec3)
@@ -195,7 +195,7 @@ class Workspace:
 
     def hold(self, held: dict[str, Tensor | None]) -> None:
         """Copy parameters and the adapter's operator in, those that are given."""
-        given = {name: value for name, value in held.items() if value is not None}
+        given = {name: value[: len(self.held[name])] for name, value in held.items() if value is not None}
         torch._foreach_copy_([self.held[name] for name in given], list(given.values()))
 
     def point(self, held: dict[str, Tensor | None]) -> None:
