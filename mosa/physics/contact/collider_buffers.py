@@ -93,15 +93,16 @@ class ColliderBuffers:
     def _arguments(self, place: list, step: int, time: float) -> list:
         return [*place, 1.0 / time, self.count, step, *self._packed, *self._poses]
 
-    def apply(self, step: int, place: list, time: float, velocity) -> None:
-        """Contact at substep `step`, on node velocities in place. place: grid, cutoff, dx; time [s]: for which the
-        substep's forces act."""
-        self._work.over_nodes(self.kernels.collide_nodes, [
-            *self._arguments(place, step, time), velocity, *self._added_to(self._reaction, self._reaction_sums),
+    def update(self, step: int, place: list, time: float, velocity, cleared) -> None:
+        """The grid update of substep `step` with contact. place, velocity, cleared: as `update_kernels` takes them; time [s]: for
+        which the substep's forces act."""
+        self._work.over_nodes(self.kernels.update_and_collide, [
+            *self._arguments(place, step, time), velocity, cleared, *self._added_to(self._reaction, self._reaction_sums),
         ])  # fmt: skip
 
     def adjoint(self, step: int, place: list, time: float, adj_velocity) -> None:
-        """Turns the adjoint of node velocities after contact into that before it; `before` holds those velocities."""
+        """Turns the adjoint of node velocities after contact into that before it; `before` holds those velocities. place: grid,
+        cutoff, dx."""
         self._work.over_nodes(self.kernels.adj_collide_nodes, [
             *self._arguments(place, step, time), self.before_wp, *self._adj_reaction, adj_velocity, self._adj_mass,
             *self._added_to(self._adj_poses, self._adj_sums),

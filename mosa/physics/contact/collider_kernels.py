@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from mosa.exact_sums import sum_functions
+from mosa.physics.contact.grid_update import update_kernels
 from mosa.physics.contact.planes import make_fade, make_normal_adjoint, make_plane_functions
 from mosa.physics.contact.shapes import shape_functions
 from mosa.physics.grid.node_access import node_access
@@ -23,7 +24,8 @@ from mosa.physics.grid.stencil import node_functions
 
 @cache
 def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
-    """Kernels collide_nodes, adj_collide_nodes, add_mass for wp.float32 or wp.float64 fields.
+    """Kernels update_and_collide (`grid_update` of planes, then the colliders), adj_collide_nodes, add_mass for wp.float32 or
+    wp.float64 fields.
 
     exact: what nodes add up, reactions and the adjoints of poses, are exact sums (substeps, W K, numbers, COLUMNS) int64."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
@@ -36,7 +38,9 @@ def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
     signed_distance, curvature = shape.signed_distance, shape.curvature
     nodes = node_functions(scalar)
     node_position, nodes_of = nodes.node_position, nodes.nodes_of
-    load3, store3 = node_access(scalar).load3, node_access(scalar).store3
+    memory, planar = node_access(scalar), update_kernels(scalar)
+    load3, load4, store3, clear = memory.load3, memory.load4, memory.store3, memory.clear
+    free_velocity, plane_contact = planar.free_velocity, planar.contact
     module = f"mosa.physics.{'exact_' if exact else ''}colliders_{scalar.__name__}"
     vectors = wp.array4d(dtype=wp.int64) if exact else wp.array2d(dtype=vec3)
     matrices = wp.array4d(dtype=wp.int64) if exact else wp.array2d(dtype=mat33)
@@ -87,22 +91,28 @@ def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
         return out
 
     @wp.kernel(module=module, enable_backward=False)
-    def collide_nodes(
-        window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4), cutoff: scalar, dx: scalar,
+    def update_and_collide(
+        window: wp.array(dtype=wp.vec3i), threads: int, grid: wp.array(dtype=vec4), impulses: wp.array(dtype=vec3), cutoff: scalar,
+        dx: scalar, planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), plane_count: int,
         inv_dt: scalar, count: int, substep: int, shapes: wp.array2d(dtype=scalar), codes: wp.array2d(dtype=int),
         fields: wp.array(dtype=scalar), position: wp.array2d(dtype=vec3), rotation: wp.array2d(dtype=mat33),
         linear: wp.array2d(dtype=vec3), angular: wp.array2d(dtype=vec3), velocity: wp.array(dtype=vec4),
-        force: vectors, torque: vectors,
+        cleared: wp.array(dtype=vec4), force: vectors, torque: vectors,
     ):  # fmt: skip
-        """Changes velocity in place, adds to force and torque of the substep."""
+        """Writes velocity, adds to force and torque of the substep. In one launch: another one would read and write all velocities
+        again, and most nodes touch no collider."""
         world = wp.tid() / threads
+        impulse = impulses[world]
         first, end = nodes_of(window, world)
         for node in range(first + wp.tid() - world * threads, end, threads):
-            m = grid[node][3]
+            g = load4(grid, node)
+            m = g[3]
+            u = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
             if m > cutoff:
-                now = velocity[node]  # changed in place, which `load3` is not for
-                u = vec3(now[0], now[1], now[2])
+                u = free_velocity(g, impulse)
                 y = node_position(node - first, window[3 * world], window[3 * world + 1], dx)
+                if plane_count > 0:
+                    u = plane_contact(u, y, planes, modes, plane_count)
                 for k in range(count):
                     c = world * count + k
                     after = respond(u, y, k, c, substep, shapes, codes, fields, position, rotation, linear, angular)
@@ -111,7 +121,9 @@ def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
                         add_vector(force, substep, c, f)
                         add_vector(torque, substep, c, wp.cross(y - position[substep, c], f))
                     u = after
-                store3(velocity, node, u)
+            store3(velocity, node, u)
+            if cleared:
+                clear(cleared, node)
 
     @wp.kernel(module=module, enable_backward=False)
     def adj_collide_nodes(
@@ -191,5 +203,6 @@ def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
             adj_grid[node] = adj_grid[node] + vec4(z, z, z, adj_mass[node])
 
     return SimpleNamespace(
-        collide_nodes=collide_nodes, adj_collide_nodes=adj_collide_nodes, add_mass=add_mass, vec3=vec3, vec4=vec4, mat33=mat33
-    )
+        update_and_collide=update_and_collide, adj_collide_nodes=adj_collide_nodes, add_mass=add_mass, vec3=vec3,
+        vec4=vec4, mat33=mat33,
+    )  # fmt: skip

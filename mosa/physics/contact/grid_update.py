@@ -12,10 +12,10 @@ from mosa.physics.grid.stencil import node_functions
 
 @cache
 def update_kernels(scalar) -> SimpleNamespace:
-    """Kernels grid_update, adj_grid for wp.float32 or wp.float64 fields.
+    """Kernels grid_update, adj_grid for wp.float32 or wp.float64 fields, and the functions free_velocity, contact.
 
-    They are launched with `threads` for each world and take all nodes of its window, however many threads that is. cleared: what
-    the next substep's particles add to, None where there is none; a launch of its own would take as long as this one."""
+    The kernels are launched with `threads` for each world and take all nodes of its window, however many threads that is. cleared:
+    what the next substep's particles add to, None where there is none; a launch of its own would take as long as this one."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
     vec4 = wp.types.vector(length=4, dtype=scalar)
     collide, adj_collide = make_plane_functions(scalar)
@@ -122,4 +122,4 @@ def update_kernels(scalar) -> SimpleNamespace:
             if cleared:
                 clear(cleared, node)
 
-    return SimpleNamespace(grid_update=grid_update, adj_grid=adj_grid)
+    return SimpleNamespace(grid_update=grid_update, adj_grid=adj_grid, free_velocity=free_velocity, contact=contact)

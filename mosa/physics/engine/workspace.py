@@ -264,9 +264,6 @@ class Workspace:
             numerics.plane_count,
         ]  # fmt: skip
 
-    def _collider_place(self, slot: int) -> list:
-        return [self.grid_wp[slot], self.cutoff, self.numerics.dx]
-
     def _stress_arguments(self, state: int, slot: int) -> list:
         held = self.held_wp
         return [self.F_wp[state], self.C_affine_wp[state], held["parameters"], held["G"], held["h"], self.tau_wp[slot]]
@@ -297,9 +294,10 @@ class Workspace:
                 *(geometry if step else kicked), int(numerics.check_J), step, self.flags_wp, self._added_to(self.grid_wp[g]),
             ])  # fmt: skip
             self._settle(self.grid_wp[g])
-            self.over_nodes(self.update.grid_update, [*self._grid_arguments(g, step), self.velocity_wp[g], cleared])
-            if self.colliders is not None:
-                self.colliders.apply(step, self._collider_place(g), self._kick(step), self.velocity_wp[g])
+            if self.colliders is None:
+                self.over_nodes(self.update.grid_update, [*self._grid_arguments(g, step), self.velocity_wp[g], cleared])
+            else:
+                self.colliders.update(step, self._grid_arguments(g, step), self._kick(step), self.velocity_wp[g], cleared)
             self.run(kernels.g2p, n, [
                 self.x_wp[a], self.F_tot_wp[a], self.velocity_wp[g], *geometry, low, high, step, self.flags_wp,
                 self.x_wp[b], self.v_wp[b], self.C_affine_wp[b], self.F_tot_wp[b],
@@ -313,7 +311,7 @@ class Workspace:
         """Launch the adjoint of `advance_steps`: from the seeds in slot (first + count) % 2 to slot first % 2.
 
         adj_held is of these substeps alone; more: but the parameters' part is added to what is there."""
-        kernels, n, held = self.kernels, self.particles, self.adj_held_wp
+        kernels, numerics, n, held = self.kernels, self.numerics, self.particles, self.adj_held_wp
         geometry, kicked = self._geometry(self.steps.dt), self._geometry(self.steps.kick)
         (self.adj_operator_wp if more else self.all_adj_wp).zero_()
         if self.colliders is not None and first + count == self.substeps:
@@ -339,7 +337,8 @@ class Workspace:
             if self.colliders is not None:
                 # the velocities that the colliders found are cheaper to compute again than to keep
                 self.over_nodes(self.update.grid_update, [*self._grid_arguments(step, step), self.colliders.before_wp, None])
-                self.colliders.adjoint(step, self._collider_place(step), self._kick(step), adj_velocity)
+                place = [self.grid_wp[step], self.cutoff, numerics.dx]
+                self.colliders.adjoint(step, place, self._kick(step), adj_velocity)
             self.over_nodes(self.update.adj_grid, [*self._grid_arguments(step, step), adj_velocity, self.adj_grid_wp, cleared])
             if self.colliders is not None:
                 self.colliders.add_mass(self.adj_grid_wp)
