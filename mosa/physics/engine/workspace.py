@@ -22,7 +22,7 @@ from mosa.physics.engine.capture import Graphs, WarpCapture
 from mosa.physics.engine.numerics import Numerics, State, Steps
 from mosa.physics.grid.transfer_kernels import NO_EVENT, transfer_kernels
 from mosa.physics.grid.window import SMALL
-from mosa.physics.launching import SCALARS, aligned, copies, launch, zeros_in_one
+from mosa.physics.launching import SCALARS, aligned, copies, copy_all, launch, zeros_in_one
 
 SPARE = 8
 """Room for larger windows: half as many nodes again, at most `window.SMALL`, or one in so many where that is more. A window that
@@ -121,7 +121,7 @@ class Workspace:
 
     def rewind(self, tape: Sequence[Tensor]) -> None:
         """As if the forward pass that left `tape`, in the window that is set, had just run."""
-        torch._foreach_copy_(self._particle_slots(), list(tape[:-1]))
+        copy_all(self._particle_slots(), tape[:-1])
         self.grid_slots().copy_(tape[-1])
 
     def _particle_slots(self) -> list[Tensor]:
