@@ -90,7 +90,9 @@ def make(overrides: list[str], folder: Path, device: str) -> Path:
     path = folder / f"{name}_{len(body.rest)}.pt"
     folder.mkdir(parents=True, exist_ok=True)
     torch.save(problem, path)
-    for prefix, s in sequences.items():
+    for (prefix, s), each in zip(sequences.items(), made.sequences):
+        laid = (body.rest - body.center) @ each.start.rotation.T + each.start.center
+        print(f"{path}: start of {prefix} off by {rms_mm(laid[chosen].cpu() - s['truth'][0]):.2f} mm", flush=True)
         if s["cues"] is not None:
             seen, contact = s["cues"]["positions"][:, chosen], s["contact"]
             off = rms_mm((seen - s["truth"][: len(seen)])[contact:])

@@ -23,7 +23,7 @@ from mosa.reconstruction.filling import body_volume
 from mosa.reconstruction.hull import hull_bounds, visual_hull
 from mosa.reconstruction.pipeline import object_geometry
 from mosa.reconstruction.settings import ReconstructionSettings
-from mosa.reconstruction.starts import first_contact, sequence_start
+from mosa.reconstruction.starts import appearance_of, first_contact, sequence_start
 from mosa.rendering.cameras import project
 from mosa.rendering.covariance import covariance_from
 from mosa.types import Cameras, Reconstruction, Scene
@@ -153,7 +153,7 @@ def volume_figures(seen: Seen, published: dict) -> dict:
 def flight_figures(seen: Seen, published: dict) -> dict:
     """Parabola through the centre of mass over the free frames, and the velocity that learning starts from."""
     scene, result, body = seen.scene, seen.result, seen.run.body
-    start = sequence_start(body, result.splats, scene, register=False)
+    start = sequence_start(body, appearance_of(body), scene, register=False)
     free = first_contact(body, start, scene)
     weight = (result.volume / result.volume.sum()).double()
     centre = torch.einsum("n,tna->ta", weight, result.cues.positions[:free].double()).numpy()

@@ -27,7 +27,7 @@ from mosa.reconstruction.moved import SecondLook
 from mosa.reconstruction.pipeline import follow, reconstruct, spacing_for, stored
 from mosa.reconstruction.resolution import grid_spacing
 from mosa.reconstruction.settings import ReconstructionSettings, build_settings
-from mosa.reconstruction.starts import first_contact, sequence_start
+from mosa.reconstruction.starts import appearance_of, first_contact, sequence_start
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import use_backend
 from mosa.run import most_particles
@@ -133,11 +133,11 @@ class Run:
 
         Prefixes: train, then train/<name> for the sequences that are learned from, test/<name> for the rest, in their order."""
         body, (training, others) = self.body, self.scenes
-        splats = self.reconstruction.splats.to(body.rest.device)  # where its images are rendered
-        found = {"train": sequence_start(body, splats, training, register=False)}
+        seen = appearance_of(body)
+        found = {"train": sequence_start(body, seen, training, register=False)}
         for scene in tqdm(others, "poses of the other sequences", leave=False):
             prefix = f"{'train' if scene.sequence in self.taught else 'test'}/{scene.sequence}"
-            found[prefix] = sequence_start(body, splats, scene, register=True)
+            found[prefix] = sequence_start(body, seen, scene, register=True)
         return found
 
     @property

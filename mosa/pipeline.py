@@ -28,7 +28,7 @@ from mosa.outputs import figures_of, optimized, start_figures, write_outputs
 from mosa.physics.contact.colliders import colliders_from_config
 from mosa.plan import plan, plan_text
 from mosa.reconstruction.resolution import ENOUGH, resolution
-from mosa.reconstruction.starts import sequence_start, splats_of
+from mosa.reconstruction.starts import appearance_of, sequence_start
 from mosa.rollout_file import save_observed
 from mosa.run import (
     begins_from,
@@ -160,8 +160,8 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     scene, held_out = scenes(evaluated_scene(cfg, twin))
     body, world = twin.body, twin.world
     if cfg.get("scene"):
-        splats = splats_of(body)
-        found = {f"test/{s.sequence}": sequence_start(body, splats, s, register=True) for s in (scene, *held_out)}
+        seen = appearance_of(body)
+        found = {f"test/{s.sequence}": sequence_start(body, seen, s, register=True) for s in (scene, *held_out)}
         # the body moves in the world that the scene shows, among the run's walls and colliders
         world = build_world(world_config(scene) | (twin.config["cfg"].get("world") or {}))
     else:

@@ -29,11 +29,18 @@ Motion = ModalMotion | MotionBasisNetwork
 
 @dataclass(frozen=True)
 class Scaffold:
-    """Gaussians at rest with the modes at their positions and, where they are the particles, their neighbourhoods."""
+    """Gaussians at rest with the modes at their positions and, where they are the particles, their neighbourhoods; shades: (T, M)
+    factors of their colours in every frame, None where the light is not known."""
 
     splats: Splats
     modes: Modes
     around: Neighbourhood | None = None
+    shades: Tensor | None = None
+
+    def colors(self, frames: Tensor) -> Tensor:
+        """(S, M, 3) in frames (S,), (1, M, 3) where they are the same in all."""
+        colors = self.splats.colors[None]
+        return colors if self.shades is None else colors * self.shades[frames][..., None]
 
 
 @dataclass(frozen=True)
@@ -128,12 +135,12 @@ class Objective:
     def __call__(self, frames: Tensor, batch: Windows, state: Tensor) -> Tensor:
         """frames: (S,) long; state: (B,) which of them each window shows."""
         carried, settings = self.carried, self.settings
-        sample = self.motion(frames, carried.splats, carried.modes, carried.around)
+        sample, colors = self.motion(frames, carried.splats, carried.modes, carried.around), carried.colors(frames)
         image, alpha = rasterize(
             sample.positions,
             sample.covariances,
             carried.splats.opacities,
-            carried.splats.colors[None],
+            colors if len(colors) == 1 else colors[state],
             batch.cameras,
             state,
             self.background,

@@ -22,7 +22,7 @@ from mosa.reconstruction.modes import coefficients_of
 from mosa.reconstruction.motion import ModalMotion
 from mosa.reconstruction.observed import Windows
 from mosa.reconstruction.uniform_adam import UniformAdam
-from mosa.schema import COUNT, POSITIVE, WEIGHT, check_knobs, knob, whole
+from mosa.schema import COUNT, POSITIVE, WEIGHT, check_knobs, knob, one_of, whole
 
 WORSE, SLACK = 1.2, 0.005
 """A prediction has misled the fit where the loss of images is more than so many times the first motion's, and so much beside. On
@@ -38,7 +38,9 @@ what was seen of a liquid's late frames may be a tenth of a metre off."""
 class InformedSettings:
     """iterations: 0 for never; views: of every frame in each; lr: its step in units of the object's radius; elastic, bending:
     weights of the energies, counted from the prediction, as in `DynamicSettings`; response: views of every frame from which it is
-    found how much of the prediction stays in what is seen (`response`), 0 for not at all."""
+    found how much of the prediction stays in what is seen (`response`), 0 for not at all; carriers: Gaussians compared with
+    the images: `fitted`, those that were fitted to all frames, in their light (`carried`), where there are any; `first`, those of
+    the first motion."""
 
     iterations: int = knob(80, whole(0))
     views: int = knob(1, COUNT)
@@ -46,6 +48,7 @@ class InformedSettings:
     elastic: float = knob(0.3, WEIGHT)
     bending: float = knob(1.0, WEIGHT)
     response: int = knob(4, whole(0))
+    carriers: str = knob("fitted", one_of("fitted", "first"))
 
     def __post_init__(self) -> None:
         check_knobs(self, "reconstruction.informed")

@@ -22,7 +22,9 @@ from mosa.reconstruction.motion import MotionSample
 from mosa.reconstruction.observed import Windows, object_windows
 from mosa.reconstruction.response import MODES, Response, image_matrices, response_of
 from mosa.reconstruction.settings import ReconstructionSettings
+from mosa.rendering.carrying import bind
 from mosa.rendering.covariance import carried_covariance
+from mosa.rendering.lighting import turned_basis
 from mosa.rendering.rasterizer import rasterize
 from mosa.threads import threaded
 from mosa.types import MotionCues, Reconstruction, Scene, Splats
@@ -146,7 +148,7 @@ class SecondLook:
             return self.cues(positions), None
         frames = len(positions) - 1
         with tqdm(total=frames, desc=f"what images of {scene.sequence} tell", disable=not self.progress, leave=False) as steps:
-            matrices = image_matrices(parts.scaffold, parts.carried, windows, parts.centres, self._background(), positions,
+            matrices = image_matrices(parts.scaffold, self._carried, windows, parts.centres, self._background(), positions,
                                       reach=parts.reach, views=settings.response, progress=steps.update)
         response, strength, left = response_of(parts.scaffold.modes, matrices, about, positions, second[1], second[0],
                                                first_contact)
@@ -168,6 +170,17 @@ class SecondLook:
         about, share = (written[name].to(modes.values) for name in ("about", "share"))
         return Response(about, share, modes.values[:, :K], modes.gradient[..., :K])
 
+    @cached_property
+    def _carried(self) -> Scaffold:
+        """What is compared with the images."""
+        parts, appearance = self.reconstruction.moving, self.reconstruction.appearance
+        if self.settings.informed.carriers == "first" or appearance is None or appearance.light is None:
+            return parts.carried
+        appearance = appearance.to(self.device)
+        splats, seen = appearance.splats, self._seen(None)
+        turns = turned_basis(appearance.normals, bind(splats.means, parts.splats.means).carry(seen).rotations)
+        return Scaffold(splats, parts.scaffold.modes.at(splats.means, parts.splats.means), shades=(turns @ appearance.light).exp())
+
     def _seen(self, seen: Tensor | None) -> Tensor:
         return (self.reconstruction.cues.positions if seen is None else seen).to(self.reconstruction.moving.centres)
 
@@ -183,7 +196,7 @@ class SecondLook:
         parts, settings, sequence = self.reconstruction.moving, self.settings, self.scene.sequence
         title = f"motion of {sequence} about the prediction"
         with tqdm(total=settings.informed.iterations, desc=title, disable=not self.progress, leave=False) as steps:
-            found = informed_motion(parts.scaffold, parts.carried, windows, parts.centres, self._background(),
+            found = informed_motion(parts.scaffold, self._carried, windows, parts.centres, self._background(),
                                     predicted.to(seen), seen, settings.informed, settings.dynamic, reach=parts.reach,
                                     seed=self.seed, progress=steps.update)  # fmt: skip
         if found is None:

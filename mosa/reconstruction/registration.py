@@ -3,10 +3,13 @@ compare.
 
 The body is a set of splats that moves rigidly: x = Q (X - X_c) + x_c. Colour and matte of its rendering are
 compared with the images by robust least squares over poses (Levenberg-Marquardt), from many rotations at first,
-coarse to fine; geometry alone would not fix a ball.
+coarse to fine; geometry alone would not fix a ball. Its colours are those of another pose, in a light that stayed while it turned:
+the eight numbers of that light are found along with the pose at the end, so that a bright side does not turn the body.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,11 +22,13 @@ from mosa.reconstruction.rigid import (
     damped,
     huber,
     left_jacobian,
+    lit_equations,
     make_level,
     normal_equations,
     rotation_exp,
 )
 from mosa.rendering.covariance import quaternion_to_matrix
+from mosa.rendering.lighting import LIGHT
 from mosa.types import Cameras, Splats
 
 
@@ -107,6 +112,49 @@ def coarse_poses(body: RigidBody, level: Level, center: Tensor, background: Tens
     return poses.take(cost.argsort()[:keep])
 
 
+class Registered(NamedTuple):
+    """A pose Q (3, 3), x_c (3,) [m], and the light (8,) that stayed while the body turned into it, None where it was not sought."""
+
+    rotation: Tensor
+    center: Tensor
+    light: Tensor | None
+
+
+def refine_lit(
+    body: RigidBody, level: Level, pose: Poses, before: Tensor, background: Tensor, *, iterations: int = 8, moves: bool = True
+) -> tuple[Poses, Tensor]:
+    """One pose and its light (8,), fitted together by Levenberg-Marquardt steps from the light `before`; moves: whether the pose is
+    fitted too, or known. body: with normals."""
+    best, trial, state, damping = (pose, before), (pose, before), None, torch.full((1,), 1e-3).to(before)
+    for _ in range(iterations):
+        found = lit_equations(body, level, *trial, before, background)
+        if state is None or found[0] < state[0]:
+            best, state, damping = trial, found, damping / 3
+        else:
+            damping = damping * 6
+        free = slice(0 if moves else 6, None)
+        step = torch.zeros(6 + LIGHT).to(before)
+        step[free] = damped(state[1][None, free], state[2][None, free, free], damping)[0]
+        trial = (best[0].moved(step[None, :3], step[None, 3:6] / body.radius), best[1] + step[6:])
+        if float(step[:6].norm()) < 2e-3 * level.pixel and float(step[6:].norm()) < 1e-3:
+            break
+    return best
+
+
+def light_of(
+    splats: Splats, normals: Tensor, pose: tuple[Tensor, Tensor], images: Tensor, mattes: Tensor, cameras: Cameras, *,
+    background: Tensor, rest_center: Tensor, before: Tensor | None = None,
+) -> Tensor:  # fmt: skip
+    """The light (8,) under which a body in a known pose (Q, x_c) looks as one frame shows it, from its colours at rest. normals:
+    (N, 3) at rest; before: (8,) what is known of the light; the rest as of `register_pose`."""
+    body = RigidBody.of(splats, rest_center, normals)
+    images, mattes, cameras = images[:, None].to(body.arm), mattes[:, None].to(body.arm), cameras.to(body.arm.device)
+    Q, center = (x.to(body.arm) for x in pose)
+    level = make_level(images, mattes, cameras, center, None)
+    before = torch.zeros(LIGHT).to(body.arm) if before is None else before.to(body.arm)
+    return refine_lit(body, level, Poses(Q[None], center[None]), before, background.to(body.arm), moves=False)[1]
+
+
 def register_pose(
     splats: Splats,
     images: Tensor,
@@ -115,20 +163,23 @@ def register_pose(
     *,
     background: Tensor,
     rest_center: Tensor,
+    normals: Tensor | None = None,
+    light: Tensor | None = None,
     rotations: int = 600,
     starts: int = 24,
     coarse_views: int = 6,
     seed: int = 0,
-) -> tuple[Tensor, Tensor]:
+) -> Registered:
     """Rigid pose of a known body in one frame: Q (3, 3) and centre x_c (3,) [m], x = Q (X - X_c) + x_c.
 
-    splats: the body at rest; images: (V, H, W, 3) on `background` (3,); mattes: (V, H, W); rest_center: X_c (3,) [m].
+    splats: the body at rest; images: (V, H, W, 3) on `background` (3,); mattes: (V, H, W); rest_center: X_c (3,) [m]; normals:
+    (N, 3) of the splats at rest, None where the light is not to be told from the colours; light: (8,) what is known of it.
     `rotations` are tried at about 28 px with at most `coarse_views` views, the best `starts` refined there, the best 3
     at about 56 px, the best at full resolution with all views. Errors: DataError where fewer than two views see the
     object.
     """
     middle = splats.means.detach().mean(0)  # about which the body turns while searching, wherever X_c is
-    body = RigidBody.of(splats, middle)
+    body = RigidBody.of(splats, middle, normals)
     background = background.to(body.arm)
     images, mattes = images[:, None].to(body.arm), mattes[:, None].to(body.arm)
     cameras = cameras.to(body.arm.device)
@@ -145,8 +196,12 @@ def register_pose(
     best = poses.take(cost.argsort()[:1])
     level = make_level(images, mattes, cameras, center, None)
     best, _ = refine(body, level, best, background, iterations=8, central=True)
+    found = None
+    if normals is not None:
+        before = torch.zeros(LIGHT).to(body.arm) if light is None else light.to(body.arm)
+        best, found = refine_lit(body, level, best, before, background)
     Q = best.rotation[0]
-    return Q, best.center[0] + Q @ (rest_center.to(body.arm) - middle.to(body.arm))
+    return Registered(Q, best.center[0] + Q @ (rest_center.to(body.arm) - middle.to(body.arm)), found)
 
 
 def distinct(poses: Poses, cost: Tensor, count: int, *, degrees: float = 5.0) -> Tensor:

@@ -109,7 +109,7 @@ def image_matrices(
             splats.means + shift,
             carried_covariance(deformation, splats.scales, splats.rotations),
             splats.opacities,
-            splats.colors[None],
+            carried.colors(frame),
             window.cameras.select([0] * len(c)),
             torch.arange(len(c), device=device),
             background,

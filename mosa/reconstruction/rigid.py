@@ -15,6 +15,7 @@ from torch import Tensor
 
 from mosa.rendering.cameras import crop_boxes, crop_cameras, crop_images, project
 from mosa.rendering.covariance import covariance_from
+from mosa.rendering.lighting import LIGHT, shading
 from mosa.rendering.rasterizer import rasterize
 from mosa.rotations import skew
 from mosa.types import Cameras, Splats
@@ -59,20 +60,27 @@ class Level:
 
 @dataclass(frozen=True)
 class RigidBody:
-    """Splats about their rest centre. arm: (N, 3) [m]; radius: root mean square distance from the centre [m]."""
+    """Splats about their rest centre. arm: (N, 3) [m]; radius: root mean square distance from the centre [m]; normals: (N, 3) of
+    the surface at rest, where the light shall be told from the colours."""
 
     arm: Tensor
     covariances: Tensor
     opacities: Tensor
     colors: Tensor
     radius: float
+    normals: Tensor | None = None
 
     @staticmethod
-    def of(splats: Splats, rest_center: Tensor) -> RigidBody:
+    def of(splats: Splats, rest_center: Tensor, normals: Tensor | None = None) -> RigidBody:
         arm = splats.means.detach().float() - rest_center.to(splats.means).float()
         covariances = covariance_from(splats.scales.detach().float(), splats.rotations.detach().float())
         radius = float(arm.square().sum(-1).mean().sqrt())
-        return RigidBody(arm, covariances, splats.opacities.detach().float(), splats.colors.detach().float(), radius)
+        return RigidBody(arm, covariances, splats.opacities.detach().float(), splats.colors.detach().float(), radius,
+                         None if normals is None else normals.to(arm))  # fmt: skip
+
+    def shaded(self, rotation: Tensor, light: Tensor) -> RigidBody:
+        """In the colours that it has turned by `rotation` (3, 3) under a light that stays (`mosa.rendering.lighting`)."""
+        return replace(self, colors=self.colors * shading(light, self.normals, rotation)[:, None])
 
     def thinned(self, count: int, seed: int) -> RigidBody:
         """About `count` of the splats, swollen so that they still cover the body."""
@@ -82,8 +90,9 @@ class RigidBody:
         index = torch.randperm(total, generator=torch.Generator().manual_seed(seed))[:count].to(self.arm.device)
         swell = (total / count) ** (2 / 3)
         return RigidBody(
-            self.arm[index], swell * self.covariances[index], self.opacities[index], self.colors[index], self.radius
-        )
+            self.arm[index], swell * self.covariances[index], self.opacities[index], self.colors[index], self.radius,
+            None if self.normals is None else self.normals[index],
+        )  # fmt: skip
 
     @torch.no_grad()
     def render(self, poses: Poses, cameras: Cameras, background: Tensor) -> Tensor:
@@ -175,3 +184,34 @@ def damped(gradient: Tensor, matrix: Tensor, damping: Tensor) -> Tensor:
     ridge = damping[:, None] * diagonal + 1e-9 * diagonal.amax(-1, keepdim=True) + 1e-12
     system = (matrix + torch.diag_embed(ridge)).double()
     return -torch.linalg.solve(system, gradient.double()[..., None])[..., 0].to(gradient)
+
+
+LIGHT_STEP = 0.02
+"""Differences for the Jacobian change a number of the light by this."""
+LIGHT_RIDGE = 1e-3
+"""Of the mean of the light's own diagonal: what pulls it to the light that was known before. One pose hardly tells some of its
+numbers, and what they are then does not show."""
+
+
+def lit_equations(
+    body: RigidBody, level: Level, pose: Poses, light: Tensor, before: Tensor, background: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Cost (), gradient (14,) and Gauss-Newton matrix (14, 14) of one pose and a light (8,) against the level's first frame; the
+    pose's numbers as of `normal_equations`. before: (8,) the light that the ridge pulls to."""
+    shaded = body.shaded(pose.rotation[0], light)
+    h = STEP_PX * level.pixel
+    steps = h * torch.cat((torch.zeros(1, 6), torch.eye(6), -torch.eye(6))).to(light)
+    around = Poses(pose.rotation.expand(13, 3, 3), pose.center.expand(13, 3))
+    # the colours turn with the light's own columns alone: a pose's columns know its geometry
+    seen = shaded.render(around.moved(steps[:, :3], steps[:, 3:] / body.radius), level.cameras, background).flatten(1)
+    brighter = [body.shaded(pose.rotation[0], light + LIGHT_STEP * e).render(pose, level.cameras, background).flatten()
+                for e in torch.eye(LIGHT).to(light)]  # fmt: skip
+    residual = seen[0] - level.target[0].flatten()
+    J = torch.cat(((seen[1:7] - seen[7:]) / (2 * h), (torch.stack(brighter) - seen[:1]) / LIGHT_STEP))
+    cost, weight = huber(residual)
+    weighted = J * weight
+    matrix, gradient = weighted @ J.T, weighted @ residual
+    ridge = LIGHT_RIDGE * matrix.diagonal()[6:].mean()
+    matrix[6:, 6:] += ridge * torch.eye(LIGHT).to(light)
+    gradient[6:] += ridge * (light - before)
+    return cost.sum() + 0.5 * ridge * (light - before).square().sum(), gradient, matrix

@@ -5,13 +5,17 @@ The training sequence starts in the rest pose, every other in the pose that its 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from scipy.spatial.transform import Rotation
 
 from mosa.errors import DataError
 from mosa.modules.body import Body, Start
 from mosa.reconstruction.registration import initial_velocity, register_pose
-from mosa.types import Scene, Splats
+from mosa.rendering.lighting import LIGHT, shading, surface_normals
+from mosa.rendering.spherical_harmonics import constant_coefficients
+from mosa.types import Appearance, Scene, Splats
 
 MOST_FRAMES = 6
 """Frames of free flight that a velocity is fitted to at most: more take longer and say little more."""
@@ -46,8 +50,22 @@ def first_contact(body: Body, start: Start, scene: Scene) -> int:
     return scene.frames - 1
 
 
-def sequence_start(body: Body, splats: Splats, scene: Scene, *, register: bool) -> Start:
-    """Pose and velocity of `scene`. register: find the pose by rendering (held-out sequences); else the rest shape's own.
+def appearance_of(body: Body) -> Appearance:
+    """What a body is looked for by: the splats that it carries, which all training frames were fitted to, else its particles; with
+    the normals of its surface."""
+    if body.splats is not None:
+        found = body.splats.appearance
+    else:
+        splats = splats_of(body)
+        found = Appearance(splats, constant_coefficients(splats.colors))
+    if found.light is None or not bool(found.light.any()):
+        found = replace(found, normals=surface_normals(found.splats.means, body.rest), light=found.splats.means.new_zeros(LIGHT))
+    return found
+
+
+def sequence_start(body: Body, appearance: Appearance, scene: Scene, *, register: bool) -> Start:
+    """Pose and velocity of `scene`. register: find the pose by rendering (held-out sequences), in the light that it shows; else the
+    rest shape's own. appearance: at rest, of `appearance_of`.
 
     The free frames are found on the way: a velocity from the first two frames predicts the contact, the frames before it give
     the final one. Where that one puts the contact earlier, into the frames it was fitted to, they are fewer: no velocity is kept
@@ -56,10 +74,14 @@ def sequence_start(body: Body, splats: Splats, scene: Scene, *, register: bool) 
     cameras = scene.training_cameras
     images, mattes = scene.images[cameras], scene.mattes[cameras]
     views = scene.cameras.select(cameras)
-    rotation, center = torch.eye(3), body.center.cpu()
+    rotation, center, splats = torch.eye(3), body.center.cpu(), appearance.splats
     if register:
-        rotation, center = register_pose(splats, images[:, 0], mattes[:, 0], views, background=scene.background,
-                                         rest_center=body.center)
+        rotation, center, light = register_pose(
+            splats, images[:, 0], mattes[:, 0], views, background=scene.background, rest_center=body.center,
+            normals=appearance.normals, light=appearance.light,
+        )  # fmt: skip
+        lit = shading(light, appearance.normals.to(light), rotation)
+        splats = replace(splats, colors=splats.colors * lit.to(splats.colors)[:, None])
     start = Start(rotation.to(body.rest), center.to(body.rest), torch.zeros(3).to(body.rest), torch.zeros(3).to(body.rest))
     count, most = 2, MOST_FRAMES
     while True:

@@ -34,7 +34,7 @@ def drop(monkeypatch, seen_wrongly, frames=9, last_free_frame=None, height=HEIGH
         return torch.tensor([0.0, float((times @ fallen) / times.square().sum()), 0.0]), torch.zeros(3)
 
     monkeypatch.setattr(starts, "initial_velocity", fitted)
-    return lambda: starts.sequence_start(body, None, scene, register=False), asked, body, scene
+    return lambda: starts.sequence_start(body, SimpleNamespace(splats=None), scene, register=False), asked, body, scene
 
 
 def test_two_frames_that_say_too_little_speed_are_corrected(monkeypatch):
