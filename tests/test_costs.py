@@ -54,7 +54,7 @@ def test_memory_of_each_particle_is_named_by_what_takes_it(monkeypatch):
     cfg = configuration()
     cfg["reconstruction"]["neighbours"] = 100_000
     monkeypatch.setattr(costs, "machine_memory", lambda: 25e9)
-    with pytest.raises(ConfigError, match=r"^reconstruction\.neighbours: 100000, .*GB for each particle, of this machine's 25\.0 GB"):
+    with pytest.raises(ConfigError, match=r"^reconstruction\.neighbours: 100000, .*for each particle, of this machine's 25\.0 GB"):
         costs.check_memory(cfg, SIZE)
 
 
