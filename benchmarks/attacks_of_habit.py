@@ -260,13 +260,15 @@ def habits_running(folder: Path) -> Iterator[Attack]:
         "no_gpu": "CUDA_VISIBLE_DEVICES=7 {}", "threads_0": "OMP_NUM_THREADS=0 {}", "threads_word": "OMP_NUM_THREADS=many {}",
         "slurm": "SLURM_JOB_ID=1 SLURM_NTASKS=4 SLURM_PROCID=0 SLURM_LOCALID=0 SLURM_NODELIST=a {}",
         "mpi": "OMPI_COMM_WORLD_SIZE=4 OMPI_COMM_WORLD_RANK=0 {}", "world_size": "WORLD_SIZE=2 RANK=0 {}",
-        "cache_is_a_file": f"XDG_CACHE_HOME={ROOT}/README.md {{}}", "empty_cache_home": "XDG_CACHE_HOME= {}",
+        "empty_cache_home": "XDG_CACHE_HOME= {}",
         "matplotlib": "MPLBACKEND=TkAgg DISPLAY= {}", "proxy": "http_proxy=http://127.0.0.1:1 https_proxy=http://127.0.0.1:1 {}",
     }.items():  # fmt: skip
         yield f"goes on: {name}", lambda n=name, s=shell: same(n, s)
     for name in ("error::UserWarning", "error"):  # one of ours, or of a library's import, ends it
         yield f"PYTHONWARNINGS={name}", lambda n=name: (program(*words(fitted(n)), shell=f"PYTHONWARNINGS={n} {{}}", wanted=2),
                                                         refuse("one message"))  # fmt: skip
+    yield "XDG_CACHE_HOME is a file", lambda: (program(*words(fitted("file")), shell=f"XDG_CACHE_HOME={ROOT}/README.md {{}}",
+                                                       wanted=2), refuse("one message"))  # fmt: skip
     yield "from another folder", lambda: elsewhere(fitted, words, whole, folder, python)
 
     def stopped_twice(name: str, pause: float) -> None:

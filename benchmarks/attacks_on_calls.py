@@ -39,7 +39,16 @@ def overrides(_: Path) -> Iterator[Attack]:
                                       "scene.cache",
                                       "world.colliders", "prior.parameters", "ckpt_path", "rendering.backend", "losses")]
             + ["optimized_metric=nope", "world.walls={}", "simulation.stride=1000000", "reconstruction.resolution=100000",
-               "simulation.precision=16", "+adapter.alpha=1", "prior.law=jelly", "fit.joint.start=foo"],
+               "simulation.precision=16", "+adapter.alpha=1", "prior.law=jelly", "fit.joint.start=foo"]
+            + [f"{key}={value}" for key in ("seed", "simulation.particles", "prior.parameters.E")
+               for value in ("0x10", "1e400", "05", "0o17", "0b11", "1:30", "2026-11-23", "no", "off", "''", "5%", "5mm", "1/2",
+                             "{a:5}", "1d3", "1e3f", "1__0")]
+            + ["reconstruction.neighbours=1", "reconstruction.neighbours=100000", "reconstruction.margin=1000000",
+               "reconstruction.ridge_passes=1000000000", "rendering.margin=100000", "heterogeneity.wavelength=1e-9",
+               "heterogeneity.amplitude=1.0", "heterogeneity.most=0", "identification.threads=-1",
+               "reconstruction.carried.degree=4",
+               "reconstruction.static.max_points=5", "prior.parameters.nu=0.5000001", "simulation.courant=1.5",
+               "world.walls=separate"],
     }  # fmt: skip
     for plus, each in wrong.items():
         for override in each:

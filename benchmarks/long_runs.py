@@ -1,7 +1,7 @@
 """Many runs, killed and resumed, many rollouts in one process, and equal runs on a GPU: what leaks, differs or is left behind.
 
     OMP_NUM_THREADS=1 python benchmarks/long_runs.py                     # small: about fifteen minutes on two cores
-    OMP_NUM_THREADS=1 python benchmarks/long_runs.py --runs 200 --workers 24 --kills 6 --between 15 40 --launched 24 \\
+    OMP_NUM_THREADS=1 python benchmarks/long_runs.py --runs 200 --workers 20 --abreast --kills 6 --between 12 28 --launched 24 \\
         --rollouts 21600 --frames 12 --particles 4000 --device cuda      # all of it, on 32 cores and two GPUs
     OMP_NUM_THREADS=1 python benchmarks/long_runs.py --parts rollouts --rollouts 2000
 
@@ -10,7 +10,7 @@ Three parts, side by side where there are GPUs:
 - runs: drawn ones (law, criterion, adapter, numbers of the fit, seed) on the tiny scene, each in a process of its own, `workers`
   beside each other. The same ones then as a sweep of joblib, and the first `launched` of them also of submitit's local executor.
   Every process of a sweep is killed with SIGKILL at drawn moments, and the same command is given again, with resume=auto, until
-  it has come to its end.
+  it has come to its end. One after the other, or all three beside each other (--abreast).
 - rollouts: `rollouts` drawn drops of one body in one process, of `frames` frames. 21,600 are a day of them on a CPU, of 4 s each.
   Every hundredth is made twice and compared.
 - equality (with --device cuda): two runs that are given the same, and two with deterministic=true; and what that costs a rollout
@@ -24,6 +24,7 @@ left, memory, file handles or threads that grow. The launchers are the extra `sw
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import random
@@ -118,6 +119,18 @@ def leftovers(*folders: Path) -> list[str]:
     return [str(file) for folder in folders for file in folder.rglob("*") if file.name.endswith(MARKS)]
 
 
+class Swept(NamedTuple):
+    """Of the runs with these numbers what a sweep left, after `kills` kills that met so many unfinished jobs."""
+
+    launcher: str
+    numbers: list[int]
+    found: list[dict]
+    code: int
+    kills: int
+    met: int
+    took: float
+
+
 def told(row: Row) -> Row:
     print(f"[{time.strftime('%H:%M:%S')}] {row.what}: {row.found}{'' if row.met else '   <- NOT AS ASKED'}", flush=True)
     return row
@@ -126,9 +139,10 @@ def told(row: Row) -> Row:
 # -------------------------------------------------------------------------------------------------------------------------- runs
 
 
-def by_themselves(sets: list[list[str]], folder: Path, common: list[str], workers: int, within: float) -> list[dict | None]:
+def by_themselves(sets: list[list[str]], folder: Path, common: list[str], workers: int, within: float,
+                  compiled: threading.Event) -> list[dict | None]:  # fmt: skip
     """The runs, each in a process of its own, `workers` beside each other; their figures, None for one that would have begun after
-    `within` seconds."""
+    `within` seconds. `compiled` is set once the first of each law is complete."""
 
     began = time.perf_counter()
 
@@ -141,7 +155,10 @@ def by_themselves(sets: list[list[str]], folder: Path, common: list[str], worker
     # the first of each law first, alone with the kernels that it compiles
     laws = [next(k for k, s in enumerate(sets) if s[0] == law) for law in sorted({s[0] for s in sets})]
     with ThreadPoolExecutor(workers) as pool:
-        found = dict(zip(laws, pool.map(one, laws)))
+        try:
+            found = dict(zip(laws, pool.map(one, laws)))
+        finally:  # whoever waits for it would wait for ever
+            compiled.set()
         others = [k for k in range(len(sets)) if k not in found]
         found |= dict(zip(others, pool.map(one, others)))
     return [found[k] for k in range(len(sets))]
@@ -198,43 +215,60 @@ def killed_sweep(sets: list[list[str]], folder: Path, common: list[str], launche
 
 
 def runs(options: argparse.Namespace, folder: Path) -> list[Row]:
-    generator, rows = random.Random(options.seed), []
-    sets = drawn(options.runs, generator)
+    sets = drawn(options.runs, random.Random(options.seed))
     common = [*SMALL, "simulation.particles=100", *options.smaller, f"scene.cache={folder}/cache"]
     (folder / "alone").mkdir()
-    began = time.perf_counter()
-    alone = by_themselves(sets, folder / "alone", common, options.workers, options.within)
-    sets, alone = [s for s, found in zip(sets, alone) if found is not None], [found for found in alone if found is not None]
-    wrong = [k for k, found in enumerate(alone) if "exit code" in found or "metrics.json" in found]
+    compiled = threading.Event()
+
+    def timed_alone() -> tuple[list[dict | None], float]:
+        began = time.perf_counter()
+        return by_themselves(sets, folder / "alone", common, options.workers, options.within, compiled), time.perf_counter() - began
+
+    def swept(launcher: str, count: int, kills: int) -> Swept:
+        compiled.wait()
+        # beside each other nobody knows yet which of the runs begin too late
+        numbers = [k for k in range(len(sets)) if options.abreast or alone.result()[0][k] is not None][:count]
+        began, generator = time.perf_counter(), random.Random(f"{options.seed} {launcher}")
+        found = killed_sweep([sets[k] for k in numbers], folder / launcher, common, launcher, options.workers, kills,
+                             tuple(options.between), generator)  # fmt: skip
+        return Swept(launcher, numbers, *found, time.perf_counter() - began)
+
+    sweeps = [sweep for sweep in (("joblib", len(sets), options.kills), ("submitit_local", options.launched, 1)) if sweep[1]]
+    with ThreadPoolExecutor(1 + len(sweeps) if options.abreast else 1) as pool:
+        alone = pool.submit(timed_alone)
+        jobs = [pool.submit(swept, *sweep) for sweep in sweeps]
+        (found, took), again = alone.result(), [job.result() for job in jobs]
+    complete = [k for k, each in enumerate(found) if each is not None]
+    wrong = [k for k in complete if "exit code" in found[k] or "metrics.json" in found[k]]
     for k in wrong:
         print(f"run {k} failed: {' '.join(sets[k])}: {(folder / 'alone' / f'{k}.log').read_text()[-1500:]}")
-    rows.append(told(Row(f"drawn runs, {options.workers} beside each other", f"{options.runs}, all complete",
-                         f"{len(sets) - len(wrong)} of {len(sets)}, {time.perf_counter() - began:.0f} s",
-                         not wrong and len(sets) == options.runs)))  # fmt: skip
-    for launcher, count, kills in (("joblib", len(sets), options.kills), ("submitit_local", options.launched, 1)):
-        chosen = sets[:count]
-        if not chosen:
-            continue
-        began = time.perf_counter()
-        again, code, killed, met = killed_sweep(chosen, folder / launcher, common, launcher, options.workers, kills,
-                                                tuple(options.between), generator)  # fmt: skip
-        differ = [k for k, (a, b) in enumerate(zip(alone, again)) if a != b]
-        for k in differ:
-            names = sorted(name for name in {*alone[k], *again[k]} if alone[k].get(name) != again[k].get(name))
-            print(f"run {k} differs: {' '.join(sets[k])}: {names[:8]}")
-        if code or differ:
-            print((folder / launcher / "sweep.log").read_text()[-3000:])
-        found = (f"{len(differ)} with figures that differ, exit code {code}, {killed} kills met {met} unfinished jobs, "
-                 f"{time.perf_counter() - began:.0f} s")  # fmt: skip
-        asked = "0 differ, exit code 0" + (", a kill met some" if kills else "")
-        what = f"the {'same' if count == len(sets) else f'first {count}'} as a sweep of {launcher}, killed and resumed"
-        rows.append(told(Row(what, asked, found, not differ and code == 0 and (met > 0 or not kills))))
+    rows = [told(Row(f"drawn runs, {options.workers} beside each other", f"{options.runs}, all complete",
+                     f"{len(complete) - len(wrong)} of {len(complete)}, {took:.0f} s",
+                     not wrong and len(complete) == options.runs))]  # fmt: skip
+    rows += [against(sweep, sets, found, folder) for sweep in again]
     time.sleep(2.0)  # for what ends by itself: joblib's trackers
     alive, left = processes_with(str(folder)), leftovers(folder)
     print("\n".join(left))
-    rows.append(told(Row("left behind by them", "nothing",
-                                 f"{len(alive)} processes, {len(left)} half-written files or locks", not alive and not left)))
+    rows.append(told(Row("left behind by them", "nothing", f"{len(alive)} processes, {len(left)} half-written files or locks",
+                         not alive and not left)))  # fmt: skip
     return rows
+
+
+def against(sweep: Swept, sets: list[list[str]], alone: list[dict | None], folder: Path) -> Row:
+    """A sweep's figures beside those of the same runs by themselves."""
+    differ = [k for k, found in zip(sweep.numbers, sweep.found) if alone[k] is not None and found != alone[k]]
+    for k, again in zip(sweep.numbers, sweep.found):
+        if k in differ:
+            names = sorted(name for name in {*alone[k], *again} if alone[k].get(name) != again.get(name))
+            print(f"run {k} differs: {' '.join(sets[k])}: {names[:8]}")
+    if sweep.code or differ:
+        print((folder / sweep.launcher / "sweep.log").read_text()[-3000:])
+    count = len(sweep.numbers)
+    what = f"the {'same' if count == len(sets) else f'first {count}'} as a sweep of {sweep.launcher}, killed and resumed"
+    asked = "0 differ, exit code 0" + (", a kill met some" if sweep.kills else "")
+    found = (f"{len(differ)} with figures that differ, exit code {sweep.code}, {sweep.kills} kills met {sweep.met} unfinished "
+             f"jobs, {sweep.took:.0f} s")  # fmt: skip
+    return told(Row(what, asked, found, not differ and sweep.code == 0 and (sweep.met > 0 or not sweep.kills)))
 
 
 # ---------------------------------------------------------------------------------------------------------------------- rollouts
@@ -246,9 +280,17 @@ def resident() -> float:
 
 
 def on_device(device: str) -> float:
-    """MB of the GPU that are taken, by all of its processes."""
+    """MB of the GPU that this process has, or all of its processes where the driver tells no more."""
     if device == "cpu":
         return 0.0
+    with contextlib.suppress(ImportError):
+        import pynvml
+
+        pynvml.nvmlInit()
+        card = pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{torch.cuda.get_device_properties(0).uuid}")
+        own = [each.usedGpuMemory for each in pynvml.nvmlDeviceGetComputeRunningProcesses(card) if each.pid == os.getpid()]
+        if own and own[0] is not None:
+            return own[0] / 1e6
     free, total = torch.cuda.mem_get_info()
     return (total - free) / 1e6
 
@@ -487,6 +529,7 @@ def main() -> None:
     parser.add_argument("--within", type=float, default=1e9, help="seconds after which no further run begins; fewer runs fail")
     parser.add_argument("--smaller", nargs="+", default=[], metavar="KEY=VALUE", help="further overrides of the drawn runs")
     parser.add_argument("--workers", type=int, default=2, help="runs beside each other")
+    parser.add_argument("--abreast", action="store_true", help="the runs and the sweeps of them beside each other")
     parser.add_argument("--kills", type=int, default=2, help="of joblib's sweep; submitit's is killed once")
     parser.add_argument("--between", type=float, nargs=2, default=(15.0, 60.0), help="seconds until a kill")
     parser.add_argument("--launched", type=int, default=2, help="of the runs, by submitit's local executor")

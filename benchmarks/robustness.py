@@ -9,7 +9,7 @@
 
 Each attack ends in one clear message (a MosaError of one line), in a traceback, in a hang (over 60 s), or it runs. What runs is
 listed: those are the attacks that the program has no word against. The attacks are in attacks_on_files.py, attacks_on_calls.py,
-attacks_on_data.py, attacks_on_meaning.py, attacks_of_habit.py, attacks_on_running.py and attacks_on_cuda.py.
+attacks_on_data.py, attacks_on_meaning.py, attacks_of_habit.py, attacks_afresh.py, attacks_on_running.py and attacks_on_cuda.py.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
+import attacks_afresh as afresh
 import attacks_of_habit as habit
 import attacks_on_calls as calls
 import attacks_on_data as data
@@ -37,7 +38,7 @@ GROUPS = {"checkpoints": files.checkpoints, "npz": files.npz, "overrides": calls
           "calls": calls.calls, "data": data.data, "meshes": data.meshes, "caches": files.caches, "poses": data.poses,
           "resumed": files.resumed, "runs": calls.runs} | MORE | {"running": running, "cuda": cuda}  # fmt: skip
 GROUPS |= {"gpu_memory": gpu_memory, "habits_data": habit.habits_data, "habits_keys": habit.habits_keys,
-           "habits_running": habit.habits_running}  # fmt: skip
+           "habits_running": habit.habits_running, "afresh_data": afresh.afresh_data}  # fmt: skip
 """Name -> pairs of what is done and a function that does it, in a folder."""
 PATIENCE = 60
 LONGER = {"runs": 300, "cuda": 300, "gpu_memory": 300, "habits_keys": 120, "habits_running": 600, "running": 600}

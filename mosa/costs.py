@@ -121,6 +121,11 @@ def check_memory(cfg: Mapping[str, Any], size: Size) -> float:
         return wanted
     empty = memory_of(cfg, replace(size, particles=0))
     most = int((there - empty) / particle_bytes(cfg, size))
+    if most < 8 and empty < 0.5 * there:
+        settings = cfg["reconstruction"]
+        raise ConfigError(f"reconstruction.neighbours: {settings['neighbours']}, with reconstruction.dynamic.modes of "
+                          f"{settings['dynamic']['modes']}, take {particle_bytes(cfg, size) / 1e9:.2g} GB for each particle, of "
+                          f"this machine's {there / 1e9:.1f} GB; lower them")
     if most < 8:
         raise ConfigError(f"scene.scale: {size.sequences} x {size.cameras} x {size.frames} pictures of {size.pixels} px take "
                           f"{empty / 1e9:.1f} GB, which this machine's {there / 1e9:.1f} GB do not hold; lower scene.scale, or "

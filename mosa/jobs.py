@@ -28,6 +28,7 @@ from mosa.commands import fail
 from mosa.errors import ConfigError, MosaError
 from mosa.refused import explained, let_go
 from mosa.screen import outlived
+from mosa.threads import settle_threads
 
 FAILED = "failed"
 """Folder in that of a sweep: one file for each job that ended in an error, named after its number, with the message."""
@@ -120,7 +121,7 @@ def run_command(run: Callable[[], None], conf: str | Path) -> None:
     """Run Hydra's `run` with what stands on the command line; conf: the folder of its groups.
 
     Exit code 2 too for what Hydra refuses before any job begins: a mistake of the user like all others."""
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # on small tensors and shared machines a second thread was measured 30x slower
+    settle_threads()
     sys.argv[1:] = map(quoted, sys.argv[1:])
     with outlived():
         check_arguments(sys.argv[1:], Path(conf))

@@ -89,7 +89,7 @@ TRAINING: dict[str, Kind] = {
     "prior.frozen": or_null(NAMES),
     "prior.modulated": or_null(NAMES),
     "prior.options": or_null(SECTION),
-    "rendering.margin": whole(0),
+    "rendering.margin": whole(0, 256),
     "world.walls": or_null(SECTION),
     "world.colliders": or_null(ENTRIES),
     "logger.tensorboard": or_null(SECTION),

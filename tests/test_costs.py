@@ -12,6 +12,7 @@ from mosa import costs
 from mosa.config import plain
 from mosa.data.scene import load_scene
 from mosa.errors import ConfigError
+from mosa.reconstruction.settings import build_settings
 
 TINY = ["debug=default"]
 
@@ -46,6 +47,21 @@ def test_pictures_that_alone_are_too_many_are_named(monkeypatch):
     monkeypatch.setattr(costs, "machine_memory", lambda: costs.BASE + 1e8)
     with pytest.raises(ConfigError, match=r"^scene\.scale: 3 x 6 x 15 pictures of 25600 px"):
         costs.check_memory(configuration(), SIZE)
+
+
+def test_memory_of_each_particle_is_named_by_what_takes_it(monkeypatch):
+    """It was scene.scale's fault, whatever took the memory."""
+    cfg = configuration()
+    cfg["reconstruction"]["neighbours"] = 100_000
+    monkeypatch.setattr(costs, "machine_memory", lambda: 25e9)
+    with pytest.raises(ConfigError, match=r"^reconstruction\.neighbours: 100000, .*for each particle, of this machine's 25\.0 GB"):
+        costs.check_memory(cfg, SIZE)
+
+
+@pytest.mark.parametrize(("key", "value"), [("neighbours", 10**5), ("margin", 10**6), ("ridge_passes", 10**9)])
+def test_what_no_machine_computes_is_refused_by_its_key(key, value):
+    with pytest.raises(ConfigError, match=rf"^reconstruction\.{key}: expected a whole number of .* at most"):
+        build_settings(**{key: value})
 
 
 def test_a_built_in_scene_is_refused_before_it_is_made(monkeypatch, tmp_path):

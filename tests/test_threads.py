@@ -1,10 +1,11 @@
 """Work in threads comes back in order, with its errors."""
 
+import os
 import threading
 
 import pytest
 
-from mosa.threads import threaded
+from mosa.threads import settle_threads, threaded
 
 
 def test_results_keep_the_order_of_the_items(monkeypatch):
@@ -26,3 +27,16 @@ def test_errors_reach_the_caller(monkeypatch, cores):
     with pytest.raises(ZeroDivisionError):
         list(threaded(lambda x: 1 / x, [1, 0]))
     assert list(threaded(float, [])) == []
+
+
+@pytest.mark.parametrize(("given", "kept"), [
+    (None, "1"), ("", "1"), ("0", "1"), ("-2", "1"), ("many", "1"), ("\u0662", "1"), ("3", "3"), ("4,2", "4,2"), (" 2 ", " 2 "),
+])  # fmt: skip
+def test_what_is_no_number_of_threads_is_one_thread(monkeypatch, capsys, given, kept):
+    """The libraries take all cores for it: minutes in the place of seconds, and sums in another order."""
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if given is not None:
+        monkeypatch.setenv("OMP_NUM_THREADS", given)
+    settle_threads()
+    assert os.environ["OMP_NUM_THREADS"] == kept
+    assert ("OMP_NUM_THREADS: expected a whole number above 0" in capsys.readouterr().err) == (bool(given) and kept != given)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import shlex
 import signal
 import sys
@@ -13,6 +12,7 @@ from mosa.commands import configuration
 from mosa.errors import ConfigError, MosaError
 from mosa.refused import explained
 from mosa.screen import outlived
+from mosa.threads import settle_threads
 
 RESULTS = Path("docs/results")
 
@@ -45,7 +45,7 @@ def arguments(words: list[str]) -> argparse.Namespace:
 
 
 def main(words: list[str] | None = None) -> None:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    settle_threads()
     signal.signal(signal.SIGTERM, interrupt)  # or the jobs would go on without anyone who waits for them
     with outlived():  # hours of jobs do not end with whoever read their lines
         code = code_of(words)

@@ -1,11 +1,12 @@
 """What a run saw, calibrated and learned, side by side in a browser, or its twin live:  mosa-view outputs/train/<date>/<time>"""
 
-import os
 import sys
+
+from mosa.threads import settle_threads
 
 
 def main() -> None:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    settle_threads()
     from mosa.viewer import main as view
 
     view(sys.argv[1:])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +24,8 @@ LARGEST = 1e30
 
 # relative jitter of frame times that still counts as a constant frame rate
 TIME_JITTER = 1e-3
+RATE = 0.005
+"""Share by which scene.fps may differ from the rate of a file's times without a word: 59.94 and 60 frames per second are one."""
 
 
 @dataclass(frozen=True)
@@ -38,12 +41,27 @@ class Footage:
     background: Tensor
 
 
+class TwiceError(ValueError):
+    """A key of a JSON object that is there twice: which of its values counts is left to each reader."""
+
+
+def each_once(pairs: list[tuple[str, object]]) -> dict:
+    """An object of JSON. Errors: TwiceError for a key that is there twice with two values."""
+    found: dict[str, object] = {}
+    for key, value in pairs:
+        if key in found and found[key] != value:
+            raise TwiceError(f"the key {key[:60]!r} twice, as {str(found[key])[:40]} and as {str(value)[:40]}")
+        found[key] = value
+    return found
+
+
 def read_json(path: Path):
-    """Contents of a JSON file. Errors: DataError naming file and line."""
+    """Contents of a JSON file. Errors: DataError naming file and line, or a key that is there twice."""
     if not path.is_file():
         raise DataError(f"{path}: file not found")
     try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))  # some editors put a byte order mark before it
+        # some editors put a byte order mark before it
+        return json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=each_once)
     except json.JSONDecodeError as error:
         raise DataError(
             f"{path}: expected JSON, found a mistake in line {error.lineno}, column {error.colno}: {error.msg}"
@@ -53,7 +71,8 @@ def read_json(path: Path):
     except ValueError as error:  # a number of thousands of digits
         if isinstance(error, UnicodeDecodeError):
             raise DataError(f"{path}: expected JSON text, found bytes that are no UTF-8") from error
-        raise DataError(f"{path}: expected JSON, found what cannot be read ({error})") from error
+        found = str(error) if isinstance(error, TwiceError) else f"what cannot be read ({error})"
+        raise DataError(f"{path}: expected JSON, found {found}") from error
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
 
@@ -151,6 +170,15 @@ def even_times(times: list[float], frames: list[int], where: str, remedy: str) -
             f"{where}: expected one frame rate, found the times {listed} s: {steps[worst]:.6f} s between frames "
             f"{frames[worst]} and {frames[worst + 1]}, {middle:.6f} s elsewhere; {remedy}"
         )
+
+
+def told_rate(times: list[float], fps: float, where: str) -> None:
+    """A warning where scene.fps takes the place of times in the file that say another rate."""
+    steps = np.diff(np.asarray(times, dtype=np.float64))
+    middle = float(np.median(steps)) if len(steps) else 0.0
+    if middle > 0 and abs(middle * fps - 1) > RATE:
+        warnings.warn(f"{where}: scene.fps = {fps:g} takes the place of the file's own times, which say {1 / middle:.5g} frames "
+                      "per second: expected the same rate, but for a film in slow motion", stacklevel=2)
 
 
 def scaled(K: np.ndarray, full: tuple[int, int], size: tuple[int, int]) -> np.ndarray:

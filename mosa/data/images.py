@@ -48,8 +48,9 @@ def read_image(path: Path) -> np.ndarray:
     return np.clip(pixels, 0, 1)
 
 
-FAINT = 0.1
-"""Of a matte that has anything in it at least: labels are numbers from 1 on, of 255."""
+FAINT = 0.5
+"""Of a matte that has anything in it at least. Labels are numbers from 1 on, of 255; and a pixel belongs to the object from half
+coverage on, so that one which is fainter everywhere would be an empty one in all that looks at outlines."""
 SLIVER = 50
 """Pixels of a matte that may all be so faint: the edge of an object that is nearly out of the picture."""
 GREY = 8 / 255
@@ -69,18 +70,22 @@ def matte_of(path: Path, pixels: np.ndarray) -> np.ndarray:
 
 
 def faintless(path: Path, matte: np.ndarray) -> np.ndarray:
-    """The matte. Errors: DataError where all of it that is not empty is nearly so."""
+    """The matte. Errors: DataError where all of it that is not empty is below half coverage."""
     most = float(matte.max())
     if most < FAINT and int((matte > 0).sum()) > SLIVER:
         raise DataError(f"{path}: expected a matte that is white (255) where the object is, found {255 * most:.3g} at most: the "
-                        "number of a label? write 255 in its place")
+                        "number of a label, or a matte that is half transparent? write 255 in its place")
     return matte
 
 
 def check_pixels(path: Path) -> None:
-    """The header says how large a picture is, before any of it is decoded. Errors: DataError."""
+    """The header says how large a picture is, and of how many, before any of it is decoded. Errors: DataError."""
     with Image.open(path) as picture:
         width, height = picture.size
+        # pages of a TIFF are small copies too, and the second picture of a phone's JPEG is its preview
+        several = getattr(picture, "n_frames", 1) if picture.format in ("PNG", "GIF", "WEBP") else 1
+    if several > 1:
+        raise DataError(f"{path}: expected one picture, found an animation of {several}; write each of them as a file")
     if width * height > MOST_PIXELS:
         raise DataError(f"{path}: expected at most {MOST_PIXELS / 1e6:.0f} million pixels, found {width}x{height}: scale it down")
 

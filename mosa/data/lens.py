@@ -57,6 +57,8 @@ class Lens:
 
 def is_fisheye(model, flag, where: str) -> bool:
     """Whether a camera_model (None: none given), or the flag is_fisheye of instant-ngp, means a fisheye. DataError for others."""
+    if flag not in (None, False, True):
+        raise DataError(f"{where}: is_fisheye: expected true or false, found {str(flag)[:60]!r}")
     if model is None:
         return bool(flag)
     if not isinstance(model, str) or model.upper() not in MODELS:

@@ -24,6 +24,8 @@ RESOLUTION = 40
 OPEN, SUSPECT = 0.2, 0.04
 """Share of a matte that the hull leaves open from which on data are refused, and warned of. With a right calibration it is at most
 0.001 (built-in films of 64 to 400 px, PAC-NeRF's bird)."""
+ISLAND = 4
+"""Pixels of a matte, in pieces that no other camera sees, from which on they are said; single ones are noise of matting."""
 SUNK = 0.25
 """Share of the hull below the ground in frame 0 from which on the ground is elsewhere."""
 APART = 0.35
@@ -66,7 +68,12 @@ def hull_points(mattes: Tensor, cameras: Cameras, box: Tensor) -> tuple[Tensor, 
 
 def left_open(points: Tensor, pitch: float, mattes: Tensor, cameras: Cameras) -> Tensor:
     """Share (V,) of each matte (V, H, W) that is further than a voxel from where points (M, 3) are seen."""
-    shares = []
+    return open_and_apart(points, pitch, mattes, cameras)[0]
+
+
+def open_and_apart(points: Tensor, pitch: float, mattes: Tensor, cameras: Cameras) -> tuple[Tensor, list[int]]:
+    """What `left_open` says, and how many pixels of each matte are in pieces of which all is open."""
+    shares, islands = [], []
     for matte, K, w2c in zip(mattes, cameras.K, cameras.w2c):
         seen = points @ w2c[:3, :3].T + w2c[:3, 3]
         pixel = seen @ K.T
@@ -79,7 +86,9 @@ def left_open(points: Tensor, pitch: float, mattes: Tensor, cameras: Cameras) ->
         covered = cv2.dilate(covered, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)).astype(bool)
         inside = (matte > 0.5).numpy()
         shares.append(float((inside & ~covered).sum() / max(inside.sum(), 1)))
-    return torch.tensor(shares)
+        _, pieces = cv2.connectedComponents(inside.astype(np.uint8), connectivity=8)
+        islands.append(int((inside & ~np.isin(pieces, np.unique(pieces[covered & inside]))).sum()))
+    return torch.tensor(shares), islands
 
 
 def whole_views(scene: Scene, frame: int) -> list[int]:
@@ -109,7 +118,14 @@ def check_outlines(scene: Scene, label: str) -> None:
             raise DataError(f"{label}, frame {frame}: {error}") from error
         if not len(points):
             continue  # thinner than a voxel
-        worst = max(worst, most_open(left_open(points, pitch, mattes, cameras), cameras.names, frame, label))
+        shares, islands = open_and_apart(points, pitch, mattes, cameras)
+        worst = max(worst, most_open(shares, cameras.names, frame, label))
+        if frame == 0 and max(islands) >= ISLAND:  # later it may splash, and drops are thinner than a voxel
+            v = islands.index(max(islands))
+            many = sum(pixels >= ISLAND for pixels in islands)
+            warnings.warn(f"{label}: the matte of camera {cameras.names[v]}, frame 0, has {islands[v]} pixels apart from the "
+                          f"object, where the other cameras see nothing ({many} cameras have such): expected one object; clear "
+                          "them", stacklevel=3)  # fmt: skip
         if scene.ground is None:
             continue
         heights = points @ scene.up - scene.ground.height

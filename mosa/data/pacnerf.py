@@ -20,9 +20,10 @@ from mosa.data.footage import (
     read_json,
     same_camera,
     scaled,
+    told_rate,
     world_to_camera,
 )  # fmt: skip
-from mosa.data.images import check_amount, composite, expect_size, fill_holes, read_image, resize, scaled_size
+from mosa.data.images import check_amount, composite, expect_size, faintless, fill_holes, read_image, resize, scaled_size
 from mosa.data.matting import matte_from_plate
 from mosa.data.scene_from_footage import scene_from_footage
 from mosa.errors import DataError
@@ -65,6 +66,8 @@ def read_pacnerf(path: str | Path, *, frames=None, fps: float | None = None, sca
     if fps is None:
         remedy = "correct them, restrict scene.frames, or set scene.fps"
         even_times([times[f][0] for f in numbers], numbers, str(listing), remedy)
+    else:
+        told_rate([times[f][0] for f in numbers], fps, str(listing))
     if prefix == "r":
         log.info("%s: raw images without mattes; matted from the background plates r_<camera>_-1.png", folder)
     images, mattes, scaled_calibration = [], [], {}
@@ -157,7 +160,7 @@ def split(file: Path, pixels: np.ndarray, plate: np.ndarray | None) -> tuple[np.
     if file.name.startswith("a_"):
         if pixels.shape[2] != 4:
             raise DataError(f"{file}: expected RGBA with the matte as alpha, found {pixels.shape[2]} channels")
-        return pixels[..., :3], pixels[..., 3]
+        return pixels[..., :3], faintless(file, np.ascontiguousarray(pixels[..., 3]))
     color = np.ascontiguousarray(np.broadcast_to(pixels[..., :3], (*pixels.shape[:2], 3)))
     if plate is not None:
         expect_size(file, pixels, *plate.shape[1::-1], reason="as the background plate of its camera")

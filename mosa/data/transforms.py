@@ -21,6 +21,7 @@ from mosa.data.footage import (
     read_json,
     same_camera,
     scaled,
+    told_rate,
     world_to_camera,
 )  # fmt: skip
 from mosa.data.images import check_amount, composite, expect_size, faintless, fill_holes, matte_of, read_image, resize, scaled_size
@@ -69,6 +70,7 @@ def read_transforms(path: str | Path, *, frames=None, fps: float | None = None, 
     times, table = synchronise(by_camera, fps)
     wanted = frame_range(list(range(len(times))), frames, str(file))
     if fps is not None and all(entry.get("time") is not None for entry in document["frames"]):
+        told_rate([times[f] for f in wanted], fps, str(file))
         times = [i / fps for i in range(len(times))]
     remedy = "correct them, restrict scene.frames, or set scene.fps where every entry has a time"
     even_times([times[f] for f in wanted], wanted, str(file), remedy)

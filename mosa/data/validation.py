@@ -17,6 +17,11 @@ from mosa.types import Scene
 
 FULL = 0.99
 """Share of an image from which on a matte says nothing."""
+CLEAR = 0.9
+"""Coverage that a camera's matte has somewhere in a film."""
+FLASH = 0.2
+"""By which an object's mean colour, of 0 to 1, may leave the line between the frames beside it. Built-in films stay
+below 0.04."""
 SQUARE, NEARLY = 2.0, 1.05
 """Ratios of the two focal lengths of a camera from which on they are refused, and warned of: sensors have square pixels."""
 
@@ -52,6 +57,7 @@ def validate(scene: Scene) -> Scene:
         check_agreement(scene, label, frame)
     check_fall(scene, label)
     if not scene.synthetic:
+        check_colors(scene, label)
         check_outlines(scene, label)
         check_particles(scene, label)
     holes = None if scene.synthetic else holes_report(scene)
@@ -127,6 +133,25 @@ def check_mattes(scene: Scene, label: str) -> None:
             one = ": an opaque alpha channel, or an object too near; matte it, or restrict scene.frames"
             raise DataError(f"{label}: camera {name}, frame {t}: the matte covers {float(covered[v, t]):.0%} of the image"
                             f"{every if float(covered[v].min()) > FULL else one}")
+    most = scene.mattes.amax((1, 2, 3))
+    if float(most.min()) < CLEAR:
+        v = int(most.argmin())
+        warnings.warn(f"{label}: camera {scene.cameras.names[v]}: the matte is nowhere more than {float(most[v]):.2f} in any "
+                      "frame: expected 1 inside of the object; what is missing mixes the background into its colours", stacklevel=3)
+
+
+def check_colors(scene: Scene, label: str) -> None:
+    """A warning where the object's mean colour jumps in one frame of a camera and comes back: a frame that was not exposed, or
+    dropped and filled with black."""
+    inside = (scene.mattes > CLEAR).float()
+    means = (scene.images * inside[..., None]).sum((2, 3)) / inside.sum((2, 3))[..., None].clamp(min=1)
+    seen = inside.sum((2, 3)) > 0
+    jump = (means[:, 1:-1] - (means[:, :-2] + means[:, 2:]) / 2).abs().amax(2) * (seen[:, 1:-1] & seen[:, :-2] & seen[:, 2:])
+    if jump.numel() and float(jump.max()) > FLASH:
+        v, t = divmod(int(jump.argmax()), jump.shape[1])
+        warnings.warn(f"{label}: camera {scene.cameras.names[v]}, frame {t + 1}: the object's mean colour is "
+                      f"{float(jump[v, t]):.2f} beside that of the frames before and after: a dropped or flashed frame? expected "
+                      "one light", stacklevel=3)
 
 
 def check_borders(scene: Scene, label: str) -> None:

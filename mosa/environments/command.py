@@ -61,7 +61,7 @@ def train_and_test(cfg: DictConfig) -> None:
         if name not in known:
             raise ConfigError(f"simulator: expected {', '.join(SIMULATORS)}, or a list of them, found {name!r}")
     if setting.device == "cpu":
-        torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
+        torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1").split(",")[0]))
     # a body that rolls off the box may fold over itself for a moment; the trial is lost either way
     warnings.filterwarnings("ignore", message=".*det F <= 0.*")
     folder = Path(values["out"] or HydraConfig.get().runtime.output_dir)

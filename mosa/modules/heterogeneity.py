@@ -24,7 +24,7 @@ class HeterogeneitySettings:
     enabled: bool = knob(True, FLAG)
     kind: str = knob("network", one_of("modes", "network"))
     amplitude: float = knob(0.2, number(0, 1, above=True, below=True))
-    wavelength: float = knob(0.33, number(0, 2, above=True))
+    wavelength: float = knob(0.33, number(0.02, 2))
     most: int = knob(50, whole(1, WIDEST))
     hidden: int = knob(32, whole(1, WIDEST))
     frequencies: int = knob(2, whole(0, 32))

@@ -24,11 +24,11 @@ class ReconstructionSettings:
     backbone's, where it is one of modes and the cue that of the neighbourhood."""
 
     resolution: int = knob(80, whole(8, 1024))  # a hull of that many voxels per side has 4 GB
-    ridge_passes: int = knob(24, whole(0))
+    ridge_passes: int = knob(24, whole(0, 10**4))
     points: int = knob(3000, whole(8, 10**8))
-    neighbours: int = knob(20, whole(4))  # fewer leave every deformation gradient open
+    neighbours: int = knob(20, whole(4, 1000))  # fewer leave every deformation gradient open
     cue: str = knob("neighbourhood", one_of("neighbourhood", "gaussian"))
-    margin: int = knob(6, whole(0))
+    margin: int = knob(6, whole(0, 256))  # of windows in memory, all at once
     splats: str | None = knob(None, or_null(TEXT))
     geometry: GeometrySettings = field(default_factory=GeometrySettings)
     static: StaticSettings = field(default_factory=StaticSettings)

@@ -22,6 +22,7 @@ def palette(mask: np.ndarray) -> Image.Image:
 
 @pytest.mark.parametrize(("mask", "message"), [
     (Image.fromarray(disc(1)), r"white \(255\) where the object is, found 1 at most: the number of a label"),
+    (Image.fromarray(disc(126)), "found 126 at most: .* half transparent"),
     (palette(disc(255)), "grey mask, white = object, found colours"),
     (Image.fromarray(np.stack([0 * disc(1), disc(255), 0 * disc(1)], -1)), "found colours"),
     (Image.fromarray(np.stack([disc(90), disc(90), disc(90), disc(255)], -1)), "found an alpha channel that differs"),
@@ -43,3 +44,14 @@ def test_grey_masks_are_read_in_whatever_they_are_written(tmp_path, mask):
     edge = np.zeros((40, 40), np.float32)
     edge[:10, 0] = 0.05  # an object that is nearly out of the picture
     assert faintless(tmp_path / "mask.png", edge) is edge
+
+
+def test_an_animation_is_no_picture(tmp_path):
+    """Its first frame was read without a word."""
+    first, second = Image.fromarray(disc(255)), Image.fromarray(disc(200))
+    for kind in ("PNG", "GIF"):
+        first.save(tmp_path / "a.png", kind, save_all=True, append_images=[second])
+        with pytest.raises(DataError, match=r"a\.png: expected one picture, found an animation of 2"):
+            read_image(tmp_path / "a.png")
+    first.save(tmp_path / "a.png", "TIFF", save_all=True, append_images=[second])  # pages: a small copy beside the picture
+    assert read_image(tmp_path / "a.png").shape == (40, 40, 1)

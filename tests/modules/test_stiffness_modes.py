@@ -72,6 +72,7 @@ def test_the_factor_is_within_its_amplitude_and_1_without_coefficients():
 
 @pytest.mark.parametrize("options, key", [
     ({"amplitude": 1.0}, "amplitude"), ({"amplitude": 0.0}, "amplitude"), ({"wavelength": 0.0}, "wavelength"),
+    ({"wavelength": 1e-9}, "wavelength"),
     ({"wavelength": 2.1}, "wavelength"), ({"wavelength": float("nan")}, "wavelength"), ({"most": 0}, "most"),
     ({"most": 2.5}, "most"),
 ])  # fmt: skip
