@@ -11,7 +11,8 @@ identifies the directions by the joint stage of a run (`adapter=operator`). With
 isotropic one and of the learned one is then pressed between two plates, over half a turn (`mosa.analysis.compression`).
 `--black-box` learns `adapter=direct` by as many steps of Adam as a run takes, on the same motion. What is left out is the
 reconstruction. With `--own-grid` the motion to learn from is that of the true law on the learner's own particles and grid: what is
-then wrong, the grid has not done. `draw` makes the figure and the page of all that was fitted.
+then wrong, the grid has not done. `make` and `fit` with `--drops train test_60` learn from several drops of the body. `draw` makes
+the figure and the page of all that was fitted.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from mosa.data.builtin.objects import BuiltinObject, object_named
 from mosa.experiments.analyses import force_at, learned_modulus, pressed_modulus, redistribution, true_modulus
 from mosa.experiments.commits import commit
 from mosa.experiments.drawing import save
-from mosa.modules.body import Body
+from mosa.modules.body import Body, Start
 from mosa.modules.lit_mosa import LitMosa
 from mosa.modules.takes import Take
 from mosa.prediction import determined
@@ -60,9 +61,28 @@ def object_of(name: str) -> BuiltinObject:
     return replace(body, material=body.material.isotropic()) if name.endswith(TWIN) else body
 
 
-def make(name: str, folder: Path, seed: int) -> Path:
+def motion_of(path: Path, drop: str) -> Path:
+    """Where the motion of a drop lies beside the training drop's `path`."""
+    return path if drop == "train" else path.with_stem(f"{path.stem}_{drop}")
+
+
+def make(name: str, folder: Path, seed: int, drops: list[str]) -> None:
     body = object_of(name)
-    return calibration.keep(folder / f"{name}.npz", body, body.material, seed)
+    for drop in drops:
+        calibration.keep(motion_of(folder / f"{name}.npz", drop), body, body.material, seed, drop)
+
+
+def further(case: SimpleNamespace, path: Path, noise: float, rng: np.random.Generator) -> Take:
+    """Another drop of the same body, stored at `path`, with errors of the motion of its own."""
+    stored, body = np.load(path), case.body
+    tensor = lambda a: torch.as_tensor(a, dtype=torch.float32, device=body.rest.device)  # noqa: E731
+    rest = body.rest.cpu().double().numpy()
+    truth = calibration.carried(stored, rest, case.object.spacing)
+    seen = tensor(calibration.noisy(truth, rest, noise * np.ptp(rest[:, 1]), rng))
+    start = Start(tensor(stored["rotation"]), tensor(truth[0].mean(0)), tensor(stored["velocity"]), torch.zeros(3).to(body.rest))
+    cues = neighbourhood_cues(seen, body.rest.new_zeros(1), neighbourhood(tensor(truth[0])))  # their rotations are from frame 0 on
+    spacing = float(body.volume.mean()) ** (1 / 3)
+    return Take(start, None, cues, case.take.frame_dt, calibration.first_contact(truth, spacing))
 
 
 def in_plane(material: HiddenMaterial, count: int) -> tuple[Tensor, Tensor]:
@@ -140,8 +160,9 @@ def learn_black_box(module: LitMosa, body: Body) -> None:
         for group in optimizer.param_groups:
             group["lr"] = group["rate"] * stage.decay(iteration)
         optimizer.zero_grad()
+        take = module.takes[iteration % len(module.takes)]
         for gain in module.criterion.gains:
-            terms, _ = module.terms(stage, [0], module.active_frames(stage, iteration, module.takes[0]), gain=gain)
+            terms, _ = module.terms(stage, [0], module.active_frames(stage, iteration, take), take, gain=gain)
             (sum(module.weights[name] * value for name, value in terms.items()) / len(module.criterion.gains)).backward()
         module.gradient_norms(optimizer, stage, iteration)
         optimizer.step()
@@ -149,7 +170,8 @@ def learn_black_box(module: LitMosa, body: Body) -> None:
 
 
 def fit(
-    path: Path, particles: int, more: list[str], seed: int, noise: float, device: str, plates: bool, black_box: bool, own_grid: bool
+    path: Path, particles: int, more: list[str], seed: int, noise: float, device: str, plates: bool, black_box: bool,
+    own_grid: bool, drops: list[str],
 ) -> dict:  # fmt: skip
     """Of one body: calibration, joint stage, and what its laws are, along the directions of a plane."""
     began, truth = time.perf_counter(), object_of(path.stem)
@@ -158,7 +180,9 @@ def fit(
     if own_grid:
         on_own_grid(case, path, noise, seed)
     body, take = case.body, case.take
-    module = LitMosa.from_config(case.config, body, takes=[take], background=torch.ones(3, device=device))
+    takes = [take, *(further(case, motion_of(path, drop), noise, np.random.default_rng([seed, 12, i]))
+                     for i, drop in enumerate(drops) if drop != "train")]  # fmt: skip
+    module = LitMosa.from_config(case.config, body, takes=takes, background=torch.ones(3, device=device))
     calibrated = module.identifying(module.stages[0])
     calibrated.search()
     fits.iterated(calibrated, module.stages[0].iterations)
@@ -187,7 +211,7 @@ def fit(
         learned_modulus(body, n).detach(), redistribution(body, n)  # fmt: skip
     record = {
         "body": path.stem, "method": "black box" if black_box else "ours", "set": more, "particles": len(body.rest), "seed": seed,
-        "noise": noise, "own_grid": own_grid, "cells": float(np.ptp(body.rest[:, 1])) / body.settings.dx,
+        "noise": noise, "own_grid": own_grid, "drops": drops, "cells": float(np.ptp(body.rest[:, 1])) / body.settings.dx,
         "prior_mm": prior_mm, "learned_mm": learned_mm, "floor_mm": floor_mm, "degrees": torch.rad2deg(angles).tolist(),
         "E_along": learned.tolist(), "true_E_along": true.tolist(), "w": w.detach().tolist(), "w_range": float(w.max() - w.min()),
         "fibre_deg": None, "cone_deg": None,
@@ -210,10 +234,9 @@ def fit(
                      "machine": device_label(device)}
 
 
-HEADS = ("body", "law", "particles", "cells of height", "noise [%]", "rms [mm]", "true law here [mm]",
+HEADS = ("body", "law", "drops", "particles", "cells of height", "noise [%]", "rms [mm]", "true law here [mm]",
          "E off, mean and largest [%]", "its level", "its shape off, mean and largest [%]", "largest less smallest w",
-         "stiffest over softest",
-         "stiffest from the fibre [deg]", "95 % cone [deg]", "E between plates off, mean and largest [%]",
+         "stiffest over softest", "stiffest from the fibre [deg]", "95 % cone [deg]", "E between plates off, mean and largest [%]",
          "force off, largest [%]", "s")  # fmt: skip
 
 
@@ -236,7 +259,7 @@ def table(records: list[dict]) -> str:
     rows = []
     for r in records:
         plates = r.get("plates") or {}
-        where = [r["particles"], shown(r["cells"], 1), shown(r["noise"], 1, 100) + ", own grid" * r["own_grid"]]
+        where = [len(r["drops"]), r["particles"], shown(r["cells"], 1), shown(r["noise"], 1, 100) + ", own grid" * r["own_grid"]]
         floor = shown(r["floor_mm"], 1)
         rows.append([r["body"], "isotropic", *where, shown(r["prior_mm"], 1), floor, *[""] * 7, *off(plates.get("prior")), ""])
         rows.append([r["body"], r["method"], *where, shown(r["learned_mm"], 1), floor, two(r, "E_off"), shown(r["E_level"], 3),
@@ -258,6 +281,7 @@ def draw(records: list[dict], folder: Path) -> None:
             plates, same = r.get("plates"), [s for s in own if s["method"] == r["method"]]
             degrees = plates["degrees"] if plates else r["degrees"]
             label = r["method"] + (f", {r['particles']} particles" if len({s["particles"] for s in same}) > 1 else "")
+            label += f", {len(r['drops'])} drops" if len(r["drops"]) > 1 else ""
             if not above.lines:
                 above.plot(degrees, [e / 1e3 for e in (plates["true"] if plates else r["true_E_along"])], "k--", label="truth")
                 if plates:
@@ -291,10 +315,14 @@ def main() -> None:
     parser.add_argument("--black-box", action="store_true", help="fit: adapter=direct in place of ours")
     parser.add_argument("--own-grid", action="store_true", help="fit: the true law's motion on the learner's particles and grid")
     parser.set_defaults(particles=4000)
+    parser.add_argument("--drops", nargs="+", default=["train"], help="make, fit: drops to learn from, train among them")
     options = parser.parse_args()
+    if "train" not in options.drops or (options.own_grid and len(options.drops) > 1):
+        parser.error("--drops: expected train among them, and train alone with --own-grid")
     given = (options.particles, options.set, options.seed, options.noise, options.device, options.plates, options.black_box,
-             options.own_grid)
-    fits.run(options, lambda name: make(name, options.out, options.seed), lambda path: fit(path, *given), table, draw)
+             options.own_grid, options.drops)
+    fits.run(options, lambda name: make(name, options.out, options.seed, options.drops), lambda path: fit(path, *given),
+             table, draw)  # fmt: skip
 
 
 if __name__ == "__main__":
