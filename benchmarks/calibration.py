@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -63,15 +64,15 @@ def configuration(name: str, more: list[str]) -> dict:
     return composed([*overrides_of(name), "adapter=none", "heterogeneity.enabled=false", *more])
 
 
-def keep(path: Path, body: BuiltinObject, material: Hidden | PublishedMaterial, seed: int) -> Path:
-    """The true motion of a body's training drop: rest (N, 3), positions (T, N, 3) [m]."""
+def keep(path: Path, body: BuiltinObject, material: Hidden | PublishedMaterial, seed: int, drop: str = "train") -> Path:
+    """The true motion of one of a body's drops: rest (N, 3) as in frame 0 of the training drop, positions (T, N, 3) [m]."""
     began = time.perf_counter()
     surface = extract_surface(SHAPES[body.shape], body.pitch, np.random.default_rng([seed, 1]))
     particles = fill(SHAPES[body.shape], body.spacing, np.random.default_rng([seed, 2]))
-    fall = simulate(body, material, particles, surface.vertices, body.drops["train"], body.drops["train"])
+    fall = simulate(body, material, particles, surface.vertices, body.drops[drop], body.drops["train"])
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez(path, rest=fall.rest, positions=fall.positions.astype(np.float32), velocity=fall.velocity, shape=particles,
-             lowest=surface.vertices[:, 1].min())
+             rotation=fall.rotation, lowest=surface.vertices[:, 1].min())
     print(f"{path}: {len(particles)} particles, {fall.substeps} substeps a frame, {time.perf_counter() - began:.0f} s", flush=True)
     return path
 
@@ -93,6 +94,19 @@ def noisy(positions: np.ndarray, rest: np.ndarray, sd: float, rng: np.random.Gen
     return found
 
 
+def carried(stored: Mapping[str, np.ndarray], rest: np.ndarray, spacing: float) -> np.ndarray:
+    """(T, N, 3) [m], where the true motion takes points (N, 3) that are at `rest` in frame 0 of the training drop; spacing [m] of
+    the true particles."""
+    skin = bind(rest, stored["rest"], spacing)
+    return np.stack([skin.follow(x.astype(np.float64)) for x in stored["positions"]])
+
+
+def first_contact(truth: np.ndarray, spacing: float) -> int:
+    """The first frame in which particles `spacing` [m] apart, of a motion (T, N, 3), have all but reached the ground."""
+    lowest = truth[:, :, 1].min(1) - 0.5 * spacing
+    return int(np.argmax(lowest < 0.02 * lowest[0]))
+
+
 def learner_of(
     path: Path, body: BuiltinObject, cfg: dict, particles: int, seed: int, noise: float, device: str
 ) -> SimpleNamespace:  # fmt: skip
@@ -102,8 +116,7 @@ def learner_of(
     spacing = (len(stored["shape"]) * body.spacing**3 / particles) ** (1 / 3)
     points = fill(SHAPES[body.shape], spacing, rng)
     rest = points + (stored["rest"] - stored["shape"])[0]
-    skin = bind(rest, stored["rest"], body.spacing)
-    truth = np.stack([skin.follow(x.astype(np.float64)) for x in stored["positions"]])
+    truth = carried(stored, rest, body.spacing)
     seen = noisy(truth, rest, noise * np.ptp(stored["rest"][:, 1]), rng)
     tensor = lambda a: torch.as_tensor(a, dtype=torch.float32, device=device)  # noqa: E731
     n, reach = len(rest), body.reach or BOX[1][0]
@@ -115,9 +128,7 @@ def learner_of(
                                "opacities": torch.ones(n), "covariances": torch.eye(3).expand(n, 3, 3)}).to(device)  # fmt: skip
     start = Start(torch.eye(3, device=device), made.center, tensor(stored["velocity"]), torch.zeros(3, device=device))
     cues = neighbourhood_cues(tensor(seen), torch.zeros(1, device=device), neighbourhood(tensor(rest)))
-    height = rest[:, 1].min() - 0.5 * spacing
-    falls = truth[:, :, 1].min(1) - 0.5 * spacing
-    contact = int(np.argmax(falls < 0.02 * height))
+    contact = first_contact(truth, spacing)
     take = Take(start, None, cues, config["frame_dt"], contact)
     return SimpleNamespace(object=body, body=made, world=build_world(world), take=take, cfg=cfg, truth=tensor(truth), config=config)
 

@@ -10,7 +10,9 @@ carries them along the true motion, adds an error to every frame (`calibration.n
 identifies the directions by the joint stage of a run (`adapter=operator`). With `--plates` a specimen of the true law, of the
 isotropic one and of the learned one is then pressed between two plates, over half a turn (`mosa.analysis.compression`).
 `--black-box` learns `adapter=direct` by as many steps of Adam as a run takes, on the same motion. What is left out is the
-reconstruction. `draw` makes the figure and the page of all that was fitted.
+reconstruction. With `--own-grid` the motion to learn from is that of the true law on the learner's own particles and grid: what is
+then wrong, the grid has not done. `make` and `fit` with `--drops train test_60` learn from several drops of the body. `draw` makes
+the figure and the page of all that was fitted.
 """
 
 from __future__ import annotations
@@ -19,9 +21,11 @@ import json
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import calibration
 import fits
+import numpy as np
 import torch
 from matplotlib.figure import Figure as Canvas
 from torch import Tensor
@@ -31,14 +35,17 @@ from mosa.analysis.anisotropy import directions_in_plane
 from mosa.analysis.compression import Pressed, press
 from mosa.analysis.stiffness import angle_between, stiffest
 from mosa.analysis.tables import markdown
+from mosa.data.builtin.floor import floor_rollout
 from mosa.data.builtin.hidden_material import HiddenMaterial
 from mosa.data.builtin.objects import BuiltinObject, object_named
 from mosa.experiments.analyses import force_at, learned_modulus, pressed_modulus, redistribution, true_modulus
 from mosa.experiments.commits import commit
 from mosa.experiments.drawing import save
-from mosa.modules.body import Body
+from mosa.modules.body import Body, Start
 from mosa.modules.lit_mosa import LitMosa
+from mosa.modules.takes import Take
 from mosa.prediction import determined
+from mosa.reconstruction.cues import neighbourhood, neighbourhood_cues
 from mosa.run import device_label
 
 TWIN = "_twin"
@@ -54,9 +61,28 @@ def object_of(name: str) -> BuiltinObject:
     return replace(body, material=body.material.isotropic()) if name.endswith(TWIN) else body
 
 
-def make(name: str, folder: Path, seed: int) -> Path:
+def motion_of(path: Path, drop: str) -> Path:
+    """Where the motion of a drop lies beside the training drop's `path`."""
+    return path if drop == "train" else path.with_stem(f"{path.stem}_{drop}")
+
+
+def make(name: str, folder: Path, seed: int, drops: list[str]) -> None:
     body = object_of(name)
-    return calibration.keep(folder / f"{name}.npz", body, body.material, seed)
+    for drop in drops:
+        calibration.keep(motion_of(folder / f"{name}.npz", drop), body, body.material, seed, drop)
+
+
+def further(case: SimpleNamespace, path: Path, noise: float, rng: np.random.Generator) -> Take:
+    """Another drop of the same body, stored at `path`, with errors of the motion of its own."""
+    stored, body = np.load(path), case.body
+    tensor = lambda a: torch.as_tensor(a, dtype=torch.float32, device=body.rest.device)  # noqa: E731
+    rest = body.rest.cpu().double().numpy()
+    truth = calibration.carried(stored, rest, case.object.spacing)
+    seen = tensor(calibration.noisy(truth, rest, noise * np.ptp(rest[:, 1]), rng))
+    start = Start(tensor(stored["rotation"]), tensor(truth[0].mean(0)), tensor(stored["velocity"]), torch.zeros(3).to(body.rest))
+    cues = neighbourhood_cues(seen, body.rest.new_zeros(1), neighbourhood(tensor(truth[0])))  # their rotations are from frame 0 on
+    spacing = float(body.volume.mean()) ** (1 / 3)
+    return Take(start, None, cues, case.take.frame_dt, calibration.first_contact(truth, spacing))
 
 
 def in_plane(material: HiddenMaterial, count: int) -> tuple[Tensor, Tensor]:
@@ -81,6 +107,38 @@ def compared(found: list[Pressed], true: list[Pressed]) -> dict:
     return {"E": E, "E_off_mean": sum(off) / len(off), "E_off_largest": max(off), "force_off_largest": max(forces)}
 
 
+def level_and_shape(found: Tensor, true: Tensor) -> dict[str, float]:
+    """Of moduli over the angle, (K,) each: by how much they are off, and that error taken apart: the geometric mean of found over
+    true, and by how much what is found is off when it is divided by that. Too coarse a grid makes a law stiffer all over."""
+    ratio = found / true
+    level = float(ratio.log().mean().exp())
+    off, shape = (ratio - 1).abs(), (ratio / level - 1).abs()
+    return {"E_off_mean": float(off.mean()), "E_off_largest": float(off.max()), "E_level": level,
+            "E_shape_off_mean": float(shape.mean()), "E_shape_off_largest": float(shape.max())}  # fmt: skip
+
+
+def true_law_here(case: SimpleNamespace, path: Path) -> Tensor:
+    """(T, N, 3) [m], where the true law takes the learner's particles on the learner's grid, from its contact height."""
+    stored = np.load(path)
+    tensor = lambda a: torch.as_tensor(a, dtype=torch.float32)  # noqa: E731
+    truth = SimpleNamespace(rest=tensor(stored["rest"]), positions=tensor(stored["positions"]), velocity=tensor(stored["velocity"]),
+                            rotation=torch.eye(3), parameters={"ratio": case.object.material.ratio})  # fmt: skip
+    frames = len(case.truth)
+    scene = SimpleNamespace(name=path.stem.removesuffix(TWIN), synthetic=True, truth=truth, frames=frames,
+                            times=case.take.frame_dt * torch.arange(frames))  # fmt: skip
+    return floor_rollout(case.body, scene, case.world).to(case.truth)
+
+
+def on_own_grid(case: SimpleNamespace, path: Path, noise: float, seed: int) -> None:
+    """Learn from where the true law goes on the learner's grid, in place of where it went on its own."""
+    case.truth = true_law_here(case, path)
+    rest = case.body.rest
+    true, points = case.truth.cpu().double().numpy(), rest.cpu().double().numpy()
+    seen = calibration.noisy(true, points, noise * np.ptp(points[:, 1]), np.random.default_rng([seed, 12]))
+    cues = neighbourhood_cues(torch.as_tensor(seen).to(rest), rest.new_zeros(1), neighbourhood(rest))
+    case.take = Take(case.take.start, None, cues, case.take.frame_dt, case.take.first_contact)
+
+
 class NoImages:
     """In place of a take's observations, where no loss term asks for images."""
 
@@ -102,33 +160,43 @@ def learn_black_box(module: LitMosa, body: Body) -> None:
         for group in optimizer.param_groups:
             group["lr"] = group["rate"] * stage.decay(iteration)
         optimizer.zero_grad()
+        take = module.takes[iteration % len(module.takes)]
         for gain in module.criterion.gains:
-            terms, _ = module.terms(stage, [0], module.active_frames(stage, iteration, module.takes[0]), gain=gain)
+            terms, _ = module.terms(stage, [0], module.active_frames(stage, iteration, take), take, gain=gain)
             (sum(module.weights[name] * value for name, value in terms.items()) / len(module.criterion.gains)).backward()
         module.gradient_norms(optimizer, stage, iteration)
         optimizer.step()
         body.contact.project()
 
 
-def fit(path: Path, particles: int, more: list[str], seed: int, noise: float, device: str, plates: bool, black_box: bool) -> dict:
+def fit(
+    path: Path, particles: int, more: list[str], seed: int, noise: float, device: str, plates: bool, black_box: bool,
+    own_grid: bool, drops: list[str],
+) -> dict:  # fmt: skip
     """Of one body: calibration, joint stage, and what its laws are, along the directions of a plane."""
     began, truth = time.perf_counter(), object_of(path.stem)
     words = [f"scene={path.stem.removesuffix(TWIN)}", "prior=neo_hookean", *(["adapter=direct"] if black_box else []), *more]
     case = calibration.learner_of(path, truth, calibration.composed(words), particles, seed, noise, device)
+    if own_grid:
+        on_own_grid(case, path, noise, seed)
     body, take = case.body, case.take
-    module = LitMosa.from_config(case.config, body, takes=[take], background=torch.ones(3, device=device))
+    takes = [take, *(further(case, motion_of(path, drop), noise, np.random.default_rng([seed, 12, i]))
+                     for i, drop in enumerate(drops) if drop != "train")]  # fmt: skip
+    module = LitMosa.from_config(case.config, body, takes=takes, background=torch.ones(3, device=device))
     calibrated = module.identifying(module.stages[0])
     calibrated.search()
     fits.iterated(calibrated, module.stages[0].iterations)
     body.freeze("prior")
     print(f"  {path.stem}: calibrated after {time.perf_counter() - began:.0f} s", flush=True)
 
-    def away() -> float:
-        with torch.no_grad():
-            rollout = body.simulate(take.start, case.world, len(case.truth), take.frame_dt)
-        return 1e3 * float((rollout.x - case.truth)[take.first_contact :].square().sum(-1).mean().sqrt())
+    def rms_mm(x: Tensor) -> float:
+        return 1e3 * float((x - case.truth)[take.first_contact :].square().sum(-1).mean().sqrt())
 
-    prior_mm, posterior = away(), None
+    @torch.no_grad()
+    def away() -> float:
+        return rms_mm(body.simulate(take.start, case.world, len(case.truth), take.frame_dt).x)
+
+    prior_mm, floor_mm, posterior = away(), rms_mm(true_law_here(case, path)), None
     if black_box:
         learn_black_box(module, body)
     else:
@@ -143,10 +211,12 @@ def fit(path: Path, particles: int, more: list[str], seed: int, noise: float, de
         learned_modulus(body, n).detach(), redistribution(body, n)  # fmt: skip
     record = {
         "body": path.stem, "method": "black box" if black_box else "ours", "set": more, "particles": len(body.rest), "seed": seed,
-        "noise": noise, "prior_mm": prior_mm, "learned_mm": learned_mm, "degrees": torch.rad2deg(angles).tolist(),
-        "E_along": learned.tolist(), "true_E_along": true.tolist(), "E_off_largest": float((learned / true - 1).abs().max()),
-        "w": w.detach().tolist(), "w_range": float(w.max() - w.min()), "fibre_deg": None, "cone_deg": None,
-    } | {name: float(value.detach()) for name, value in body.material.physical().items()}  # fmt: skip
+        "noise": noise, "own_grid": own_grid, "drops": drops, "cells": float(np.ptp(body.rest[:, 1])) / body.settings.dx,
+        "prior_mm": prior_mm, "learned_mm": learned_mm, "floor_mm": floor_mm, "degrees": torch.rad2deg(angles).tolist(),
+        "E_along": learned.tolist(), "true_E_along": true.tolist(), "w": w.detach().tolist(), "w_range": float(w.max() - w.min()),
+        "fibre_deg": None, "cone_deg": None,
+    } | level_and_shape(learned, true)  # fmt: skip
+    record |= {name: float(value.detach()) for name, value in body.material.physical().items()}
     if not black_box:
         body.adapter.follow(body.material.poisson())
         axis, ratio = stiffest(body.adapter.stiffness().detach().cpu())
@@ -164,8 +234,9 @@ def fit(path: Path, particles: int, more: list[str], seed: int, noise: float, de
                      "machine": device_label(device)}
 
 
-HEADS = ("body", "law", "particles", "rms [mm]", "largest error of E [%]", "largest less smallest w", "stiffest over softest",
-         "stiffest from the fibre [deg]", "95 % cone [deg]", "E between plates off, mean and largest [%]",
+HEADS = ("body", "law", "drops", "particles", "cells of height", "noise [%]", "rms [mm]", "true law here [mm]",
+         "E off, mean and largest [%]", "its level", "its shape off, mean and largest [%]", "largest less smallest w",
+         "stiffest over softest", "stiffest from the fibre [deg]", "95 % cone [deg]", "E between plates off, mean and largest [%]",
          "force off, largest [%]", "s")  # fmt: skip
 
 
@@ -180,15 +251,20 @@ def off(plates: dict | None) -> list[str]:
     return [f"{100 * plates['E_off_mean']:.1f}, {100 * plates['E_off_largest']:.1f}", shown(plates["force_off_largest"], 1, 100)]
 
 
+def two(record: dict, name: str) -> str:
+    return f"{100 * record[name + '_mean']:.1f}, {100 * record[name + '_largest']:.1f}"
+
+
 def table(records: list[dict]) -> str:
     rows = []
     for r in records:
         plates = r.get("plates") or {}
-        prior = off(plates.get("prior"))
-        rows.append([r["body"], "isotropic", r["particles"], shown(r["prior_mm"], 1), "", "", "", "", "", *prior, ""])
-        rows.append([r["body"], r["method"], r["particles"], shown(r["learned_mm"], 1), shown(r["E_off_largest"], 1, 100),
-                     shown(r["w_range"], 3), shown(r.get("stiffness_ratio"), 3), shown(r["fibre_deg"], 0), shown(r["cone_deg"], 0),
-                     *off(plates.get("learned")), shown(r["seconds"], 0)])  # fmt: skip
+        where = [len(r["drops"]), r["particles"], shown(r["cells"], 1), shown(r["noise"], 1, 100) + ", own grid" * r["own_grid"]]
+        floor = shown(r["floor_mm"], 1)
+        rows.append([r["body"], "isotropic", *where, shown(r["prior_mm"], 1), floor, *[""] * 7, *off(plates.get("prior")), ""])
+        rows.append([r["body"], r["method"], *where, shown(r["learned_mm"], 1), floor, two(r, "E_off"), shown(r["E_level"], 3),
+                     two(r, "E_shape_off"), shown(r["w_range"], 3), shown(r.get("stiffness_ratio"), 3), shown(r["fibre_deg"], 0),
+                     shown(r["cone_deg"], 0), *off(plates.get("learned")), shown(r["seconds"], 0)])  # fmt: skip
     return markdown(HEADS, [row for i, row in enumerate(rows) if row not in rows[:i]])
 
 
@@ -200,15 +276,18 @@ def draw(records: list[dict], folder: Path) -> None:
     top = max(0.05, max(max(r["w"]) for r in records))
     for column, name in enumerate(names):
         above, below = grid[:, column]
-        for r in (r for r in records if r["body"] == name):
-            plates = r.get("plates")
+        own = [r for r in records if r["body"] == name]
+        for r in own:
+            plates, same = r.get("plates"), [s for s in own if s["method"] == r["method"]]
             degrees = plates["degrees"] if plates else r["degrees"]
+            label = r["method"] + (f", {r['particles']} particles" if len({s["particles"] for s in same}) > 1 else "")
+            label += f", {len(r['drops'])} drops" if len(r["drops"]) > 1 else ""
             if not above.lines:
                 above.plot(degrees, [e / 1e3 for e in (plates["true"] if plates else r["true_E_along"])], "k--", label="truth")
                 if plates:
                     above.plot(degrees, [e / 1e3 for e in plates["prior"]["E"]], label="isotropic")
-            above.plot(degrees, [e / 1e3 for e in (plates["learned"]["E"] if plates else r["E_along"])], label=r["method"])
-            below.plot(r["degrees"], r["w"], label=r["method"])
+            above.plot(degrees, [e / 1e3 for e in (plates["learned"]["E"] if plates else r["E_along"])], label=label)
+            below.plot(r["degrees"], r["w"], label=label)
             above.set_ylabel("E between plates [kPa]" if plates else "E [kPa]")
         above.set_ylim(bottom=0)
         above.set_title(name.replace(TWIN, ", isotropic twin"), fontsize=10)
@@ -220,13 +299,13 @@ def draw(records: list[dict], folder: Path) -> None:
     stem = folder / "directions_from_motion"
     picture = save(canvas, stem)
     stem.with_suffix(".json").write_text(json.dumps(records, indent=1))
+    commits, machines, seeds = (", ".join(sorted({str(r[key]) for r in records})) for key in ("commit", "machine", "seed"))
     stem.with_suffix(".md").write_text("\n".join([
         "# Directions from true motions", "", __doc__.split("\n\n")[2].strip(), "", table(records), "",
         f"![E and w over the angle from the fibre]({picture.name})", "",
-        "- command: `python benchmarks/directions.py make`, `fit --plates` (`--black-box`) and `draw`",
-        f"- version {mosa.__version__}, commit {', '.join(sorted({r['commit'] for r in records}))}",
-        f"- seed {', '.join(sorted({str(r['seed']) for r in records}))}; error of the motion: "
-        f"{100 * records[0]['noise']:.1f} % of the height; {', '.join(sorted({r['machine'] for r in records}))}", ""]))  # fmt: skip
+        "- command: `python benchmarks/directions.py make`, `fit --plates` (`--black-box`, `--own-grid`) and `draw`",
+        f"- version {mosa.__version__}, commit {commits}",
+        f"- seed {seeds}; noise: error of the motion over the body's height; {machines}", ""]))  # fmt: skip
 
 
 def main() -> None:
@@ -234,9 +313,16 @@ def main() -> None:
     calibration.add_options(parser)
     parser.add_argument("--plates", action="store_true", help="fit: press specimens between plates too")
     parser.add_argument("--black-box", action="store_true", help="fit: adapter=direct in place of ours")
+    parser.add_argument("--own-grid", action="store_true", help="fit: the true law's motion on the learner's particles and grid")
+    parser.set_defaults(particles=4000)
+    parser.add_argument("--drops", nargs="+", default=["train"], help="make, fit: drops to learn from, train among them")
     options = parser.parse_args()
-    given = (options.particles, options.set, options.seed, options.noise, options.device, options.plates, options.black_box)
-    fits.run(options, lambda name: make(name, options.out, options.seed), lambda path: fit(path, *given), table, draw)
+    if "train" not in options.drops or (options.own_grid and len(options.drops) > 1):
+        parser.error("--drops: expected train among them, and train alone with --own-grid")
+    given = (options.particles, options.set, options.seed, options.noise, options.device, options.plates, options.black_box,
+             options.own_grid, options.drops)
+    fits.run(options, lambda name: make(name, options.out, options.seed, options.drops), lambda path: fit(path, *given),
+             table, draw)  # fmt: skip
 
 
 if __name__ == "__main__":

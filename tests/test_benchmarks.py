@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
@@ -48,6 +49,18 @@ def test_a_partial_verification_leaves_the_published_table_alone(monkeypatch, tm
     verification.publish(results, page)
     assert "| old |" not in page.read_text() and "| 1 | probes | a | b |" in page.read_text()
     assert page.read_text().startswith("text\n") and page.read_text().endswith("<!-- end -->\nmore\n")
+
+
+def test_an_error_of_the_level_is_told_from_one_of_the_shape(monkeypatch):
+    """A law that is stiffer all over has no error of shape, and one whose directions are exchanged none of level."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    apart = importlib.import_module("directions").level_and_shape
+    true = torch.tensor([1.0, 2.0, 4.0])
+    stiffer, exchanged = apart(1.3 * true, true), apart(true.flip(0), true)
+    assert stiffer["E_level"] == pytest.approx(1.3) and stiffer["E_shape_off_largest"] == pytest.approx(0, abs=1e-6)
+    assert stiffer["E_off_mean"] == stiffer["E_off_largest"] == pytest.approx(0.3)
+    assert exchanged["E_level"] == pytest.approx(1.0) and exchanged["E_shape_off_largest"] == pytest.approx(3.0)
+    assert exchanged["E_shape_off_mean"] == exchanged["E_off_mean"] == pytest.approx((3.0 + 0 + 0.75) / 3)
 
 
 @pytest.mark.parametrize(("name", "arguments"), [("rollout", ["--device", "cuda"]), ("renderer", ["--device", "cuda"]),
