@@ -53,39 +53,61 @@ ADD = """
 
 
 # of a 6 x 6 matrix and a vector, in the order of Warp's own product: neither the matrix nor its gradient is held in float64, for
-# which a GPU's thread has not enough registers
-PRODUCT = PIECE + """
+# which a GPU's thread has not enough registers. A CPU's compiler makes vectors of Warp's own
+WHOLE = """
+    const {scalar}* numbers = reinterpret_cast<const {scalar}*>(field.data + place);
+    wp::mat_t<6, 6, double> matrix;
+    for (int k = 0; k < 36; ++k) matrix.data[k / 6][k % 6] = static_cast<double>(numbers[k]);"""
+PRODUCT = f"""
+#if defined(__CUDA_ARCH__)
+{PIECE}
     const Piece* source = reinterpret_cast<const Piece*>(field.data + place);
     wp::vec_t<6, double> value;
 #pragma unroll
-    for (int k = 0; k < {pieces}; ++k) {{
+    for (int k = 0; k < {{pieces}}; ++k) {{{{
         const Piece piece = source[k];
 #pragma unroll
-        for (int l = 0; l < {width}; ++l) {{
-            const int row = ({width} * k + l) / 6, column = ({width} * k + l) % 6;
+        for (int l = 0; l < {{width}}; ++l) {{{{
+            const int row = ({{width}} * k + l) / 6, column = ({{width}} * k + l) % 6;
             const double term = static_cast<double>(piece.part[l]) * x[column];
             value[row] = column == 0 ? term : value[row] + term;
-        }}
-    }}
-    return value;"""
-ADD_PRODUCT = PIECE + """
+        }}}}
+    }}}}
+    return value;
+#else
+{WHOLE}
+    return wp::mul(matrix, x);
+#endif
+"""
+ADD_PRODUCT = f"""
+#if defined(__CUDA_ARCH__)
+{PIECE}
     const Piece* source = reinterpret_cast<const Piece*>(field.data + place);
     Piece* target = reinterpret_cast<Piece*>(adj_field.data + i);
     wp::vec_t<6, double> sums;
 #pragma unroll
-    for (int k = 0; k < {pieces}; ++k) {{
+    for (int k = 0; k < {{pieces}}; ++k) {{{{
         const Piece piece = source[k];
         Piece added = adj_field.data ? target[k] : piece;
 #pragma unroll
-        for (int l = 0; l < {width}; ++l) {{
-            const int row = ({width} * k + l) / 6, column = ({width} * k + l) % 6;
+        for (int l = 0; l < {{width}}; ++l) {{{{
+            const int row = ({{width}} * k + l) / 6, column = ({{width}} * k + l) % 6;
             const double term = static_cast<double>(piece.part[l]) * adj_ret[row];
             sums[column] = row == 0 ? term : sums[column] + term;
-            added.part[l] += static_cast<{scalar}>(adj_ret[row] * x[column]);
-        }}
+            added.part[l] += static_cast<{{scalar}}>(adj_ret[row] * x[column]);
+        }}}}
         if (adj_field.data) target[k] = added;
-    }}
-    adj_x += sums;"""
+    }}}}
+    adj_x += sums;
+#else
+{WHOLE}
+    wp::mat_t<6, 6, double> adj_matrix = {{{{}}}};
+    wp::adj_mul(matrix, x, adj_matrix, adj_x, adj_ret);
+    if (!adj_field.data) return;
+    {{scalar}}* target = reinterpret_cast<{{scalar}}*>(adj_field.data + i);
+    for (int k = 0; k < 36; ++k) target[k] += static_cast<{{scalar}}>(adj_matrix.data[k / 6][k % 6]);
+#endif
+"""
 
 
 @cache
