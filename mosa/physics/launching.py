@@ -16,8 +16,6 @@ BYTES = 16
 """Kernels read a particle's part in pieces of so many: arrays begin at a multiple."""
 APART = 32
 """Numbers of which arrays in one buffer begin at multiples."""
-LARGE = 2**25
-"""Bytes of a tensor that is copied by itself."""
 BLOCK = 64
 """Threads of a CUDA block: small ones, so that ten thousand particles are spread over all multiprocessors."""
 
@@ -86,22 +84,11 @@ def warp_stream(device: torch.device):
 
 
 def copies(tensors: Sequence[Tensor]) -> list[Tensor]:
-    """Contiguous copies."""
+    """Contiguous copies, in one launch on CUDA."""
     made = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in tensors]
-    copy_all(made, tensors)
+    if made:
+        torch._foreach_copy_(made, list(tensors))
     return made
-
-
-def copy_all(targets: Sequence[Tensor], sources: Sequence[Tensor]) -> None:
-    """Copies sources into targets of their shapes and types: in one launch on CUDA, but for those that fill the GPU by themselves,
-    of which a launch for many does not use the whole memory's speed."""
-    pairs = list(zip(targets, sources, strict=True))
-    for target, source in pairs:
-        if source.nbytes >= LARGE:
-            target.copy_(source)
-    small = [pair for pair in pairs if pair[1].nbytes < LARGE]
-    if small:
-        torch._foreach_copy_(*map(list, zip(*small)))
 
 
 def same_memory(a: Sequence[Tensor], b: Sequence[Tensor]) -> bool:

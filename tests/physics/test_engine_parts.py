@@ -8,13 +8,12 @@ import pytest
 import torch
 
 import mosa.physics
-import mosa.physics.launching as launching
 from mosa.physics.engine.adaptive_steps import StepControl
 from mosa.physics.engine.budget import Budget
 from mosa.physics.engine.capture import ATTEMPTS, MAX_GRAPHS, Graphs, Strategy
 from mosa.physics.engine.clock import Adaptive, Clock, Moment, Replay
 from mosa.physics.engine.network_evaluation import from_weights, same_weights
-from mosa.physics.launching import copies, same_memory
+from mosa.physics.launching import same_memory
 
 
 class Counted(Strategy):
@@ -104,17 +103,6 @@ def test_memory_is_the_same_whoever_views_it():
     leaf = torch.nn.Parameter(a)
     assert same_memory([a, leaf], [leaf.detach(), a])
     assert not same_memory([a], [a.clone()]) and not same_memory([a], [a[:3]]) and not same_memory([a], [a, a])
-
-
-@pytest.mark.parametrize("large", [0, 100, 2**40])
-def test_copies_are_the_same_in_one_launch_or_each_by_itself(large, monkeypatch):
-    """Contiguous, of views too, and of none; some are copied together and some alone."""
-    monkeypatch.setattr(launching, "LARGE", large)
-    source = torch.arange(60.0).view(5, 12)
-    given = [source, source[1:3, 2:5], source.T[:4], source[2], source[:0]]
-    made = copies(given)
-    assert all(torch.equal(a, b) and a.is_contiguous() for a, b in zip(made, given, strict=True))
-    assert not any(a.numel() and a.data_ptr() == b.data_ptr() for a, b in zip(made, given)) and copies([]) == []
 
 
 def test_what_is_made_of_weights_is_not_mixed_up_with_what_lies_where_they_lay():

@@ -22,7 +22,7 @@ from mosa.physics.engine.capture import Graphs, WarpCapture
 from mosa.physics.engine.numerics import Numerics, State, Steps
 from mosa.physics.grid.transfer_kernels import NO_EVENT, transfer_kernels
 from mosa.physics.grid.window import SMALL
-from mosa.physics.launching import SCALARS, aligned, copies, copy_all, launch, zeros_in_one
+from mosa.physics.launching import SCALARS, aligned, copies, launch, zeros_in_one
 
 SPARE = 8
 """Room for larger windows: half as many nodes again, at most `window.SMALL`, or one in so many where that is more. A window that
@@ -30,6 +30,9 @@ finds none costs new buffers and captures."""
 IDLE = 8
 """Times the window's nodes that stay (`window.SMALL` in any case) for when it grows again: idle ones cost memory and, on CUDA,
 threads that end at once."""
+LARGE = 2**22
+"""Bytes of one number of all particles at all kept substeps, from which each tensor of them is copied by itself: one launch for
+many has 320 blocks, which the 132 multiprocessors of an H200 share unevenly."""
 
 
 class Workspace:
@@ -53,7 +56,9 @@ class Workspace:
         self.stress, self.mapping = kernels_of(numerics.law, self.scalar, adapted, plastic_adapted, numerics.strain)
         self.plastic = numerics.law.plastic
         n = particles
+        self._shared = shared
         states = substeps + 1 if with_adjoint else 2
+        self._large = states * n * torch.finfo(numerics.dtype).bits // 8 >= LARGE
         self.x, self.x_wp = self._per_slot(states, (n, 3), self.kernels.vec3)
         self.v, self.v_wp = self._per_slot(states, (n, 3), self.kernels.vec3)
         self.C_affine, self.C_affine_wp = self._per_slot(states, (n, 3, 3), self.kernels.mat33)
@@ -117,11 +122,18 @@ class Workspace:
 
     def tape(self) -> list[Tensor]:
         """Copies of all that the adjoint reads of a forward pass, one tensor of slots each, the grid's last."""
-        return [*copies(self._particle_slots()), self.grid_slots().clone(memory_format=torch.contiguous_format)]
+        slots = self._particle_slots()
+        kept = [slot.clone() for slot in slots] if self._large else copies(slots)
+        return [*kept, self.grid_slots().clone(memory_format=torch.contiguous_format)]
 
     def rewind(self, tape: Sequence[Tensor]) -> None:
         """As if the forward pass that left `tape`, in the window that is set, had just run."""
-        copy_all(self._particle_slots(), tape[:-1])
+        slots = self._particle_slots()
+        if self._large:
+            for slot, kept in zip(slots, tape):
+                slot.copy_(kept)
+        else:
+            torch._foreach_copy_(slots, list(tape[:-1]))
         self.grid_slots().copy_(tape[-1])
 
     def _particle_slots(self) -> list[Tensor]:
@@ -195,7 +207,9 @@ class Workspace:
 
     def hold(self, held: dict[str, Tensor | None]) -> None:
         """Copy parameters and the adapter's operator in, those that are given."""
-        given = {name: value[: len(self.held[name])] for name, value in held.items() if value is not None}
+        given = {name: value for name, value in held.items() if value is not None}
+        if self._shared:
+            given |= {name: given[name][:1] for name in ("G", "h")}
         torch._foreach_copy_([self.held[name] for name in given], list(given.values()))
 
     def point(self, held: dict[str, Tensor | None]) -> None:

@@ -1,0 +1,67 @@
+"""An operator that is the same for all particles, answered as views of one row, against one that has a row for each."""
+
+import pytest
+import torch
+
+from mosa.physics.engine.adapter_interface import AdapterOperator
+from mosa.physics.engine.simulator import Simulator
+from mosa.types import Ground, ParticleState
+
+
+def results(state, rows: bool, device, dtype, *, strain, worlds, stride):
+    """(positions, gradients of the operator and of mu) of a rollout; rows: a row of the operator for every particle."""
+    names = ("x", "v", "C_affine", "F", "F_tot")
+    state = ParticleState(*(getattr(state, name).to(device=device, dtype=dtype) for name in names))
+    n = len(state.x)
+    g = torch.Generator().manual_seed(0)
+    G, h = (torch.randn(6, *s, generator=g, dtype=torch.float64) for s in ((6,), ()))
+    G, h = ((scale * t).to(device=device, dtype=dtype).requires_grad_() for t, scale in ((G, 0.05), (h, 0.02 if strain else 1e3)))
+    mu = torch.full((), 4e4, device=device, dtype=dtype, requires_grad=True)
+
+    def adapter(given):
+        views = G.expand(len(given.w), 6, 6), h.expand(len(given.w), 6)
+        return AdapterOperator(*(view.contiguous() if rows else view for view in views))
+
+    sim = Simulator("corotated", dx=0.04, substeps=10, frame_dt=4e-3, ground=Ground(0.0), dtype=dtype, device=device, strain=strain)
+    volume = torch.full((n,), 8e-6, device=device, dtype=dtype)
+    start = ParticleState.stack([state] * worlds) if worlds else state
+    rollout = sim.rollout(start, {"mu": mu, "lam": 5e4}, volume, 1000.0, 3, adapter=adapter, stride=stride)
+    gradients = torch.autograd.grad((rollout.x**2).sum() + (rollout.F**2).sum(), [G, h, mu])
+    return sim, [rollout.x.detach(), *gradients]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("worlds", [None, 2])
+@pytest.mark.parametrize("strain", [None, "green", "hencky"])
+@pytest.mark.parametrize("stride", [None, 4])
+def test_one_row_gives_the_bits_of_a_row_for_each_particle(dtype, worlds, strain, stride, make_block):
+    """Positions, and gradients: each particle adds to its own row of them, whatever it read."""
+    options = {"strain": strain, "worlds": worlds, "stride": stride}
+    found = [results(make_block(n=3), rows, "cpu", dtype, **options) for rows in (True, False)]
+    for sim, expected in zip((found[0][0], found[1][0]), (27, 1)):
+        assert {len(work.held["G"]) for work in sim.buffers} == {expected}
+    for each, shared in zip(found[0][1], found[1][1]):
+        assert torch.equal(each, shared) and each.abs().max() > 0
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("dtype, tolerance", [(torch.float64, 1e-9), (torch.float32, 1e-4)])
+@pytest.mark.parametrize("worlds", [None, 2])
+@pytest.mark.parametrize("strain", [None, "green"])
+def test_one_row_on_a_gpu(dtype, tolerance, worlds, strain, make_block):
+    """Within the order of the grid's sums, as `test_cuda`."""
+    options = {"strain": strain, "worlds": worlds, "stride": None}
+    each, shared = (results(make_block(n=6), rows, "cuda", dtype, **options)[1] for rows in (True, False))
+    for a, b in zip(each, shared):
+        assert (a - b).abs().max() <= tolerance * max(1.0, float(a.abs().max()))
+
+
+def test_large_states_are_copied_one_tensor_at_a_time(make_block, monkeypatch):
+    found = []
+    for large in (2**40, 0):
+        monkeypatch.setattr("mosa.physics.engine.workspace.LARGE", large)
+        sim, values = results(make_block(n=3), False, "cpu", torch.float64, strain="green", worlds=None, stride=None)
+        kinds = {work._large for work in sim.buffers}
+        assert kinds == {large == 0}
+        found.append(values)
+    assert all(torch.equal(a, b) for a, b in zip(*found))
