@@ -56,7 +56,6 @@ class Workspace:
         self.stress, self.mapping = kernels_of(numerics.law, self.scalar, adapted, plastic_adapted, numerics.strain)
         self.plastic = numerics.law.plastic
         n = particles
-        self._shared = shared
         states = substeps + 1 if with_adjoint else 2
         self._large = states * n * torch.finfo(numerics.dtype).bits // 8 >= LARGE
         self.x, self.x_wp = self._per_slot(states, (n, 3), self.kernels.vec3)
@@ -78,6 +77,7 @@ class Workspace:
         for name, (shape, kind) in shapes.items():
             one = name != "parameters" and (pointed or (shared and name in ("G", "h")))
             self.held[name], self.held_wp[name] = self.array((1, *shape[1:]) if one else shape, kind)
+        self._rows = {name: self.held[name][0] for name in ("G", "h")} if shared else {}
         if with_adjoint:
             self.adj_x, self.adj_x_wp = self._per_slot(2, (n, 3), self.kernels.vec3)
             self.adj_v, self.adj_v_wp = self._per_slot(2, (n, 3), self.kernels.vec3)
@@ -208,9 +208,10 @@ class Workspace:
     def hold(self, held: dict[str, Tensor | None]) -> None:
         """Copy parameters and the adapter's operator in, those that are given."""
         given = {name: value for name, value in held.items() if value is not None}
-        if self._shared:
-            given |= {name: given[name][:1] for name in ("G", "h")}
-        torch._foreach_copy_([self.held[name] for name in given], list(given.values()))
+        targets = self.held
+        if self._rows:  # a view of one row with a leading dimension has other strides than its target: each is then copied alone
+            targets, given = self.held | self._rows, given | {name: given[name][0] for name in self._rows}
+        torch._foreach_copy_([targets[name] for name in given], list(given.values()))
 
     def point(self, held: dict[str, Tensor | None]) -> None:
         """As `hold`, without a copy or a graph: the next launches read these tensors. The caller keeps them."""
