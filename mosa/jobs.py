@@ -11,6 +11,7 @@ import os
 import shutil
 import signal
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -90,14 +91,27 @@ def check_folders(arguments: Sequence[str]) -> None:
             sys.exit(2)
         place = Path(value.strip("'\"")).absolute()
         there = next(folder for folder in (place, *place.parents) if os.path.lexists(folder))
-        if not there.is_dir() or not os.access(there, os.W_OK):
-            reason = "it cannot be written to" if there.is_dir() else "it is none"
+        if reason := no_place(there, there != place):
             print(f"\nConfigError: {key}: expected a folder that can be made, found {value}: {there}: {reason}", file=sys.stderr)
             sys.exit(2)
         if key == "hydra.run.dir" and (foreign := no_file_of_a_run(place)) is not None:
             print(f"\nConfigError: {key}: {foreign}: expected what a run has there, a file (of checkpoints and .hydra: a folder), "
                   "found something else (a folder, a pipe, a device, a link to nothing); remove it", file=sys.stderr)  # fmt: skip
             sys.exit(2)
+
+
+def no_place(folder: Path, new: bool) -> str | None:
+    """Why a run's files cannot be in a folder, or, new, a folder in it; None where they can."""
+    if not folder.is_dir():
+        return "it is none"
+    if not os.access(folder, os.W_OK):
+        return "it cannot be written to"
+    try:
+        if new:  # some file systems let nothing be made, whatever the rights say
+            os.rmdir(tempfile.mkdtemp(dir=folder))
+    except OSError as error:
+        return f"nothing can be made in it ({error.strerror})"
+    return None
 
 
 def no_file_of_a_run(folder: Path) -> Path | None:

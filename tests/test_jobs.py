@@ -167,6 +167,11 @@ def test_a_run_folder_that_cannot_be_made_is_said_before_hydra_fails(tmp_path, c
         with pytest.raises(SystemExit) as ended:
             check_folders(["seed=0", f"hydra.run.dir={tmp_path}/{wrong}"])
         assert ended.value.code == 2 and "hydra.run.dir: expected a folder" in capsys.readouterr().err
+    if Path("/proc/self").is_dir():  # for root it has all rights
+        with pytest.raises(SystemExit):
+            check_folders(["hydra.run.dir=/proc/mosa"])
+        assert "hydra.run.dir: expected a folder that can be made, found /proc/mosa: /proc: " in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["file"]
     with pytest.raises(SystemExit):  # a shell's variable that is not set: the run would lie among the program's files
         check_folders(["hydra.run.dir="])
     assert "hydra.run.dir: expected a folder, found nothing" in capsys.readouterr().err
