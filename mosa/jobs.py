@@ -11,6 +11,7 @@ import os
 import shutil
 import signal
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -32,6 +33,8 @@ from mosa.threads import settle_threads
 
 FAILED = "failed"
 """Folder in that of a sweep: one file for each job that ended in an error, named after its number, with the message."""
+WRITTEN = (".json", ".log", ".md", ".npz", ".ply", ".png", ".mp4")
+"""Endings of the files that a run writes into its folder."""
 LONGEST = 120
 """Bytes of a job's folder name that its overrides may have: a file system takes 255 for the whole of it."""
 
@@ -88,10 +91,35 @@ def check_folders(arguments: Sequence[str]) -> None:
             sys.exit(2)
         place = Path(value.strip("'\"")).absolute()
         there = next(folder for folder in (place, *place.parents) if os.path.lexists(folder))
-        if not there.is_dir() or not os.access(there, os.W_OK):
-            reason = "it cannot be written to" if there.is_dir() else "it is none"
+        if reason := no_place(there, there != place):
             print(f"\nConfigError: {key}: expected a folder that can be made, found {value}: {there}: {reason}", file=sys.stderr)
             sys.exit(2)
+        if key == "hydra.run.dir" and (foreign := no_file_of_a_run(place)) is not None:
+            print(f"\nConfigError: {key}: {foreign}: expected what a run has there, a file (of checkpoints and .hydra: a folder), "
+                  "found something else (a folder, a pipe, a device, a link to nothing); remove it", file=sys.stderr)  # fmt: skip
+            sys.exit(2)
+
+
+def no_place(folder: Path, new: bool) -> str | None:
+    """Why a run's files cannot be in a folder, or, new, a folder in it; None where they can."""
+    if not folder.is_dir():
+        return "it is none"
+    if not os.access(folder, os.W_OK):
+        return "it cannot be written to"
+    try:
+        if new:  # some file systems let nothing be made, whatever the rights say
+            os.rmdir(tempfile.mkdtemp(dir=folder))
+    except OSError as error:
+        return f"nothing can be made in it ({error.strerror})"
+    return None
+
+
+def no_file_of_a_run(folder: Path) -> Path | None:
+    """What has the name of a run's file and is none: a pipe would be waited for, a folder ends the run when it is written."""
+    found = [path for path in folder.glob("*") if path.suffix in WRITTEN and not path.is_file()]
+    found += [path for path in folder.glob("checkpoints/*.ckpt") if not path.is_file()]
+    found += [path for name in ("checkpoints", ".hydra") if os.path.lexists(path := folder / name) and not path.is_dir()]
+    return min(found, default=None)
 
 
 def check_files(arguments: Sequence[str], conf: Path) -> None:

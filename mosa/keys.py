@@ -24,6 +24,7 @@ from mosa.schema import (
     COUNT,
     ENTRIES,
     FLAG,
+    FOLDER,
     NAMES,
     PLACE,
     POSITIVE,
@@ -101,7 +102,7 @@ TRAINING: dict[str, Kind] = {
     "rendering.appearance": one_of("splats", "particles"),
     "ckpt_path": or_null(TEXT),
     "optimized_metric": FIGURE,
-    "scene.cache": or_null(TEXT),
+    "scene.cache": or_null(FOLDER),  # an empty one would be the folder that this was started in
     "logger.images_every": whole(0),
 }
 BODY = {key: kind for key, kind in TRAINING.items()
@@ -112,7 +113,7 @@ SIMULATION: dict[str, Kind] = {
     **{name: SECTION for name in ("simulate", "evaluation")},
     "extensions": or_null(NAMES),
     "ckpt_path": TEXT,
-    "cache": or_null(TEXT),
+    "cache": or_null(FOLDER),
     "plan": or_null(whole(2)),
     "appearance": or_null(one_of("splats", "particles")),
     "simulate.variant": one_of("adapted", "prior_eta", "prior"),

@@ -62,6 +62,7 @@ def is_sequence(value: Any) -> bool:
 
 
 TEXT = Kind("a text", lambda v: isinstance(v, str))
+FOLDER = Kind("a folder", lambda v: isinstance(v, str) and bool(v.strip()))
 FLAG = Kind("true or false", lambda v: isinstance(v, bool))
 NAMES = Kind("a list of names like [a, b]", lambda v: isinstance(v, list) and all(isinstance(name, str) for name in v))
 SEQUENCES = Kind("a list of names or folders like [a, b], or of sections like {path: a, frames: [0, 9]}",

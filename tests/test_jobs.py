@@ -167,9 +167,36 @@ def test_a_run_folder_that_cannot_be_made_is_said_before_hydra_fails(tmp_path, c
         with pytest.raises(SystemExit) as ended:
             check_folders(["seed=0", f"hydra.run.dir={tmp_path}/{wrong}"])
         assert ended.value.code == 2 and "hydra.run.dir: expected a folder" in capsys.readouterr().err
+    if Path("/proc/self").is_dir():  # for root it has all rights
+        with pytest.raises(SystemExit):
+            check_folders(["hydra.run.dir=/proc/mosa"])
+        assert "hydra.run.dir: expected a folder that can be made, found /proc/mosa: /proc: " in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["file"]
     with pytest.raises(SystemExit):  # a shell's variable that is not set: the run would lie among the program's files
         check_folders(["hydra.run.dir="])
     assert "hydra.run.dir: expected a folder, found nothing" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["train.log", "metrics.json", "checkpoints/last.ckpt", "results.md", "rollout.npz", "checkpoints",
+                                  ".hydra"])
+@pytest.mark.parametrize("kind", ["pipe", "folder", "device", "nothing"])
+def test_what_is_no_file_of_a_run_is_said_before_it_begins(tmp_path, capsys, name, kind):
+    """A pipe in the place of the log was waited for without end, a folder in that of a table ended a run when all was done."""
+    place = tmp_path / "run" / name
+    place.parent.mkdir(parents=True)
+    check_folders([f"hydra.run.dir={tmp_path}/run"])
+    if kind == "pipe":
+        os.mkfifo(place)
+    elif kind == "folder":
+        place.mkdir()
+    else:
+        place.symlink_to("/dev/zero" if kind == "device" else "/nonexistent")
+    if kind == "folder" and "." not in name[1:]:  # what a run has there
+        check_folders([f"hydra.run.dir={tmp_path}/run"])
+        return
+    with pytest.raises(SystemExit) as ended:
+        check_folders([f"hydra.run.dir={tmp_path}/run"])
+    assert ended.value.code == 2 and f"{name}: expected what a run has there" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("arguments", [["banana"], ["banana=3"], ["scene=banana"]])
