@@ -286,8 +286,8 @@ def draw(records: list[dict], folder: Path) -> None:
                 above.plot(degrees, [e / 1e3 for e in (plates["true"] if plates else r["true_E_along"])], "k--", label="truth")
                 if plates:
                     above.plot(degrees, [e / 1e3 for e in plates["prior"]["E"]], label="isotropic")
-            above.plot(degrees, [e / 1e3 for e in (plates["learned"]["E"] if plates else r["E_along"])], label=label)
-            below.plot(r["degrees"], r["w"], label=label)
+            (line,) = above.plot(degrees, [e / 1e3 for e in (plates["learned"]["E"] if plates else r["E_along"])], label=label)
+            below.plot(r["degrees"], r["w"], label=label, color=line.get_color())
             above.set_ylabel("E between plates [kPa]" if plates else "E [kPa]")
         above.set_ylim(bottom=0)
         above.set_title(name.replace(TWIN, ", isotropic twin"), fontsize=10)
