@@ -115,9 +115,9 @@ def _positions(body: Body, s: Sequence, world: World) -> Tensor:
 
 @torch.no_grad()
 def determined(body: Body, posterior: Posterior, *, draws: int = 400, seed: int = 1) -> dict[str, float]:
-    """What the data say about the law: standard deviations of the global parameters (`posterior/<name>_sd`, relative for moduli),
-    how
-    many of the operator's numbers and of the stiffness modes they determine, and the 95 % cone about the stiffest direction."""
+    """What the data say about the law: standard deviations of the global parameters (`posterior/<name>_sd`, relative for moduli), how
+    many of the operator's numbers and of the stiffness modes they determine, and the 95 % cone about the stiffest direction: of draws
+    about every form of the law that explains the data, each form as likely as the others."""
     figures: dict[str, float] = {}
     blocks: dict[str, list[int]] = {}
     for i, name in enumerate(posterior.names):
@@ -138,9 +138,10 @@ def determined(body: Body, posterior: Posterior, *, draws: int = 400, seed: int 
     if body.adapter is not None and body.adapter.is_on and body.adapter.stiffness() is not None:
         generator = torch.Generator().manual_seed(seed)
         axis, _ = stiffest(body.adapter.stiffness().cpu())
-        stiffnesses = []
-        # wider draws than the likelihood's own, as predictions have them
-        for _ in each_law(body, posterior.mean + INFLATION * (posterior.draws(draws, generator) - posterior.mean)):
+        stiffnesses, forms = [], torch.stack([posterior.mean, *(n.to(posterior.mean) for n in posterior.rivals.values())])
+        # wider draws than the likelihood's own
+        away = INFLATION * (posterior.draws(draws, generator) - posterior.mean)
+        for _ in each_law(body, forms[torch.arange(draws) % len(forms)] + away):
             body.adapter.follow(body.material.poisson())
             stiffnesses.append(body.adapter.stiffness().cpu())
         body.adapter.follow(body.material.poisson())
