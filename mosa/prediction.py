@@ -115,9 +115,9 @@ def _positions(body: Body, s: Sequence, world: World) -> Tensor:
 
 @torch.no_grad()
 def determined(body: Body, posterior: Posterior, *, draws: int = 400, seed: int = 1) -> dict[str, float]:
-    """What the data say about the law: standard deviations of the global parameters (`posterior/<name>_sd`, relative for moduli), how
-    many of the operator's numbers and of the stiffness modes they determine, and the 95 % cone about the stiffest direction: of draws
-    about every form of the law that explains the data, each form as likely as the others."""
+    """What the data say about the law: standard deviations of the global parameters (`posterior/<name>_sd`, relative for moduli),
+    how many of the operator's numbers and of the stiffness modes they determine, and the 95 % cone about the stiffest direction:
+    of draws about every form of the law that explains the data, each form as likely as the others."""
     figures: dict[str, float] = {}
     blocks: dict[str, list[int]] = {}
     for i, name in enumerate(posterior.names):

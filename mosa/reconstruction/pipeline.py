@@ -320,45 +320,36 @@ def follow(
     _first_frame(scene)
     pose = (rotation, center, rest_center)
     cache = _open_cache(
-        cache_dir, scene, _motion_settings(settings) | {"carried": asdict(settings.carried)}, seed, light="of its first frame",
+        cache_dir, scene, _motion_settings(settings), seed, light="of its first frame",
         body=[first.fingerprint, first.training_cameras, first.training_frames, reconstruction.spacing],
         pose=[[round(v, 6) for v in part.flatten().tolist()] for part in pose],
     )  # fmt: skip
     windows = object_windows(scene, views, frames, margin=settings.margin).to(device)
 
-    def turned(seen: Appearance) -> Appearance:
-        """In the pose, in the light that falls on it there: the one that frame 0 shows, near the one that was known."""
-        rest, still = seen.splats, [c for c in views if bool((scene.mattes[c, 0] > 0.5).any())]
-        normals = surface_normals(rest.means, reconstruction.splats.means) if seen.normals is None else seen.normals
+    def turned(rest: Splats) -> Splats:
+        """In the pose, in the light that falls on it there: the one that frame 0 shows."""
+        normals = surface_normals(rest.means, reconstruction.splats.means)
+        still = [c for c in views if bool((scene.mattes[c, 0] > 0.5).any())]
         light = light_of(rest.to(device), normals.to(device), (rotation, center), scene.images[still, 0], scene.mattes[still, 0],
-                         scene.cameras.select(still), background=scene.background, rest_center=rest_center,
-                         before=seen.light).cpu()  # fmt: skip
-        Q, normals, moved = rotation.cpu().to(normals), normals.cpu(), posed(rest.to("cpu"), *(p.cpu() for p in pose))
-        colors = moved.colors * shading(light, normals, Q)[:, None]
-        return Appearance(replace(moved, colors=colors), constant_coefficients(colors), normals @ Q.T, light)
-
-    def plain(rest: Splats) -> Appearance:
-        return Appearance(rest, constant_coefficients(rest.colors))
+                         scene.cameras.select(still), background=scene.background, rest_center=rest_center).cpu()
+        moved = posed(rest.to("cpu"), *(p.cpu() for p in pose))
+        return replace(moved, colors=moved.colors * shading(light, normals.cpu(), rotation.cpu().to(normals))[:, None])
 
     carried = settings.dynamic.carriers == "static"
-    if reconstruction.appearance is not None:
-        appearance = turned(reconstruction.appearance)
-    else:
-        appearance = turned(plain(reconstruction.splats if reconstruction.static is None else reconstruction.static))
-    splats = turned(plain(reconstruction.splats)).splats if not carried else posed(
-        reconstruction.splats.to("cpu"), *(p.cpu() for p in pose))  # fmt: skip
+    splats = posed(reconstruction.splats.to("cpu"), *(p.cpu() for p in pose)) if carried else turned(reconstruction.splats)
+    static = turned(reconstruction.splats if reconstruction.static is None else reconstruction.static)
 
     def bar(name: str, total: int) -> tqdm:
         return tqdm(total=total, desc=f"reconstruction of {scene.sequence}: {name}", disable=not progress, leave=False)
 
-    parts = MovingParts(scene, splats.to(device), appearance.splats.to(device), settings)
+    parts = MovingParts(scene, splats.to(device), static.to(device), settings)
 
     def motion_stage() -> dict[str, Tensor]:
         return first_motion(parts, windows, scene.background.to(device), seed, bar, cache)
 
     motion = cache.stage("motion", motion_stage, (len(frames), len(splats.means)))
-    return Reconstruction(splats, reconstruction.spacing, reconstruction.volume, cues_of(motion, splats, settings),
-                          appearance.splats, appearance=appearance, moving=parts)
+    return Reconstruction(splats, reconstruction.spacing, reconstruction.volume, cues_of(motion, splats, settings), static,
+                          moving=parts)
 
 
 def scaffold_splats(particles: Particles, static: Splats, device: torch.device | str) -> Splats:
