@@ -194,7 +194,10 @@ def damaged_kernels(folder: Path, fitted: Callable, words: Callable, whole: dict
         for file in sorted((home / "warp").rglob("*")):
             if file.is_file():
                 change(file)
-        program(*words(run), shell=f"XDG_CACHE_HOME='{home}' {{}}")
+        given = {"shell": f"XDG_CACHE_HOME='{home}' {{}}"}
+        if name != "gone":
+            message(*words(run), **given)
+        program(*words(run), **given)
         equal(whole, run)
 
     def compiled(change: Callable[[Path], object]) -> Callable[[Path], object]:
