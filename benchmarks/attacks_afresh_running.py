@@ -92,7 +92,7 @@ def afresh_running(folder: Path) -> Iterator[Attack]:
     yield from changed_files(fitted, words, message, same)
     yield from changed_keys(fitted, words, message, same)
     yield from other_folders(folder, fitted, words, same)
-    yield from damaged_kernels(folder, fitted, words, whole, message)
+    yield from damaged_kernels(folder, fitted, words, whole)
     yield from sweeps(folder, cache)
 
 
@@ -184,7 +184,7 @@ def other_folders(folder: Path, fitted: Callable, words: Callable, same: Callabl
         yield f"goes on: {name}", lambda n=name, s=shell: same(fitted(n), shell=s)
 
 
-def damaged_kernels(folder: Path, fitted: Callable, words: Callable, whole: dict, message: Callable) -> Iterator[Attack]:
+def damaged_kernels(folder: Path, fitted: Callable, words: Callable, whole: dict) -> Iterator[Attack]:
     """The cache of compiled kernels, as a killed compiler, a full disk or another user leave it."""
 
     def with_cache(name: str, change: Callable[[Path], object]) -> None:
@@ -196,7 +196,10 @@ def damaged_kernels(folder: Path, fitted: Callable, words: Callable, whole: dict
                 change(file)
         given = {"shell": f"XDG_CACHE_HOME='{home}' {{}}"}
         if name != "gone":
-            message(*words(run), **given)
+            found = [line for line in program(*words(run), **given, wanted=2).splitlines() if "Error: " in line]
+            if len(found) != 1 or str(home) not in found[0]:
+                raise AssertionError(f"not said: {found}")
+            shutil.rmtree(home / "warp")
         program(*words(run), **given)
         equal(whole, run)
 

@@ -91,7 +91,8 @@ def kernels_message(error: BaseException) -> str | None:
     compiler is: that is a mistake of the program."""
     for one in causes(error):
         files = (Path(frame.f_code.co_filename) for frame, _ in traceback.walk_tb(one.__traceback__))
-        if any(file.match("warp/*/context.py") for file in files) and (UNLOADABLE.search(str(one)) or isinstance(one, JSONDecodeError)):
+        said = UNLOADABLE.search(str(one)) or isinstance(one, JSONDecodeError)
+        if said and any(file.match("warp/*/context.py") for file in files):
             warp = sys.modules.get("warp")
             place = getattr(getattr(warp, "config", None), "kernel_cache_dir", None) or "the folder warp of the cache"
             return (f"{place}: expected kernels as they were compiled, found some that cannot be loaded "

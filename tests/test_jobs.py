@@ -177,6 +177,15 @@ def test_a_run_folder_that_cannot_be_made_is_said_before_hydra_fails(tmp_path, c
     assert "hydra.run.dir: expected a folder, found nothing" in capsys.readouterr().err
 
 
+def test_jobs_of_a_sweep_have_a_folder_each(capsys):
+    """The figures of the second took the place of the first one's."""
+    check_folders(["-m", "seed=0,1", "hydra.sweep.subdir=${hydra.job.num}"])
+    check_folders(["hydra.sweep.subdir=here"])
+    with pytest.raises(SystemExit) as ended:
+        check_folders(["--multirun", "seed=0,1", "hydra.sweep.subdir=here"])
+    assert ended.value.code == 2 and "hydra.sweep.subdir: expected a name that is another one" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", ["train.log", "metrics.json", "checkpoints/last.ckpt", "results.md", "rollout.npz", "checkpoints",
                                   ".hydra"])
 @pytest.mark.parametrize("kind", ["pipe", "folder", "device", "nothing"])
