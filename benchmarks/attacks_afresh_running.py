@@ -57,7 +57,7 @@ def afresh_keys(folder: Path) -> Iterator[Attack]:
         scene.format=null scene.scale=1e-9 optimized_metric=time/fit_s trainer.devices=0 trainer.devices=1000000
         seed=${seed} seed=${oc.env:NOPE} losses=${fit} world.colliders=${world.colliders} seed=glob(*) seed=choice(1,2)
         seed=??? scene@x=rabbit hydra.run.dir=/proc/x hydra.run.dir=/dev/null hydra.job.chdir=true
-        hydra.output_subdir=null hydra.verbose=true hydra/job_logging=none hydra/job_logging=nothing --info --cfg""".split()
+        hydra.output_subdir=null hydra.verbose=true hydra/job_logging=none hydra/job_logging=nothing""".split()
     for number, words in enumerate(values):
         yield words, lambda n=number, w=words: attack(n, w)
     several = ("losses.position=0 losses.image=0 losses.mask=0 losses.flow=0", "fit.prior.optimizer=adam fit.prior.lr=0",
