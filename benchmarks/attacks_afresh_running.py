@@ -57,7 +57,7 @@ def afresh_keys(folder: Path) -> Iterator[Attack]:
         scene.format=null scene.scale=1e-9 optimized_metric=time/fit_s trainer.devices=0 trainer.devices=1000000
         seed=${seed} seed=${oc.env:NOPE} losses=${fit} world.colliders=${world.colliders} seed=glob(*) seed=choice(1,2)
         seed=??? scene@x=rabbit hydra.run.dir=/proc/x hydra.run.dir=/dev/null hydra.job.chdir=true
-        hydra.output_subdir=null hydra.verbose=true hydra/job_logging=none hydra/job_logging=nothing --info --cfg""".split()
+        hydra.output_subdir=null hydra.verbose=true hydra/job_logging=none hydra/job_logging=nothing""".split()
     for number, words in enumerate(values):
         yield words, lambda n=number, w=words: attack(n, w)
     several = ("losses.position=0 losses.image=0 losses.mask=0 losses.flow=0", "fit.prior.optimizer=adam fit.prior.lr=0",
@@ -92,7 +92,7 @@ def afresh_running(folder: Path) -> Iterator[Attack]:
     yield from changed_files(fitted, words, message, same)
     yield from changed_keys(fitted, words, message, same)
     yield from other_folders(folder, fitted, words, same)
-    yield from damaged_kernels(folder, fitted, words, whole, message)
+    yield from damaged_kernels(folder, fitted, words, whole)
     yield from sweeps(folder, cache)
 
 
@@ -184,7 +184,7 @@ def other_folders(folder: Path, fitted: Callable, words: Callable, same: Callabl
         yield f"goes on: {name}", lambda n=name, s=shell: same(fitted(n), shell=s)
 
 
-def damaged_kernels(folder: Path, fitted: Callable, words: Callable, whole: dict, message: Callable) -> Iterator[Attack]:
+def damaged_kernels(folder: Path, fitted: Callable, words: Callable, whole: dict) -> Iterator[Attack]:
     """The cache of compiled kernels, as a killed compiler, a full disk or another user leave it."""
 
     def with_cache(name: str, change: Callable[[Path], object]) -> None:
@@ -194,7 +194,13 @@ def damaged_kernels(folder: Path, fitted: Callable, words: Callable, whole: dict
         for file in sorted((home / "warp").rglob("*")):
             if file.is_file():
                 change(file)
-        program(*words(run), shell=f"XDG_CACHE_HOME='{home}' {{}}")
+        given = {"shell": f"XDG_CACHE_HOME='{home}' {{}}"}
+        if name != "gone":
+            found = [line for line in program(*words(run), **given, wanted=2).splitlines() if "Error: " in line]
+            if len(found) != 1 or str(home) not in found[0]:
+                raise AssertionError(f"not said: {found}")
+            shutil.rmtree(home / "warp")
+        program(*words(run), **given)
         equal(whole, run)
 
     def compiled(change: Callable[[Path], object]) -> Callable[[Path], object]:

@@ -1,8 +1,8 @@
 """Many runs, killed and resumed, many rollouts in one process, and equal runs on a GPU: what leaks, differs or is left behind.
 
     OMP_NUM_THREADS=1 python benchmarks/long_runs.py                     # small: about fifteen minutes on two cores
-    OMP_NUM_THREADS=1 python benchmarks/long_runs.py --runs 200 --workers 20 --abreast --kills 6 --between 12 28 --launched 24 \\
-        --rollouts 21600 --frames 12 --particles 4000 --device cuda      # all of it, on 32 cores and two GPUs
+    OMP_NUM_THREADS=1 python benchmarks/long_runs.py --runs 200 --workers 30 --kills 2 --between 70 110 --launched 24 \\
+        --rollouts 21600 --frames 4 --particles 1000 --device cuda       # all of it, on 32 cores and two GPUs
     OMP_NUM_THREADS=1 python benchmarks/long_runs.py --parts rollouts --rollouts 2000
 
 Three parts, side by side where there are GPUs:

@@ -339,17 +339,35 @@ def check_same(checkpoint: Mapping[str, Any], module: torch.nn.Module, path: str
 def check_same_run(checkpoint: Mapping[str, Any], values: Mapping[str, Any], folder: str | Path) -> None:
     """The checkpoint in a run's folder is of the configuration that resume=auto is to go on with: figures and steps of another one
     would else pass for this one's. Keys that only one of both has are of another version. Errors: ConfigError naming the keys."""
-    stored = checkpoint["mosa"].get("config")
-    stored = stored.get("cfg") if isinstance(stored, Mapping) else None
-    if not isinstance(stored, Mapping):
+    if (stored := stored_keys(checkpoint)) is None:
         return
     chosen = ("prior",) if checkpoint["mosa"].get("compared") else ()  # a law was chosen among prior.candidates
     if found := list(differing(stored, values, (*BESIDE, *chosen))):
-        shown = ", ".join(f"{key}: {str(there)[:60]} there, {str(here)[:60]} here" for key, there, here in found[:4])
-        more = f", and {len(found) - 4} more" if len(found) > 4 else ""
-        raise ConfigError(f"resume: expected in {folder} a run of this configuration, found another one's ({shown}{more}); give "
+        raise ConfigError(f"resume: expected in {folder} a run of this configuration, found another one's ({listed(found)}); give "
                           "this run a folder of its own, begin anew in this one with resume=null, or go on from its checkpoint "
                           "with ckpt_path=")
+
+
+def check_same_scene(checkpoint: Mapping[str, Any], values: Mapping[str, Any], path: str | Path) -> None:
+    """The checkpoint that ckpt_path names was fitted to the data that the fit is to go on with: a body of as many particles would
+    take another's law for its own. Other keys may differ. Errors: ConfigError naming those of the scene that do."""
+    stored, without = stored_keys(checkpoint), (*BESIDE, "scene.test")
+    if stored is not None and (found := list(differing(stored.get("scene"), values.get("scene"), without, "scene"))):
+        raise ConfigError(f"ckpt_path: expected in {path} a fit to this scene, found one to another ({listed(found)}); a law is "
+                          "taken to another object with python eval.py or python -m mosa.splats")
+
+
+def stored_keys(checkpoint: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """The configuration that a checkpoint's run had; None where it does not say."""
+    stored = checkpoint["mosa"].get("config")
+    stored = stored.get("cfg") if isinstance(stored, Mapping) else None
+    return stored if isinstance(stored, Mapping) else None
+
+
+def listed(found: Sequence[tuple[str, Any, Any]]) -> str:
+    """Keys that differ, with both values."""
+    shown = ", ".join(f"{key}: {str(there)[:60]} there, {str(here)[:60]} here" for key, there, here in found[:4])
+    return shown + (f", and {len(found) - 4} more" if len(found) > 4 else "")
 
 
 def differing(stored: Any, values: Any, without: Sequence[str] = (), where: str = "") -> Iterator[tuple[str, Any, Any]]:

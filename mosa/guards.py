@@ -10,7 +10,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from mosa.analysis.figures import ffmpeg
-from mosa.checkpoints import check_resumed, read_checkpoint
+from mosa.checkpoints import check_resumed, check_same_scene, read_checkpoint
 from mosa.config import plain, rehearse
 from mosa.data.agreement import lines_of_sight, misses
 from mosa.data.splat_files import check_formats
@@ -93,14 +93,16 @@ def check_particles(key: str, count: float) -> None:
 
 
 def check_begin(cfg: DictConfig) -> None:
-    """The checkpoint that a fit is to go on from is one. Errors: DataError."""
+    """The checkpoint that a fit is to go on from is one, and of this scene. Errors: DataError, ConfigError naming the keys."""
     if cfg.ckpt_path is None:
         return
     try:
-        check_resumed(read_checkpoint(cfg.ckpt_path), cfg.ckpt_path)
+        found = read_checkpoint(cfg.ckpt_path)
+        check_resumed(found, cfg.ckpt_path)
     except DataError as error:
         again = "; remove the file, and resume=auto begins the fit anew" if cfg.resume == "auto" else ""
         raise DataError(f"{error}{again}") from error
+    check_same_scene(found, plain(cfg), cfg.ckpt_path)
 
 
 def check_seen(cfg: DictConfig, scene: Scene) -> None:

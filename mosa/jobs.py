@@ -84,6 +84,10 @@ def check_folders(arguments: Sequence[str]) -> None:
         sys.exit(2)
     for argument in arguments:
         key, _, value = argument.partition("=")
+        if key == "hydra.sweep.subdir" and "$" not in value and {"-m", "--multirun"} & set(arguments):
+            print(f"\nConfigError: {key}: expected a name that is another one for each job, as ${{hydra.job.num}} is: {value}: "
+                  "each would take the place of the one before", file=sys.stderr)  # fmt: skip
+            sys.exit(2)
         if key not in ("hydra.run.dir", "hydra.sweep.dir") or "$" in value:
             continue
         if not value.strip("'\" "):

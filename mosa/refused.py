@@ -7,7 +7,9 @@ import gc
 import os
 import re
 import sys
+import traceback
 from collections.abc import Iterator
+from json import JSONDecodeError
 from pathlib import Path
 
 DISK = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.EIO, errno.ENOTDIR,
@@ -21,6 +23,8 @@ OF_A_GPU = re.compile(r"cuda|cublas|cudnn|cusolver|cusparse|cufft|curand|nvrtc|n
 LEAST = 0.5e9
 """Bytes that are free on a GPU at least, where an error of its libraries that names no memory is about something else: a library's
 handle, a context or a module that finds no room says that it is not initialised, or fails to load."""
+UNLOADABLE = re.compile(r"Failed to (load C(PU|UDA) module|find (forward|backward) kernel)|was not found in the cache")
+"""What Warp says of a compiled kernel that it cannot use."""
 LAST = Path("checkpoints", "last.ckpt")
 """Of a run, in its folder."""
 
@@ -82,6 +86,20 @@ def memory_message(error: BaseException) -> str | None:
             "take trainer=cpu (eval.py and others: device=cpu)")
 
 
+def kernels_message(error: BaseException) -> str | None:
+    """One sentence on compiled kernels that a killed compiler or a full disk left damaged; None for any other error, as one of the
+    compiler is: that is a mistake of the program."""
+    for one in causes(error):
+        files = (Path(frame.f_code.co_filename) for frame, _ in traceback.walk_tb(one.__traceback__))
+        said = UNLOADABLE.search(str(one)) or isinstance(one, JSONDecodeError)
+        if said and any(file.match("warp/*/context.py") for file in files):
+            warp = sys.modules.get("warp")
+            place = getattr(getattr(warp, "config", None), "kernel_cache_dir", None) or "the folder warp of the cache"
+            return (f"{place}: expected kernels as they were compiled, found some that cannot be loaded "
+                    f"({' '.join(str(one).split())[:120]}); remove that folder, and they are compiled again")
+    return None
+
+
 def explained(error: Exception, folder: str | Path | None = None) -> str | None:
     """What ended a command, as one message, where it was the machine; None for a mistake of the program. folder: of the run, whose
     checkpoint the message names."""
@@ -91,7 +109,8 @@ def explained(error: Exception, folder: str | Path | None = None) -> str | None:
         said = " ".join(str(error).split())[:300]
         return f"{type(error).__name__}: {said} (a warning, which -W error or PYTHONWARNINGS makes an error)"
     if (reason := memory_message(error)) is None:
-        return None
+        kernels = kernels_message(error)
+        return None if kernels is None else f"DataError: {kernels}"
     last = None if folder is None else Path(folder) / LAST
     if last is not None and last.is_file():
         reason += f"; the fit is kept in {last}, and the same command with resume=auto goes on from there"

@@ -177,6 +177,15 @@ def test_a_run_folder_that_cannot_be_made_is_said_before_hydra_fails(tmp_path, c
     assert "hydra.run.dir: expected a folder, found nothing" in capsys.readouterr().err
 
 
+def test_jobs_of_a_sweep_have_a_folder_each(capsys):
+    """The figures of the second took the place of the first one's."""
+    check_folders(["-m", "seed=0,1", "hydra.sweep.subdir=${hydra.job.num}"])
+    check_folders(["hydra.sweep.subdir=here"])
+    with pytest.raises(SystemExit) as ended:
+        check_folders(["--multirun", "seed=0,1", "hydra.sweep.subdir=here"])
+    assert ended.value.code == 2 and "hydra.sweep.subdir: expected a name that is another one" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", ["train.log", "metrics.json", "checkpoints/last.ckpt", "results.md", "rollout.npz", "checkpoints",
                                   ".hydra"])
 @pytest.mark.parametrize("kind", ["pipe", "folder", "device", "nothing"])
@@ -333,3 +342,46 @@ def test_yaml_that_cannot_be_read_is_named_with_its_file(tmp_path, capsys, text,
         assert ended.value.code == 2
         said = capsys.readouterr().err.strip()
         assert said.startswith(f"ConfigError: {tmp_path}/experiment/mine.yaml: expected YAML") and message in said
+
+
+@pytest.mark.parametrize(("ending", "damage"), [
+    (".o", lambda file: file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])),
+    (".o", lambda file: file.write_bytes(b"")),
+    (".o", lambda file: file.write_bytes(bytes(file.stat().st_size))), (".meta", lambda file: file.write_bytes(b"")),
+])  # fmt: skip
+def test_damaged_kernels_are_one_message(tmp_path, ending, damage):
+    """As a killed compiler or a full disk leave them; in a process of its own, as a kernel that is loaded stays so."""
+    (tmp_path / "kernel.py").write_text(textwrap.dedent("""
+        import warp as wp
+        from mosa import refused
+        wp.config.kernel_cache_dir = "kernels"
+
+        @wp.kernel
+        def twice(x: wp.array(dtype=float)):
+            x[wp.tid()] = 2.0 * x[wp.tid()]
+
+        try:
+            wp.launch(twice, 1, inputs=[wp.ones(1, dtype=float, device="cpu")], device="cpu")
+        except Exception as error:
+            print(refused.explained(error))
+        else:
+            print("ran")
+    """))
+
+    def launched() -> str:
+        places = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
+        told = subprocess.run([sys.executable, "kernel.py"], cwd=tmp_path, capture_output=True, text=True, timeout=120, env=places)
+        return told.stdout.strip().splitlines()[-1]
+
+    assert launched() == "ran"
+    files = [file for file in (tmp_path / "kernels").rglob("*") if file.suffix == ending]
+    for file in files:
+        damage(file)
+    found = launched()
+    assert files and str(tmp_path / "kernels") in found
+    assert "expected kernels as they were compiled, found some that cannot be loaded" in found
+
+
+def test_what_a_compiler_refuses_is_no_damaged_kernel():
+    """A mistake of the program keeps its traceback."""
+    assert refused.explained(RuntimeError("Failed to load CPU module 'm'")) is None  # not from where Warp loads

@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 
 from mosa import fitting
 from mosa.callbacks import KeepLast
+from mosa.checkpoints import check_same_scene
 from mosa.errors import ConfigError, DataError
 from mosa.run import begins_from, finished, read_figures, write_figures
 
@@ -102,6 +103,17 @@ def test_a_run_of_another_configuration_is_not_taken_for_this_one(tmp_path, chan
         begins_from(cfg, tmp_path)
     cfg.resume = None
     assert finished(cfg, tmp_path) is None and begins_from(cfg, tmp_path) is None
+
+
+def test_a_fit_goes_on_with_the_data_that_it_began_with(tmp_path):
+    """A body of as many particles, of another film, was found out when all was reconstructed, or never."""
+    trained(tmp_path)
+    found, path = torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True), "x.ckpt"
+    scene = {"path": "/moved/duck", "cache": "/b"}
+    check_same_scene(found, {"scene": scene | {"test": ["more"]}, "seed": 5}, path)
+    with pytest.raises(ConfigError, match=r"in x\.ckpt a fit to this scene, .*scene\.path: /a/duck there, /a/goose"):
+        check_same_scene(found, {"scene": scene | {"path": "/a/goose"}}, path)
+    check_same_scene({"mosa": {}}, {"scene": scene}, path)  # of a program that did not write it
 
 
 @pytest.mark.parametrize("changed", [
