@@ -124,7 +124,8 @@ def learner_of(
              "box": [[-reach, BOX[0][1], -reach], [reach, BOX[1][1], reach]]}  # fmt: skip
     config = {"cfg": cfg, "world": world, "density": body.material.density, "frame_dt": 1 / body.footage.fps,
               "dx": grid_spacing(spacing, cfg["simulation"]["particles_per_cell"])}  # fmt: skip
-    made = build_body(config, {"rest": tensor(rest), "volume": tensor(np.full(n, spacing**3)), "colors": torch.zeros(n, 3),
+    # made on the CPU, where a new field's waves are, and moved as a whole
+    made = build_body(config, {"rest": tensor(rest).cpu(), "volume": torch.full((n,), spacing**3), "colors": torch.zeros(n, 3),
                                "opacities": torch.ones(n), "covariances": torch.eye(3).expand(n, 3, 3)}).to(device)  # fmt: skip
     start = Start(torch.eye(3, device=device), made.center, tensor(stored["velocity"]), torch.zeros(3, device=device))
     cues = neighbourhood_cues(tensor(seen), torch.zeros(1, device=device), neighbourhood(tensor(rest)))
