@@ -131,6 +131,9 @@ class Placement(Release):
         return [{"type": "box", "name": "box", "size": [self.edge, self.top, self.edge], "position": [0, 0.5 * self.top, 0],
                  "mode": "separate", "friction": FRICTION, "thickness": THICKNESS}]  # fmt: skip
 
+    def targets(self, trials: Trials) -> Tensor:
+        return torch.tensor([0.0, self.top, 0.0]).expand(len(trials), 3)
+
     def miss(self, trials: Trials, view: View) -> Tensor:
         away = view.center[:, [0, 2]].square().sum(1) / self.near**2
         return away + (1 - view.upright[:, 1]) / (1 - math.cos(self.lean))
@@ -217,8 +220,10 @@ class Hanging(Release):
 class Pushing(Task):
     """Push the body over the ground with a paddle to a target, step by step; at the end it stands there.
 
-    The paddle moves in the plane with at most `fastest`; it begins `apart` from the body. Success: the centre is within `near` of
-    the target, the up axis within `lean` of the vertical, and the speed below `still`.
+    The paddle moves in the plane with at most `fastest` and turns about the vertical with at most `turning` [rad/s]: a face that
+    stays square to x drags the body along and hardly moves it across, and half of the targets are out of reach. It begins `apart`
+    from the body. Success: the centre is within `near` of the target, the up axis within `lean` of the vertical, and the speed
+    below `still`.
     """
 
     steps: int = 40
@@ -227,6 +232,7 @@ class Pushing(Task):
     lean: float = math.radians(20.0)
     still: float = 0.1
     fastest: float = 0.8
+    turning: float = 2.0
     apart: float = 0.04
     name = "pushing"
     tool = "paddle"
@@ -234,15 +240,17 @@ class Pushing(Task):
 
     @property
     def actions(self) -> tuple[Quantity, ...]:
-        return tuple(Quantity(f"paddle velocity {axis}", "m/s", -self.fastest, self.fastest) for axis in "xz")
+        moves = tuple(Quantity(f"paddle velocity {axis}", "m/s", -self.fastest, self.fastest) for axis in "xz")
+        return (*moves, Quantity("paddle's turn towards z", "rad/s", -self.turning, self.turning))
 
     @property
     def observations(self) -> tuple[Quantity, ...]:
-        far, fast = 0.35, 1.0
-        return (Quantity("target from body x", "m", -far, far), Quantity("target from body z", "m", -far, far),
+        far, aside, near, fast, askew = 0.35, self.ASIDE[1], 0.1, 1.0, 0.5
+        return (Quantity("target from body x", "m", -far, far), Quantity("target from body z", "m", -aside, aside),
                 Quantity("body velocity x", "m/s", -fast, fast), Quantity("body velocity z", "m/s", -fast, fast),
-                Quantity("body from paddle x", "m", -far, far), Quantity("body from paddle z", "m", -far, far),
-                Quantity("up axis x", "1", -1.0, 1.0), Quantity("up axis z", "1", -1.0, 1.0))  # fmt: skip
+                Quantity("body from paddle x", "m", -far, far), Quantity("body from paddle z", "m", -near, near),
+                Quantity("up axis x", "1", -1.0, 1.0), Quantity("up axis z", "1", -1.0, 1.0),
+                Quantity("paddle turned towards z", "rad", -askew, askew))  # fmt: skip
 
     @property
     def drawn(self) -> tuple[tuple[Quantity, ...], tuple[Quantity, ...]]:
@@ -269,20 +277,29 @@ class Pushing(Task):
         return [{"rotation": upright, "position": (float(x), 0.0, float(z)), "height": 0.0, "velocity": still,
                  "angular_velocity": still} for x, z in trials.hidden]  # fmt: skip
 
+    def targets(self, trials: Trials) -> Tensor:
+        x, z = trials.observed.T
+        return torch.stack([x, torch.zeros_like(x), z], 1)
+
     def observe(self, trials: Trials, view: View | None) -> Tensor:
         plane = [0, 2]
         target = trials.observed.to(view.center)
         apart = view.center[:, plane] - view.tool[:, plane].to(view.center)
-        return torch.cat([target - view.center[:, plane], view.velocity[:, plane], apart, view.upright[:, plane]], 1)
+        return torch.cat([target - view.center[:, plane], view.velocity[:, plane], apart, view.upright[:, plane],
+                          view.tool_turn.to(view.center)[:, None]], 1)  # fmt: skip
 
     def command(self, action: Tensor) -> Mapping[str, Tensor] | None:
         v = self.physical(action)
-        return {"paddle": torch.stack([v[:, 0], torch.zeros_like(v[:, 0]), v[:, 1]], 1)}
+        none = torch.zeros_like(v[:, 0])
+        turn = torch.stack([none, -v[:, 2], none], 1)  # from x towards z is against the sense about y
+        return {"paddle": {"velocity": torch.stack([v[:, 0], none, v[:, 1]], 1), "angular_velocity": turn}}
 
     def starting_weights(self) -> tuple[Tensor, Tensor]:
-        """Towards the target, and across to where the body is: without it the paddle never touches, and nothing is learned."""
+        """Towards the target, across to where the body is, and turned a little to the target's side: without the first two the
+        paddle never touches, and nothing is learned."""
         weight, bias = super().starting_weights()
-        weight[0, 0], weight[0, 2], weight[1, 5], weight[1, 1] = 2.0, -0.5, 1.0, -0.5
+        weight[0, 0], weight[0, 2], weight[1, 5], weight[1, 1] = 2.0, -0.5, 0.3, -0.07
+        weight[2, 1], weight[2, 8] = 1.0, -2.0
         return weight, bias
 
     def miss(self, trials: Trials, view: View) -> Tensor:
