@@ -49,7 +49,7 @@ def measured(name: str, options: argparse.Namespace, values: dict[str, float]) -
     apart = 1e3 * (ends[0].center - ends[1].center).norm(dim=1).mean()
     angle = torch.rad2deg((ends[0].upright * ends[1].upright).sum(1).clamp(-1, 1).acos()).mean()
     reachable = ""
-    if task.tool is None and options.candidates:
+    if task.once and options.candidates:
         arena, generator = Arena(made[0], task, options.trials), torch.Generator().manual_seed(2)
         won = wins[0].clone()
         for _ in range(options.candidates):

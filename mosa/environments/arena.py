@@ -130,10 +130,8 @@ class Arena:
         """(observation (B, O), whether the episode is over) after actions (B, A) in [-1, 1]; a task of one decision then is."""
         if self.task.tool is None:
             self._begin(action)
-            for _ in range(self.task.steps):
-                self._advance(None)
-        else:
-            self._advance(self.task.command(action))
+        for _ in range(self.task.steps if self.task.once else 1):
+            self._advance(self.task.command(action, self.done))
         return self.task.observe(self.trials, self.view).cpu(), self.done >= self.task.steps
 
     def loss(self) -> Tensor:

@@ -195,7 +195,7 @@ def by_reinforcement(method: str, train: Arena, steps: int, seed: int, options: 
     worlds = library_worlds(train, seed)
     given = {"sac": {"learning_starts": 4 * train.count, "batch_size": 64, "gradient_steps": -1, "train_freq": 1,
                      "policy_kwargs": {"net_arch": [64, 64]}},
-             "ppo": {"n_steps": max(2, train.task.steps if train.task.tool else 4), "batch_size": 64,
+             "ppo": {"n_steps": max(2, 4 if train.task.once else train.task.steps), "batch_size": 64,
                      "policy_kwargs": {"net_arch": [64, 64]}}}[method] | dict(options or {})  # fmt: skip
     model = getattr(library, method.upper())("MlpPolicy", worlds, seed=seed, device="cpu", verbose=0, **given)
     model.learn(steps)

@@ -122,13 +122,13 @@ def expected(bench: Bench, simulator: str) -> str:
             arena._begin(still)
         for _ in range(2):  # of the first, kernels are compiled
             began = time.perf_counter()
-            arena._advance(None if task.tool is None else task.command(still))
+            arena._advance(task.command(still, 0))
             arena.view.center.sum().item()  # a GPU is done
             taken = time.perf_counter() - began
     looks = search.validation * (1 + math.ceil(search.iterations / search.every))
     drawn = search.iterations * search.batch
     episodes = {"gradient": looks + drawn, "cma": looks + drawn * search.candidates}
-    searched = episodes.get(s.policy, s.decisions / (task.steps if task.tool is not None else 1))
+    searched = episodes.get(s.policy, s.decisions / (1 if task.once else task.steps))
     slower = (BACKWARD - 1) * drawn if s.policy == "gradient" else 0
     tested = s.trials * (1 if simulator == "truth" else 2)
     seconds = (searched + slower + tested) * task.steps * taken / arena.count

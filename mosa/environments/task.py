@@ -34,7 +34,8 @@ RANGES: dict[str, Kind] = {
         is_number(x) and 0 <= x <= ROOM for x in v)),
     "steps": whole(1, 10**5), "control_dt": number(1e-4, 1), "low": number(CLEARANCE, ROOM), "high": number(CLEARANCE, ROOM),
     "tilt": _ANGLE, "unsteady_tilt": _ANGLE, "askew": _ANGLE, "lean": number(1e-3, math.pi), "near": _SOME, "radius": _SOME,
-    "still": number(1e-4, 100), "fastest": number(1e-4, 100), "turning": number(0, 100), "narrow": number(0.1, 2),
+    "still": number(1e-4, 100), "fastest": number(1e-4, 100), "turning": number(0, 100),
+    "slowest": number(1e-4, 100), "across": number(0, 100), "stroke": whole(1, 10**5), "narrow": number(0.1, 2),
 }  # fmt: skip
 """What a field of a task may be: lengths [m] where nothing else is said."""
 
@@ -87,7 +88,9 @@ class Task(ABC):
     control_dt: float = 0.02
     name: ClassVar[str] = ""
     tool: ClassVar[str | None] = None
-    """Name of the solid that actions drive; None: one decision at the start, after which nothing is acted on."""
+    """Name of the solid that actions drive; None without one: the decision is how the body starts."""
+    once: ClassVar[bool] = True
+    """Whether a policy decides once, at the start; else in every control step."""
     ground_friction: ClassVar[float] = 0.3
 
     def __post_init__(self) -> None:
@@ -96,7 +99,7 @@ class Task(ABC):
             value, kind = getattr(self, field.name), RANGES.get(field.name, LENGTH)
             if not kind.fits(value):
                 raise ConfigError(f"options.{field.name}: expected {kind.described}, found {str(value)[:80]!r}")
-        for low, high in (("low", "high"), ("close", "far")):
+        for low, high in (("low", "high"), ("close", "far"), ("slowest", "fastest")):
             if hasattr(self, low) and getattr(self, low) > getattr(self, high):
                 raise ConfigError(f"options.{low}: expected at most options.{high}={getattr(self, high):g}, found "
                                   f"{getattr(self, low):g}")
@@ -141,8 +144,8 @@ class Task(ABC):
         """(B, 3) [m] where the body's middle shall stand, on what lies under it, to be marked in pictures; None without such."""
         return None
 
-    def command(self, action: Tensor) -> Mapping[str, Any] | None:
-        """Velocities [m/s], [rad/s] of the tool, of actions (B, A)."""
+    def command(self, action: Tensor, step: int) -> Mapping[str, Any] | None:
+        """Velocities [m/s], [rad/s] of the tool in a control step, of actions (B, A)."""
         return None
 
     def starting_weights(self) -> tuple[Tensor, Tensor]:

@@ -155,6 +155,10 @@ class Hanging(Release):
     the arms' middle along them and between them across, and its speed is below `still`.
     """
 
+    low: float = 0.3
+    high: float = 0.35
+    unsteady_tilt: float = 0.005
+    unsteady_aim: float = 0.001
     near: float = 0.05
     deep: float = 0.02
     free: float = 0.05
@@ -163,9 +167,9 @@ class Hanging(Release):
     narrow: float = 0.85
     tilt: float = 0.5
     aim: float = 0.1
-    far: float = 0.4
-    close: float = 0.2
-    aside: float = 0.06
+    far: float = 0.15
+    close: float = 0.05
+    aside: float = 0.03
     name = "hanging"
 
     @property
@@ -236,6 +240,7 @@ class Pushing(Task):
     apart: float = 0.04
     name = "pushing"
     tool = "paddle"
+    once = False
     DISTANCE, ASIDE, FLOOR = (0.15, 0.3), (-0.05, 0.05), (-0.01, 0.01)
 
     @property
@@ -288,7 +293,7 @@ class Pushing(Task):
         return torch.cat([target - view.center[:, plane], view.velocity[:, plane], apart, view.upright[:, plane],
                           view.tool_turn.to(view.center)[:, None]], 1)  # fmt: skip
 
-    def command(self, action: Tensor) -> Mapping[str, Tensor] | None:
+    def command(self, action: Tensor, step: int) -> Mapping[str, Any] | None:
         v = self.physical(action)
         none = torch.zeros_like(v[:, 0])
         turn = torch.stack([none, -v[:, 2], none], 1)  # from x towards z is against the sense about y
@@ -312,7 +317,49 @@ class Pushing(Task):
         return near & (view.upright[:, 1] > math.cos(self.lean)) & (view.velocity.norm(dim=1) < self.still)
 
 
-TASKS: dict[str, type[Task]] = {task.name: task for task in (Placement, Hanging, Pushing)}
+@dataclass(frozen=True)
+class Striking(Pushing):
+    """Strike the body once with the paddle, so that it slides to a target and stops there.
+
+    The stroke lasts `stroke` control steps at a speed of `slowest` to `fastest` towards x, across at up to `across` [m/s], turned
+    at up to `turning`; then the paddle stands. How fast the body leaves it is the law's. Success: as in pushing, and nobody
+    corrects.
+    """
+
+    steps: int = 24
+    near: float = 0.015
+    fastest: float = 1.1
+    slowest: float = 0.7
+    across: float = 0.2
+    stroke: int = 5
+    name = "striking"
+    once = True
+    DISTANCE, ASIDE, FLOOR = (0.36, 0.54), (-0.015, 0.015), (-0.003, 0.003)
+
+    @property
+    def actions(self) -> tuple[Quantity, ...]:
+        return (Quantity("paddle velocity x", "m/s", self.slowest, self.fastest),
+                Quantity("paddle velocity z", "m/s", -self.across, self.across),
+                Quantity("paddle's turn towards z", "rad/s", -self.turning, self.turning))  # fmt: skip
+
+    @property
+    def observations(self) -> tuple[Quantity, ...]:
+        return self.drawn[0]
+
+    def observe(self, trials: Trials, view: View | None) -> Tensor:
+        return trials.observed
+
+    def command(self, action: Tensor, step: int) -> Mapping[str, Any] | None:
+        return super().command(action, step) if step < self.stroke else {self.tool: {"velocity": (0.0, 0.0, 0.0)}}
+
+    def starting_weights(self) -> tuple[Tensor, Tensor]:
+        """The middle of what may be asked, turned to the target's side."""
+        weight, bias = Task.starting_weights(self)
+        weight[2, 1] = 0.5
+        return weight, bias
+
+
+TASKS: dict[str, type[Task]] = {task.name: task for task in (Placement, Hanging, Striking, Pushing)}
 
 
 def task_named(name: str, rest: Tensor, **options: Any) -> Task:

@@ -31,7 +31,7 @@ from mosa.types import Ground
 
 WORLD = World(Ground(0.0, "sticky"), torch.tensor([0.0, -9.8, 0.0]), torch.tensor([0.0, 1.0, 0.0]),
               torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))  # fmt: skip
-SHORT = {"placement": 8, "hanging": 8, "pushing": 8}
+SHORT = {"placement": 8, "hanging": 8, "striking": 8, "pushing": 8}
 
 
 def simulator(name="learned", E=6e4, precision=32):
@@ -87,7 +87,7 @@ def test_the_sizes_follow_from_the_body_and_numbers_have_units(name):
     assert torch.equal(a.observed, task.draw(5, torch.Generator().manual_seed(1)).observed)
     with pytest.raises(ConfigError, match=r"up = \[0, 1, 0\]"):
         task.world(replace(WORLD, up=torch.tensor([0.0, 0.0, 1.0])))
-    with pytest.raises(ConfigError, match="task: expected one of placement, hanging, pushing"):
+    with pytest.raises(ConfigError, match="task: expected one of placement, hanging, striking, pushing"):
         task_named("juggling", torch.zeros(2, 3))
 
 
@@ -99,15 +99,18 @@ def view(task, center=(0.0, 0.0, 0.0), lean=0.0, lowest=0.0, speed=0.0):
 
 def test_success_is_what_the_task_says_and_the_loss_falls_towards_it():
     rest = torch.tensor([[0.0, 0, 0], [0.2, 0.24, 0.16]])
-    placement, hanging, pushing = (task_named(name, rest) for name in TASKS)
-    nothing = {task.name: task.draw(1, torch.Generator()) for task in (placement, hanging, pushing)}
+    placement, hanging, striking, pushing = (task_named(name, rest) for name in TASKS)
+    nothing = {task.name: task.draw(1, torch.Generator()) for task in (placement, hanging, striking, pushing)}
     top, under = placement.top, hanging.top
     tx, tz = nothing["pushing"].observed[0].tolist()
+    sx, sz = nothing["striking"].observed[0].tolist()
     good = {placement: {"center": (0.01, top + 0.1, 0.0), "lowest": top},
-            hanging: {"center": (0.01, under, 0.0), "lowest": under - 0.04}, pushing: {"center": (tx, 0.1, tz)}}  # fmt: skip
+            hanging: {"center": (0.01, under, 0.0), "lowest": under - 0.04}, pushing: {"center": (tx, 0.1, tz)},
+            striking: {"center": (sx, 0.1, sz)}}  # fmt: skip
     bad = {placement: ({"center": (0.08, top + 0.1, 0.0)}, {"lean": 0.6}, {"lowest": 0.0}, {"speed": 0.5}),
            hanging: ({"center": (0.08, under, 0.0)}, {"lowest": 0.02}, {"lowest": under - 0.01}, {"speed": 0.5}),
-           pushing: ({"center": (tx + 0.05, 0.1, tz)}, {"lean": 0.6}, {"speed": 0.3})}  # fmt: skip
+           pushing: ({"center": (tx + 0.05, 0.1, tz)}, {"lean": 0.6}, {"speed": 0.3}),
+           striking: ({"center": (sx + 0.02, 0.1, sz)}, {"lean": 0.6}, {"speed": 0.3})}  # fmt: skip
     for task, values in good.items():
         trials, fine = nothing[task.name], view(task, **values)
         assert bool(task.succeeded(trials, fine))
@@ -200,6 +203,23 @@ def test_a_paddle_turns_as_it_is_told_and_a_picture_shows_it_and_the_target():
     assert np.abs(images[0] - images[1]).mean() > 0.5
     red = [((image[..., 0] > 150) & (image[..., 1] < 110)).sum() for image in images]
     assert min(red) >= 4, red
+
+
+def test_a_stroke_is_one_decision_after_which_the_paddle_stands():
+    made = arena("striking", worlds=2, steps=8, stroke=3)
+    trials = drawn(made, 2)
+    seen = made.reset(trials)
+    torch.testing.assert_close(seen, trials.observed)
+    before = made.worlds.state.position[:, made.tool].clone()
+    action = torch.tensor([[1.0, -1.0, 0.5], [-1.0, 0.0, 0.0]])
+    _, over = made.step(action)
+    assert over and made.done == 8
+    v = made.task.physical(action).double()
+    went = 3 * made.task.control_dt * torch.stack([v[:, 0], 0 * v[:, 0], v[:, 1]], 1)
+    torch.testing.assert_close(made.view.tool - before, went, atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(made.view.tool_turn, 3 * made.task.control_dt * v[:, 2], atol=1e-6, rtol=1e-5)
+    fast, slow = made.view.center[:, 0] - trials.hidden[:, 0]
+    assert fast > slow + 0.02
 
 
 def test_the_best_of_drawn_policies_lead():

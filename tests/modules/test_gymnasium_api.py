@@ -29,7 +29,7 @@ def options(name):
 def test_the_checker_of_gymnasium_is_content(name):
     env = gymnasium.make(f"mosa/{name.capitalize()}-v0", options=options(name), disable_env_checker=True)
     check_env(env.unwrapped, skip_render_check=True)
-    decided = env.unwrapped.task.tool is None
+    decided = env.unwrapped.task.once
     env.reset(seed=1)
     length, over = 0, False
     while not over:
