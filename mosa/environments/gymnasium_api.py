@@ -90,9 +90,9 @@ class TwinEnv(gymnasium.Env, _Worlds):
     task: placement | hanging | striking | pushing, or a `Task`; simulator: learned | isotropic (of `checkpoint`) | truth (of the
     built-in scene that it learned from, or of `scene`); spacing [m]: of the truth's particles; options: of the task.
     Actions: numbers in [-1, 1] that stand for `self.task.actions` (tilts [rad] and aims [m], or velocities [m/s]); observations:
-    `self.task.observations`, in their units. A hand that lets go or strikes decides once: its episode has one step, which
-    plays the motion to its end and terminates. A push has `task.steps` steps and is truncated. Reward: minus log(1 + squared misses in tolerances), 0
-    is the most; of a push its share in every step. `info["success"]`: what the table counts.
+    `self.task.observations`, in their units. A hand that lets go or strikes decides once: its episode has one step, which plays the
+    motion to its end and terminates. A push has `task.steps` steps and is truncated. Reward: minus log(1 + squared misses in
+    tolerances), 0 is the most; of a push its share in every step. `info["success"]`: what the table counts.
     Rendering: `rgb_array`, what it looks like now; `rgb_array_list`, the last episode.
     """
 
