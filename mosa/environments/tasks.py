@@ -1,4 +1,4 @@
-"""What is asked of a policy: three tasks with an elastic body, their rewards and what is success.
+"""What is asked of a policy: four tasks with an elastic body, their rewards and what is success.
 
 The paper names two tasks, placing an elastic rabbit onto a white box and hanging on a tower, and their success rates on a robot; it
 gives no sizes, starts, actions or criteria of success. What is chosen here, and on what, is in docs/environments.md.
