@@ -328,13 +328,13 @@ class Striking(Pushing):
 
     steps: int = 24
     near: float = 0.015
-    fastest: float = 1.1
+    fastest: float = 0.97
     slowest: float = 0.7
     across: float = 0.2
     stroke: int = 5
     name = "striking"
     once = True
-    DISTANCE, ASIDE, FLOOR = (0.36, 0.54), (-0.015, 0.015), (-0.003, 0.003)
+    DISTANCE, ASIDE, FLOOR = (0.31, 0.45), (-0.015, 0.015), (-0.003, 0.003)
 
     @property
     def actions(self) -> tuple[Quantity, ...]:
