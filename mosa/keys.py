@@ -212,7 +212,6 @@ ENVIRONMENTS: dict[str, Kind] = {
     "search.every": COUNT,
     "search.validation": COUNT,
     "search.candidates": whole(4),
-    "search.elite": number(0, 1, above=True),
     "search.spread": POSITIVE,
     "decisions": COUNT,
 }

@@ -77,16 +77,19 @@ def look(state: TwinState, weights: Tensor, tool: int | None) -> View:
     x, v = state.positions, state.v.to(weights)
     share = weights.to(x)[:, None]
     turned = (share[..., None] * state.F_tot.to(x)).sum(1)[:, :, 1]
+    held = (None, None)
+    if tool is not None:
+        axis = state.rotation[:, tool, :, 0]
+        held = state.position[:, tool], torch.atan2(axis[:, 2], axis[:, 0])
     return View(
-        (share * x).sum(1), (share * v).sum(1), torch.nn.functional.normalize(turned, dim=1), x[..., 1].amin(1),
-        None if tool is None else state.position[:, tool],
+        (share * x).sum(1), (share * v).sum(1), torch.nn.functional.normalize(turned, dim=1), x[..., 1].amin(1), *held,
     )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Played:
     """loss: (B,) of the last moments, with its graph where the play was differentiable; success, diverged: (B,) bool; states: of
-    worlds that were recorded, (x (T, B, N, 3), F_tot (T, B, N, 3, 3), tool (T, B, 3) or None)."""
+    worlds that were recorded, (x (T, B, N, 3), F_tot (T, B, N, 3, 3), the tool's rotation and position (T, B, 3, 4) or None)."""
 
     loss: Tensor
     success: Tensor
@@ -127,10 +130,8 @@ class Arena:
         """(observation (B, O), whether the episode is over) after actions (B, A) in [-1, 1]; a task of one decision then is."""
         if self.task.tool is None:
             self._begin(action)
-            for _ in range(self.task.steps):
-                self._advance(None)
-        else:
-            self._advance(self.task.command(action))
+        for _ in range(self.task.steps if self.task.once else 1):
+            self._advance(self.task.command(action, self.done))
         return self.task.observe(self.trials, self.view).cpu(), self.done >= self.task.steps
 
     def loss(self) -> Tensor:
@@ -169,7 +170,9 @@ class Arena:
     def _see(self, state: TwinState) -> None:
         self.view = look(state, self.weights, self.tool)
         if self.states is not None:
-            tool = None if self.tool is None else state.position[:, self.tool].detach().cpu()
+            tool = None
+            if self.tool is not None:
+                tool = torch.cat([state.rotation[:, self.tool], state.position[:, self.tool, :, None]], 2).detach().cpu()
             self.states.append((state.positions.detach().cpu(), state.F_tot.detach().cpu(), tool))
 
 

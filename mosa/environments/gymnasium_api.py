@@ -55,7 +55,7 @@ def action_space(task: Task) -> spaces.Box:
 
 def observation_space(task: Task) -> spaces.Box:
     """Of a start its drawn ranges, a little wider than rounding; of a motion no bounds, as a body may fly anywhere."""
-    if task.tool is not None:
+    if not task.once:
         return spaces.Box(-np.inf, np.inf, (len(task.observations),), np.float32)
     low, high = (np.array([getattr(q, side) for q in task.observations], np.float32) for side in ("low", "high"))
     return spaces.Box(low - 1e-6, high + 1e-6, dtype=np.float32)
@@ -76,7 +76,7 @@ class _Worlds:
         """(observations (B, O), rewards (B,), whether the episodes are over)."""
         arena = self.arena
         seen, over = arena.step(torch.as_tensor(np.asarray(actions, np.float32)).clamp(-1, 1))
-        loss = arena.loss() if arena.task.tool is None else arena.last[-1] / arena.task.steps
+        loss = arena.loss() if arena.task.once else arena.last[-1] / arena.task.steps
         return _array(seen), -_array(loss).astype(np.float64), over
 
 
@@ -87,12 +87,12 @@ def _array(tensor: Tensor) -> np.ndarray:
 class TwinEnv(gymnasium.Env, _Worlds):
     """One body at a task.
 
-    task: placement | hanging | pushing, or a `Task`; simulator: learned | isotropic (of `checkpoint`) | truth (of the built-in
-    scene that it learned from, or of `scene`); spacing [m]: of the truth's particles; options: of the task.
+    task: placement | hanging | striking | pushing, or a `Task`; simulator: learned | isotropic (of `checkpoint`) | truth (of the
+    built-in scene that it learned from, or of `scene`); spacing [m]: of the truth's particles; options: of the task.
     Actions: numbers in [-1, 1] that stand for `self.task.actions` (tilts [rad] and aims [m], or velocities [m/s]); observations:
-    `self.task.observations`, in their units. A hand that lets go decides once: its episode has one step, which plays the motion to
-    its end and terminates. A push has `task.steps` steps and is truncated. Reward: minus log(1 + squared misses in tolerances), 0
-    is the most; of a push its share in every step. `info["success"]`: what the table counts.
+    `self.task.observations`, in their units. A hand that lets go or strikes decides once: its episode has one step, which plays the
+    motion to its end and terminates. A push has `task.steps` steps and is truncated. Reward: minus log(1 + squared misses in
+    tolerances), 0 is the most; of a push its share in every step. `info["success"]`: what the table counts.
     Rendering: `rgb_array`, what it looks like now; `rgb_array_list`, the last episode.
     """
 
@@ -115,7 +115,7 @@ class TwinEnv(gymnasium.Env, _Worlds):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         seen, reward, over = self._step(np.asarray(action)[None])
-        decided = self.task.tool is None
+        decided = self.task.once
         info = {"success": bool(self.arena.success()[0]), "diverged": bool(self.arena.diverged[0])}
         return seen[0], float(reward[0]), over and decided, over and not decided, info
 
@@ -170,7 +170,7 @@ class TwinVectorEnv(VectorEnv, _Worlds):
             last[:] = list(seen)
             info = {"final_obs": last, "_final_obs": ended.copy(), "final_info": info, "_final_info": ended.copy()}
             seen = self._draw(self.np_random, False)
-        return (seen, rewards, ended, never, info) if self.task.tool is None else (seen, rewards, never, ended, info)
+        return (seen, rewards, ended, never, info) if self.task.once else (seen, rewards, never, ended, info)
 
 
 for _name in TASKS:
@@ -210,7 +210,7 @@ def library_worlds(arena: Arena, seed: int):
             if over:
                 success = self.arena.success().tolist()
                 self.finished += [(self.decisions, value, won) for value, won in zip(self.earned.tolist(), success)]
-                infos = [{"terminal_observation": last, "TimeLimit.truncated": self.arena.task.tool is not None} for last in seen]
+                infos = [{"terminal_observation": last, "TimeLimit.truncated": not self.arena.task.once} for last in seen]
                 seen = self.reset()
             return seen, rewards.astype(np.float32), np.full(self.num_envs, over), infos
 

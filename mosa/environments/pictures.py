@@ -28,12 +28,23 @@ GROUND, TILE = 0.6, 0.03
 COLORS = {"box": (0.96, 0.96, 0.95), "paddle": (0.25, 0.45, 0.75), "arm left": (0.55, 0.57, 0.62), "arm right": (0.55, 0.57, 0.62),
           "column": (0.45, 0.47, 0.52)}  # fmt: skip
 SKY = (0.80, 0.86, 0.92)
+MARK, THIN = (0.85, 0.20, 0.20), 0.004
+"""Colour of the target, and the pitch of its Gaussians [m]."""
 
 
 def solid_surface(collider: Collider, place: Tensor | None) -> Tensor:
-    """(K, 3) [m], where the solid is described, or at `place`."""
+    """(K, 3) [m], where the solid is described, or at the pose `place` (3, 4)."""
     at, turned = pose(collider.motion, 1, 1.0)
-    return surface(collider.shape, PITCH) @ turned[0].float().T + (at[0] if place is None else place).float()
+    at, turned = (at[0], turned[0]) if place is None else (place[:, 3], place[:, :3])
+    return surface(collider.shape, PITCH) @ turned.float().T + at.float()
+
+
+def mark(target: Tensor, near: float) -> tuple[Tensor, Tensor, Tensor]:
+    """As `scenery`, of a disc of radius `near` [m] at target (3,) on what lies there."""
+    flat = lattice(2 * near, 2 * near, THIN)
+    flat = flat[flat.norm(dim=1) <= near]
+    points = target.float() + torch.stack([flat[:, 0], torch.full((len(flat),), THIN), flat[:, 1]], 1)
+    return points, torch.full((len(points),), 0.5 * THIN), torch.tensor(MARK).expand(len(points), 3)
 
 
 def scenery(solids: Sequence[Mapping[str, Any]], tool: int | None, place: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
@@ -62,11 +73,15 @@ def camera_of(arena: Arena, size: int) -> Cameras:
 
 
 @torch.no_grad()
-def picture(arena: Arena, x: Tensor, F_tot: Tensor, tool: Tensor | None, size: int = 240) -> np.ndarray:
-    """(size, size, 3) uint8 of a body with particles x (N, 3) [m], F_tot (N, 3, 3), and the tool at (3,) [m]."""
+def picture(arena: Arena, x: Tensor, F_tot: Tensor, tool: Tensor | None, size: int = 240, world: int = 0) -> np.ndarray:
+    """(size, size, 3) uint8 of a body with particles x (N, 3) [m], F_tot (N, 3, 3), the tool at the pose (3, 4), and the target of
+    the trial that is played in `world`."""
     device = arena.rest.device
     body = seen(arena.body, x[None].to(arena.rest), F_tot[None].to(arena.rest))
-    means, widths, colors = (part.to(arena.rest) for part in scenery(arena.task.solids(), arena.tool, tool))
+    parts = [scenery(arena.task.solids(), arena.tool, tool)]
+    if arena.trials is not None and (targets := arena.task.targets(arena.trials)) is not None:
+        parts.append(mark(targets[world], arena.task.near))
+    means, widths, colors = (torch.cat(values).to(arena.rest) for values in zip(*parts))
     round_ = widths.square()[:, None, None] * torch.eye(3, device=device)
     everything = Seen(
         torch.cat([body.means[0], means])[None], torch.cat([body.covariances[0], round_])[None],
@@ -81,7 +96,7 @@ def film(arena: Arena, states: tuple[Tensor, Tensor, Tensor | None], world: int,
     """`frames` pictures, from the first to the last moment, of one recorded world (`Played.states`)."""
     x, F_tot, tool = states
     chosen = np.linspace(0, len(x) - 1, min(frames, len(x))).round().astype(int)
-    return [picture(arena, x[t, world], F_tot[t, world], None if tool is None else tool[t, world], size) for t in chosen]
+    return [picture(arena, x[t, world], F_tot[t, world], None if tool is None else tool[t, world], size, world) for t in chosen]
 
 
 def write_films(folder: Path, films: Mapping[str, list[np.ndarray]], name: str) -> list[Path]:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -15,12 +16,12 @@ from mosa.environments.arena import Arena, play, play_all
 from mosa.environments.task import Task
 from mosa.errors import ConfigError, DataError
 
-METHODS = ("gradient", "cem", "sac", "ppo")
+METHODS = ("gradient", "cma", "sac", "ppo")
 
 
 class LinearPolicy(nn.Module):
-    """Actions tanh(W o + b) in [-1, 1] of observations scaled to their ranges: (O + 1) A numbers, 16 for a release and 18 for the
-    paddle. It begins as the task says: with weights 0, at the middle of what may be asked of a hand."""
+    """Actions tanh(W o + b) in [-1, 1] of observations scaled to their ranges: (O + 1) A numbers, 16 for a release, 9 for a
+    stroke and 30 for a push. It begins as the task says: with weights 0, at the middle of what may be asked of a hand."""
 
     def __init__(self, task: Task) -> None:
         super().__init__()
@@ -56,8 +57,8 @@ class Search:
     `validation` trials of the simulator it is trained in, and the best one is kept.
 
     By gradients: Adam at `rate`; `clip`: largest norm of a trial's gradient with respect to one action, as one that bounces off an
-    edge may have any. By the cross-entropy method: `candidates` policies an iteration, drawn with a standard deviation of `spread`
-    at first, of which the best `elite` share gives the next mean and spread."""
+    edge may have any. By covariance matrix adaptation: `candidates` policies an iteration, drawn with a standard deviation of
+    `spread` at first."""
 
     iterations: int = 60
     batch: int = 16
@@ -66,7 +67,6 @@ class Search:
     every: int = 10
     validation: int = 32
     candidates: int = 32
-    elite: float = 0.2
     spread: float = 0.4
 
 
@@ -122,20 +122,28 @@ def by_gradient(
 
 
 @torch.no_grad()
-def by_elites(train: Arena, check: Arena, search: Search, seed: int, say: Callable[[str], None] = lambda line: None) -> Found:
-    """The cross-entropy method: candidates are compared on the same trials, and gradients are not used. train, check: of the same
-    simulator and task, the former with `search.candidates` times `search.batch` worlds."""
+def by_evolution(train: Arena, check: Arena, search: Search, seed: int, say: Callable[[str], None] = lambda line: None) -> Found:
+    """The covariance matrix adaptation of the library cma, its matrix diagonal: candidates are compared on the same trials, and
+    gradients are not used. train, check: of the same simulator and task, the former with `search.candidates` times `search.batch`
+    worlds. Errors: ConfigError for another number of worlds, or where cma is not installed."""
     began, task, count = time.perf_counter(), train.task, search.candidates
     if train.count != count * search.batch:
         raise ConfigError(f"search: expected {count} candidates times {search.batch} trials as worlds, found {train.count}")
+    try:
+        import cma
+    except ImportError as error:
+        raise ConfigError("policy: cma needs the package of that name: pip install '.[environments]'") from error
     generator = torch.Generator().manual_seed(seed)
     validation = task.draw(search.validation, torch.Generator().manual_seed(10**6 + seed))
     policy, history, played = LinearPolicy(task), [], 0
-    mean = torch.nn.utils.parameters_to_vector(policy.parameters()).clone()
-    spread, best = torch.full_like(mean, search.spread), (math.inf, mean.clone())
-    elites = max(2, round(search.elite * count))
+    start = torch.nn.utils.parameters_to_vector(policy.parameters())
+    best = (math.inf, start.clone())
+    # a diagonal matrix adapts within tens of iterations, a full one of 30 numbers within hundreds; seed 0 is none to the library
+    strategy = cma.CMAEvolutionStrategy(start.tolist(), search.spread, {
+        "popsize": count, "seed": seed + 1, "CMA_diagonal": True, "verbose": -9, "verb_log": 0})  # fmt: skip
     for iteration in range(search.iterations + 1):
         if iteration % search.every == 0 or iteration == search.iterations:
+            mean = torch.tensor(strategy.mean).to(start)
             torch.nn.utils.vector_to_parameters(mean, policy.parameters())
             loss, success = play_all(check, validation, policy)
             played += len(validation)
@@ -145,15 +153,12 @@ def by_elites(train: Arena, check: Arena, search: Search, seed: int, say: Callab
                 best = history[-1]["loss"], mean.clone()
         if iteration == search.iterations:
             break
-        drawn = mean + spread * torch.randn(count, len(mean), generator=generator)
-        drawn[0] = mean
+        drawn = strategy.ask()
+        numbers = torch.tensor(np.array(drawn)).to(start)
         trials = task.draw(search.batch, generator)
-        outcome = play(train, trials.select(torch.arange(search.batch).repeat(count)), _side_by_side(policy, drawn, search.batch))
+        outcome = play(train, trials.select(torch.arange(search.batch).repeat(count)), _side_by_side(policy, numbers, search.batch))
         played += train.count
-        order = outcome.loss.cpu().view(count, search.batch).mean(1).argsort()
-        chosen = drawn[order[:elites]]
-        # the spread falls by half at most in one iteration: a few elites agree by chance
-        mean, spread = chosen.mean(0), torch.maximum(chosen.std(0), 0.5 * spread)
+        strategy.tell(drawn, outcome.loss.cpu().view(count, search.batch).mean(1).tolist())
     torch.nn.utils.vector_to_parameters(best[1], policy.parameters())
     return Found(policy.requires_grad_(False), history, time.perf_counter() - began, played)
 
@@ -190,7 +195,7 @@ def by_reinforcement(method: str, train: Arena, steps: int, seed: int, options: 
     worlds = library_worlds(train, seed)
     given = {"sac": {"learning_starts": 4 * train.count, "batch_size": 64, "gradient_steps": -1, "train_freq": 1,
                      "policy_kwargs": {"net_arch": [64, 64]}},
-             "ppo": {"n_steps": max(2, train.task.steps if train.task.tool else 4), "batch_size": 64,
+             "ppo": {"n_steps": max(2, 4 if train.task.once else train.task.steps), "batch_size": 64,
                      "policy_kwargs": {"net_arch": [64, 64]}}}[method] | dict(options or {})  # fmt: skip
     model = getattr(library, method.upper())("MlpPolicy", worlds, seed=seed, device="cpu", verbose=0, **given)
     model.learn(steps)

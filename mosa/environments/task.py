@@ -34,7 +34,8 @@ RANGES: dict[str, Kind] = {
         is_number(x) and 0 <= x <= ROOM for x in v)),
     "steps": whole(1, 10**5), "control_dt": number(1e-4, 1), "low": number(CLEARANCE, ROOM), "high": number(CLEARANCE, ROOM),
     "tilt": _ANGLE, "unsteady_tilt": _ANGLE, "askew": _ANGLE, "lean": number(1e-3, math.pi), "near": _SOME, "radius": _SOME,
-    "still": number(1e-4, 100), "fastest": number(1e-4, 100), "narrow": number(0.1, 2),
+    "still": number(1e-4, 100), "fastest": number(1e-4, 100), "turning": number(0, 100),
+    "slowest": number(1e-4, 100), "across": number(0, 100), "stroke": whole(1, 10**5), "narrow": number(0.1, 2),
 }  # fmt: skip
 """What a field of a task may be: lengths [m] where nothing else is said."""
 
@@ -57,13 +58,15 @@ class Trials:
 @dataclass(frozen=True)
 class View:
     """Of B bodies. center, velocity: (B, 3) mass centre [m] and its velocity [m/s]; upright: (B, 3) unit, where the rest shape's up
-    axis points; lowest: (B,) height of the lowest particle [m]; tool: (B, 3) position of a driven solid [m], None without one."""
+    axis points; lowest: (B,) height of the lowest particle [m]; tool: (B, 3) position of a driven solid [m]; tool_turn: (B,) [rad]
+    how far its own x axis is turned towards z; both None without one."""
 
     center: Tensor
     velocity: Tensor
     upright: Tensor
     lowest: Tensor
     tool: Tensor | None = None
+    tool_turn: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,9 @@ class Task(ABC):
     control_dt: float = 0.02
     name: ClassVar[str] = ""
     tool: ClassVar[str | None] = None
-    """Name of the solid that actions drive; None: one decision at the start, after which nothing is acted on."""
+    """Name of the solid that actions drive; None without one: the decision is how the body starts."""
+    once: ClassVar[bool] = True
+    """Whether a policy decides once, at the start; else in every control step."""
     ground_friction: ClassVar[float] = 0.3
 
     def __post_init__(self) -> None:
@@ -94,7 +99,7 @@ class Task(ABC):
             value, kind = getattr(self, field.name), RANGES.get(field.name, LENGTH)
             if not kind.fits(value):
                 raise ConfigError(f"options.{field.name}: expected {kind.described}, found {str(value)[:80]!r}")
-        for low, high in (("low", "high"), ("close", "far")):
+        for low, high in (("low", "high"), ("close", "far"), ("slowest", "fastest")):
             if hasattr(self, low) and getattr(self, low) > getattr(self, high):
                 raise ConfigError(f"options.{low}: expected at most options.{high}={getattr(self, high):g}, found "
                                   f"{getattr(self, low):g}")
@@ -135,8 +140,12 @@ class Task(ABC):
         """(B, O) of a policy. view: None before a start that the action decides."""
         return trials.observed
 
-    def command(self, action: Tensor) -> Mapping[str, Tensor] | None:
-        """Velocities [m/s] of the tool, of actions (B, A)."""
+    def targets(self, trials: Trials) -> Tensor | None:
+        """(B, 3) [m] where the body's middle shall stand, on what lies under it, to be marked in pictures; None without such."""
+        return None
+
+    def command(self, action: Tensor, step: int) -> Mapping[str, Any] | None:
+        """Velocities [m/s], [rad/s] of the tool in a control step, of actions (B, A)."""
         return None
 
     def starting_weights(self) -> tuple[Tensor, Tensor]:

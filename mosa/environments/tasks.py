@@ -1,4 +1,4 @@
-"""What is asked of a policy: three tasks with an elastic body, their rewards and what is success.
+"""What is asked of a policy: four tasks with an elastic body, their rewards and what is success.
 
 The paper names two tasks, placing an elastic rabbit onto a white box and hanging on a tower, and their success rates on a robot; it
 gives no sizes, starts, actions or criteria of success. What is chosen here, and on what, is in docs/environments.md.
@@ -131,6 +131,9 @@ class Placement(Release):
         return [{"type": "box", "name": "box", "size": [self.edge, self.top, self.edge], "position": [0, 0.5 * self.top, 0],
                  "mode": "separate", "friction": FRICTION, "thickness": THICKNESS}]  # fmt: skip
 
+    def targets(self, trials: Trials) -> Tensor:
+        return torch.tensor([0.0, self.top, 0.0]).expand(len(trials), 3)
+
     def miss(self, trials: Trials, view: View) -> Tensor:
         away = view.center[:, [0, 2]].square().sum(1) / self.near**2
         return away + (1 - view.upright[:, 1]) / (1 - math.cos(self.lean))
@@ -152,6 +155,10 @@ class Hanging(Release):
     the arms' middle along them and between them across, and its speed is below `still`.
     """
 
+    low: float = 0.3
+    high: float = 0.35
+    unsteady_tilt: float = 0.005
+    unsteady_aim: float = 0.001
     near: float = 0.05
     deep: float = 0.02
     free: float = 0.05
@@ -160,9 +167,9 @@ class Hanging(Release):
     narrow: float = 0.85
     tilt: float = 0.5
     aim: float = 0.1
-    far: float = 0.4
-    close: float = 0.2
-    aside: float = 0.06
+    far: float = 0.15
+    close: float = 0.05
+    aside: float = 0.03
     name = "hanging"
 
     @property
@@ -217,8 +224,10 @@ class Hanging(Release):
 class Pushing(Task):
     """Push the body over the ground with a paddle to a target, step by step; at the end it stands there.
 
-    The paddle moves in the plane with at most `fastest`; it begins `apart` from the body. Success: the centre is within `near` of
-    the target, the up axis within `lean` of the vertical, and the speed below `still`.
+    The paddle moves in the plane with at most `fastest` and turns about the vertical with at most `turning` [rad/s]: a face that
+    stays square to x drags the body along and hardly moves it across, and half of the targets are out of reach. It begins `apart`
+    from the body. Success: the centre is within `near` of the target, the up axis within `lean` of the vertical, and the speed
+    below `still`.
     """
 
     steps: int = 40
@@ -227,22 +236,26 @@ class Pushing(Task):
     lean: float = math.radians(20.0)
     still: float = 0.1
     fastest: float = 0.8
+    turning: float = 2.0
     apart: float = 0.04
     name = "pushing"
     tool = "paddle"
+    once = False
     DISTANCE, ASIDE, FLOOR = (0.15, 0.3), (-0.05, 0.05), (-0.01, 0.01)
 
     @property
     def actions(self) -> tuple[Quantity, ...]:
-        return tuple(Quantity(f"paddle velocity {axis}", "m/s", -self.fastest, self.fastest) for axis in "xz")
+        moves = tuple(Quantity(f"paddle velocity {axis}", "m/s", -self.fastest, self.fastest) for axis in "xz")
+        return (*moves, Quantity("paddle's turn towards z", "rad/s", -self.turning, self.turning))
 
     @property
     def observations(self) -> tuple[Quantity, ...]:
-        far, fast = 0.35, 1.0
-        return (Quantity("target from body x", "m", -far, far), Quantity("target from body z", "m", -far, far),
+        far, aside, near, fast, askew = 0.35, self.ASIDE[1], 0.1, 1.0, 0.5
+        return (Quantity("target from body x", "m", -far, far), Quantity("target from body z", "m", -aside, aside),
                 Quantity("body velocity x", "m/s", -fast, fast), Quantity("body velocity z", "m/s", -fast, fast),
-                Quantity("body from paddle x", "m", -far, far), Quantity("body from paddle z", "m", -far, far),
-                Quantity("up axis x", "1", -1.0, 1.0), Quantity("up axis z", "1", -1.0, 1.0))  # fmt: skip
+                Quantity("body from paddle x", "m", -far, far), Quantity("body from paddle z", "m", -near, near),
+                Quantity("up axis x", "1", -1.0, 1.0), Quantity("up axis z", "1", -1.0, 1.0),
+                Quantity("paddle turned towards z", "rad", -askew, askew))  # fmt: skip
 
     @property
     def drawn(self) -> tuple[tuple[Quantity, ...], tuple[Quantity, ...]]:
@@ -269,20 +282,29 @@ class Pushing(Task):
         return [{"rotation": upright, "position": (float(x), 0.0, float(z)), "height": 0.0, "velocity": still,
                  "angular_velocity": still} for x, z in trials.hidden]  # fmt: skip
 
+    def targets(self, trials: Trials) -> Tensor:
+        x, z = trials.observed.T
+        return torch.stack([x, torch.zeros_like(x), z], 1)
+
     def observe(self, trials: Trials, view: View | None) -> Tensor:
         plane = [0, 2]
         target = trials.observed.to(view.center)
         apart = view.center[:, plane] - view.tool[:, plane].to(view.center)
-        return torch.cat([target - view.center[:, plane], view.velocity[:, plane], apart, view.upright[:, plane]], 1)
+        return torch.cat([target - view.center[:, plane], view.velocity[:, plane], apart, view.upright[:, plane],
+                          view.tool_turn.to(view.center)[:, None]], 1)  # fmt: skip
 
-    def command(self, action: Tensor) -> Mapping[str, Tensor] | None:
+    def command(self, action: Tensor, step: int) -> Mapping[str, Any] | None:
         v = self.physical(action)
-        return {"paddle": torch.stack([v[:, 0], torch.zeros_like(v[:, 0]), v[:, 1]], 1)}
+        none = torch.zeros_like(v[:, 0])
+        turn = torch.stack([none, -v[:, 2], none], 1)  # from x towards z is against the sense about y
+        return {"paddle": {"velocity": torch.stack([v[:, 0], none, v[:, 1]], 1), "angular_velocity": turn}}
 
     def starting_weights(self) -> tuple[Tensor, Tensor]:
-        """Towards the target, and across to where the body is: without it the paddle never touches, and nothing is learned."""
+        """Towards the target, across to where the body is, and turned a little to the target's side: without the first two the
+        paddle never touches, and nothing is learned."""
         weight, bias = super().starting_weights()
-        weight[0, 0], weight[0, 2], weight[1, 5], weight[1, 1] = 2.0, -0.5, 1.0, -0.5
+        weight[0, 0], weight[0, 2], weight[1, 5], weight[1, 1] = 2.0, -0.5, 0.3, -0.07
+        weight[2, 1], weight[2, 8] = 1.0, -2.0
         return weight, bias
 
     def miss(self, trials: Trials, view: View) -> Tensor:
@@ -295,7 +317,49 @@ class Pushing(Task):
         return near & (view.upright[:, 1] > math.cos(self.lean)) & (view.velocity.norm(dim=1) < self.still)
 
 
-TASKS: dict[str, type[Task]] = {task.name: task for task in (Placement, Hanging, Pushing)}
+@dataclass(frozen=True)
+class Striking(Pushing):
+    """Strike the body once with the paddle, so that it slides to a target and stops there.
+
+    The stroke lasts `stroke` control steps at a speed of `slowest` to `fastest` towards x, across at up to `across` [m/s], turned
+    at up to `turning`; then the paddle stands. How fast the body leaves it is the law's. Success: as in pushing, and nobody
+    corrects.
+    """
+
+    steps: int = 24
+    near: float = 0.015
+    fastest: float = 0.97
+    slowest: float = 0.7
+    across: float = 0.2
+    stroke: int = 5
+    name = "striking"
+    once = True
+    DISTANCE, ASIDE, FLOOR = (0.31, 0.45), (-0.015, 0.015), (-0.003, 0.003)
+
+    @property
+    def actions(self) -> tuple[Quantity, ...]:
+        return (Quantity("paddle velocity x", "m/s", self.slowest, self.fastest),
+                Quantity("paddle velocity z", "m/s", -self.across, self.across),
+                Quantity("paddle's turn towards z", "rad/s", -self.turning, self.turning))  # fmt: skip
+
+    @property
+    def observations(self) -> tuple[Quantity, ...]:
+        return self.drawn[0]
+
+    def observe(self, trials: Trials, view: View | None) -> Tensor:
+        return trials.observed
+
+    def command(self, action: Tensor, step: int) -> Mapping[str, Any] | None:
+        return super().command(action, step) if step < self.stroke else {self.tool: {"velocity": (0.0, 0.0, 0.0)}}
+
+    def starting_weights(self) -> tuple[Tensor, Tensor]:
+        """The middle of what may be asked, turned to the target's side."""
+        weight, bias = Task.starting_weights(self)
+        weight[2, 1] = 0.5
+        return weight, bias
+
+
+TASKS: dict[str, type[Task]] = {task.name: task for task in (Placement, Hanging, Striking, Pushing)}
 
 
 def task_named(name: str, rest: Tensor, **options: Any) -> Task:

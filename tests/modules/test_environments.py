@@ -19,7 +19,7 @@ from mosa.environments import arena as arenas
 from mosa.environments import command, pictures, study
 from mosa.environments.arena import LOST, Arena, Simulator, play, play_all, simulator_named, world_of
 from mosa.environments.pictures import film
-from mosa.environments.policies import LinearPolicy, Search, _side_by_side, by_elites, by_gradient, by_reinforcement
+from mosa.environments.policies import LinearPolicy, Search, _side_by_side, by_evolution, by_gradient, by_reinforcement
 from mosa.environments.study import Bench, Setting
 from mosa.environments.task import View
 from mosa.environments.tasks import CLEARANCE, TASKS, task_named
@@ -31,7 +31,7 @@ from mosa.types import Ground
 
 WORLD = World(Ground(0.0, "sticky"), torch.tensor([0.0, -9.8, 0.0]), torch.tensor([0.0, 1.0, 0.0]),
               torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))  # fmt: skip
-SHORT = {"placement": 8, "hanging": 8, "pushing": 8}
+SHORT = {"placement": 8, "hanging": 8, "striking": 8, "pushing": 8}
 
 
 def simulator(name="learned", E=6e4, precision=32):
@@ -78,7 +78,7 @@ def test_the_sizes_follow_from_the_body_and_numbers_have_units(name):
     double = task_named(name, torch.tensor([[0.0, 0, 0], [0.4, 0.48, 0.32]]))
     assert [s["name"] for s in task.solids()] == [s["name"] for s in double.solids()] != []
     for quantity in (*task.actions, *task.observations, *task.drawn[0], *task.drawn[1]):
-        assert quantity.unit in ("m", "rad", "m/s", "1") and quantity.low < quantity.high
+        assert quantity.unit in ("m", "rad", "m/s", "rad/s", "1") and quantity.low < quantity.high
     low, high = task.physical(-torch.ones(1, len(task.actions))), task.physical(torch.ones(1, len(task.actions)))
     assert low[0].tolist() == pytest.approx([q.low for q in task.actions])
     assert high[0].tolist() == pytest.approx([q.high for q in task.actions])
@@ -87,26 +87,30 @@ def test_the_sizes_follow_from_the_body_and_numbers_have_units(name):
     assert torch.equal(a.observed, task.draw(5, torch.Generator().manual_seed(1)).observed)
     with pytest.raises(ConfigError, match=r"up = \[0, 1, 0\]"):
         task.world(replace(WORLD, up=torch.tensor([0.0, 0.0, 1.0])))
-    with pytest.raises(ConfigError, match="task: expected one of placement, hanging, pushing"):
+    with pytest.raises(ConfigError, match="task: expected one of placement, hanging, striking, pushing"):
         task_named("juggling", torch.zeros(2, 3))
 
 
 def view(task, center=(0.0, 0.0, 0.0), lean=0.0, lowest=0.0, speed=0.0):
     up = torch.tensor([[np.sin(lean), np.cos(lean), 0.0]]).float()
-    return View(torch.tensor([center]), torch.tensor([[speed, 0.0, 0.0]]), up, torch.tensor([lowest]), torch.zeros(1, 3))
+    moved = torch.tensor([[speed, 0.0, 0.0]])
+    return View(torch.tensor([center]), moved, up, torch.tensor([lowest]), torch.zeros(1, 3), torch.zeros(1))
 
 
 def test_success_is_what_the_task_says_and_the_loss_falls_towards_it():
     rest = torch.tensor([[0.0, 0, 0], [0.2, 0.24, 0.16]])
-    placement, hanging, pushing = (task_named(name, rest) for name in TASKS)
-    nothing = {task.name: task.draw(1, torch.Generator()) for task in (placement, hanging, pushing)}
+    placement, hanging, striking, pushing = (task_named(name, rest) for name in TASKS)
+    nothing = {task.name: task.draw(1, torch.Generator()) for task in (placement, hanging, striking, pushing)}
     top, under = placement.top, hanging.top
     tx, tz = nothing["pushing"].observed[0].tolist()
+    sx, sz = nothing["striking"].observed[0].tolist()
     good = {placement: {"center": (0.01, top + 0.1, 0.0), "lowest": top},
-            hanging: {"center": (0.01, under, 0.0), "lowest": under - 0.04}, pushing: {"center": (tx, 0.1, tz)}}  # fmt: skip
+            hanging: {"center": (0.01, under, 0.0), "lowest": under - 0.04}, pushing: {"center": (tx, 0.1, tz)},
+            striking: {"center": (sx, 0.1, sz)}}  # fmt: skip
     bad = {placement: ({"center": (0.08, top + 0.1, 0.0)}, {"lean": 0.6}, {"lowest": 0.0}, {"speed": 0.5}),
            hanging: ({"center": (0.08, under, 0.0)}, {"lowest": 0.02}, {"lowest": under - 0.01}, {"speed": 0.5}),
-           pushing: ({"center": (tx + 0.05, 0.1, tz)}, {"lean": 0.6}, {"speed": 0.3})}  # fmt: skip
+           pushing: ({"center": (tx + 0.05, 0.1, tz)}, {"lean": 0.6}, {"speed": 0.3}),
+           striking: ({"center": (sx + 0.02, 0.1, sz)}, {"lean": 0.6}, {"speed": 0.3})}  # fmt: skip
     for task, values in good.items():
         trials, fine = nothing[task.name], view(task, **values)
         assert bool(task.succeeded(trials, fine))
@@ -185,13 +189,46 @@ def test_descent_through_the_simulator_lowers_the_loss():
         LinearPolicy.read(check.task, {"weight": [[1.0]]})
 
 
+def test_a_paddle_turns_as_it_is_told_and_a_picture_shows_it_and_the_target():
+    made = arena("pushing", worlds=2, steps=2)
+    trials = drawn(made, 2)
+    action = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.0, -1.0]])
+    shown = play(made, trials, lambda _: action, record=True).states
+    turned = made.task.turning * action[:, 2] * 2 * made.task.control_dt
+    torch.testing.assert_close(made.view.tool_turn.float(), turned)
+    face = shown[2][-1, :, :, 0]  # where the paddle's own x axis points
+    torch.testing.assert_close(torch.atan2(face[:, 2], face[:, 0]).float(), turned)
+    torch.testing.assert_close(made.task.observe(trials, made.view)[:, -1].float(), turned)
+    images = [film(made, shown, world, 1, size=96)[0].astype(float) for world in (0, 1)]
+    assert np.abs(images[0] - images[1]).mean() > 0.5
+    red = [((image[..., 0] > 150) & (image[..., 1] < 110)).sum() for image in images]
+    assert min(red) >= 4, red
+
+
+def test_a_stroke_is_one_decision_after_which_the_paddle_stands():
+    made = arena("striking", worlds=2, steps=8, stroke=3)
+    trials = drawn(made, 2)
+    seen = made.reset(trials)
+    torch.testing.assert_close(seen, trials.observed)
+    before = made.worlds.state.position[:, made.tool].clone()
+    action = torch.tensor([[1.0, -1.0, 0.5], [-1.0, 0.0, 0.0]])
+    _, over = made.step(action)
+    assert over and made.done == 8
+    v = made.task.physical(action).double()
+    went = 3 * made.task.control_dt * torch.stack([v[:, 0], 0 * v[:, 0], v[:, 1]], 1)
+    torch.testing.assert_close(made.view.tool - before, went, atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(made.view.tool_turn, 3 * made.task.control_dt * v[:, 2], atol=1e-6, rtol=1e-5)
+    fast, slow = made.view.center[:, 0] - trials.hidden[:, 0]
+    assert fast > slow + 0.02
+
+
 def test_the_best_of_drawn_policies_lead():
     """Without gradients: candidates see the same trials, and their numbers are those of their own worlds."""
-    search = Search(iterations=3, batch=1, every=3, validation=2, candidates=6, elite=0.34, spread=0.8)
-    train, check = arena("pushing", 6), arena("pushing", 2)
-    found = by_elites(train, check, search, seed=1)
+    search = Search(iterations=8, batch=1, every=8, validation=4, candidates=8, spread=0.3)
+    train, check = arena("pushing", 8), arena("pushing", 4)
+    found = by_evolution(train, check, search, seed=1)
     losses = [entry["loss"] for entry in found.history]
-    assert losses[-1] < losses[0] - 0.02 and found.trials == 3 * 6 + 2 * 2
+    assert losses[-1] < losses[0] - 0.2 and found.trials == 8 * 8 + 2 * 4
     policy = LinearPolicy(check.task)
     numbers = torch.randn(3, sum(p.numel() for p in policy.parameters()), generator=torch.Generator().manual_seed(0))
     seen = torch.randn(6, len(check.task.observations), generator=torch.Generator().manual_seed(1))
@@ -199,8 +236,8 @@ def test_the_best_of_drawn_policies_lead():
     for k, own in enumerate(numbers):
         torch.nn.utils.vector_to_parameters(own, policy.parameters())
         torch.testing.assert_close(together[2 * k : 2 * k + 2], policy(seen[2 * k : 2 * k + 2]).detach())
-    with pytest.raises(ConfigError, match="search: expected 6 candidates times 1 trials as worlds, found 2"):
-        by_elites(check, check, search, seed=1)
+    with pytest.raises(ConfigError, match="search: expected 8 candidates times 1 trials as worlds, found 4"):
+        by_evolution(check, check, search, seed=1)
 
 
 def test_a_trial_that_diverges_is_lost_and_the_others_go_on(monkeypatch):
@@ -278,7 +315,7 @@ def test_the_command_takes_its_configuration(tmp_path, monkeypatch):
     setting = command.setting_of(values)
     assert setting.worlds == command.AT_A_TIME and setting.search == Search() and setting.trials == 100
     for change, message in (({"task": "juggling"}, "task: expected one of placement"), ({"trials": 0}, "trials: expected a whole"),
-                            ({"policy": "magic"}, "policy: expected one of gradient, cem, sac, ppo"),
+                            ({"policy": "magic"}, "policy: expected one of gradient, cma, sac, ppo"),
                             ({"options": {"nearr": 1.0}}, "options.nearr: expected one of steps"),
                             ({"search": {**values["search"], "rat": 1}}, "search.rat: unknown key")):  # fmt: skip
         with pytest.raises(ConfigError, match=message):
@@ -310,7 +347,7 @@ def test_without_gymnasium_the_message_says_what_to_install(monkeypatch):
     monkeypatch.setattr(builtins, "__import__", missing)
     with pytest.raises(ConfigError, match=r"expected Gymnasium, found none; pip install 'mosa\[environments\]'"):
         by_reinforcement("sac", arena(), 8, 0)
-    with pytest.raises(ConfigError, match="policy: expected one of gradient, cem, sac, ppo"):
+    with pytest.raises(ConfigError, match="policy: expected one of gradient, cma, sac, ppo"):
         by_reinforcement("magic", arena(), 8, 0)
 
 

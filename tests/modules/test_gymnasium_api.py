@@ -29,7 +29,7 @@ def options(name):
 def test_the_checker_of_gymnasium_is_content(name):
     env = gymnasium.make(f"mosa/{name.capitalize()}-v0", options=options(name), disable_env_checker=True)
     check_env(env.unwrapped, skip_render_check=True)
-    decided = env.unwrapped.task.tool is None
+    decided = env.unwrapped.task.once
     env.reset(seed=1)
     length, over = 0, False
     while not over:
@@ -60,7 +60,7 @@ def test_what_is_drawn_is_what_is_seen_or_held():
     assert before.shape == (40, 40, 3) and before.dtype == np.uint8 and not np.array_equal(before, env.render())
     env = TwinEnv("pushing", options={"steps": 2}, render_mode="rgb_array_list", size=40)
     env.reset(seed=0)
-    env.step(np.ones(2, np.float32))
+    env.step(np.ones(3, np.float32))
     assert len(env.render()) == 2
     with pytest.raises(Exception, match="render_mode: expected one of rgb_array"):
         TwinEnv("pushing", render_mode="human")
@@ -89,12 +89,12 @@ def test_a_vector_of_worlds_is_its_trials(name):
 def test_rewards_of_a_push_add_up_to_the_mean_loss():
     env = TwinVectorEnv("pushing", 2, options=options("pushing"))
     env.reset(seed=0)
-    total = sum(env.step(np.zeros((2, 2), np.float32))[1] for _ in range(SHORT["pushing"]))
+    total = sum(env.step(np.zeros((2, 3), np.float32))[1] for _ in range(SHORT["pushing"]))
     assert len(env.arena.last) == 0  # begun anew
     made = arena("pushing", 2)
     made.reset(task_named("pushing", made.body.rest).draw(2, torch.Generator().manual_seed(
         int(gymnasium.utils.seeding.np_random(0)[0].integers(2**62)))))  # fmt: skip
-    while not made.step(torch.zeros(2, 2))[1]:
+    while not made.step(torch.zeros(2, 3))[1]:
         pass
     np.testing.assert_allclose(total, -torch.stack(made.last).mean(0).numpy(), rtol=1e-4)
 
