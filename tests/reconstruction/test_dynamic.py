@@ -115,7 +115,7 @@ def rendered_windows(scaffold, truth, frames):
             sample.positions + torch.tensor([0.04, 0.25, 0.0]),
             sample.covariances,
             scaffold.splats.opacities,
-            scaffold.splats.colors[None],
+            scaffold.colors(torch.arange(frames)),
             view,
             torch.arange(frames),
             torch.ones(3),

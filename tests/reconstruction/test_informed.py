@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -46,6 +48,23 @@ def fitted(bent, predicted, seen, **settings):
                                 DynamicSettings(carriers="particles"), reach=0.1, seed=0)
     with torch.no_grad():
         return motion(EVERY, body.splats, body.modes, body.around).positions
+
+
+def test_a_body_in_another_light_is_followed_where_its_shades_are_known(scaffold):
+    """Frames that a light makes brighter on one side and darker on the other: without their shades the colours pull the body."""
+    truth = ModalMotion(OFFSETS, scaffold.modes.energy, reach=0.1)
+    with torch.no_grad():
+        truth.amplitude[1:, 4:8] = 0.02 * torch.randn(2, 4, 3, generator=torch.Generator().manual_seed(2))
+        side = scaffold.splats.means[:, 0] / scaffold.splats.means[:, 0].abs().max()
+        lit = replace(scaffold, shades=torch.stack([0 * side, 0.4 * side, -0.4 * side]).exp())
+        scene = rendered_windows(lit, truth, 3)
+        shifted = replace(scaffold.splats, means=scaffold.splats.means + torch.tensor([0.04, 0.25, 0.0]))
+        true = truth(EVERY, shifted, scaffold.modes).positions
+    windows, body = object_windows(scene, list(range(6)), list(range(3))), replace(scaffold, splats=shifted)
+    known = fitted((windows, replace(body, shades=lit.shades), None), true, true, bending=0.01, elastic=0.01)
+    unknown = fitted((windows, body, None), true, true, bending=0.01, elastic=0.01)
+    assert away(known, true) < 0.2
+    assert away(known, true) < 0.3 * away(unknown, true)
 
 
 def away(a, b) -> float:

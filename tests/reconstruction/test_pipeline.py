@@ -16,6 +16,7 @@ from mosa.reconstruction import moved, pipeline
 from mosa.reconstruction.informed import InformedSettings
 from mosa.reconstruction.pipeline import follow, reconstruct, spacing_for
 from mosa.reconstruction.settings import build_settings
+from mosa.rendering.lighting import shading, surface_normals
 
 CONF = Path(__file__).parents[2] / "conf" / "reconstruction"
 SETTINGS = build_settings(
@@ -116,6 +117,18 @@ def test_the_second_look_takes_what_the_first_motion_was_fitted_with(squashed, f
     assert again.positions.shape == found.cues.positions.shape and bool(torch.isfinite(again.positions).all())
 
 
+def test_the_second_look_compares_what_was_fitted_to_all_frames(squashed, found):
+    """In the light of every frame; `first` and a reconstruction without such Gaussians compare those of the first motion."""
+    fitted, first = (moved.SecondLook(squashed, found, replace(SETTINGS, informed=InformedSettings(carriers=name)), progress=False)
+                     for name in ("fitted", "first"))  # fmt: skip
+    carried = fitted._carried
+    assert torch.equal(carried.splats.means, found.appearance.splats.means)
+    assert carried.shades.shape == (len(found.cues.positions), len(carried.splats.means))
+    torch.testing.assert_close(carried.shades[0], torch.ones_like(carried.shades[0]), atol=1e-4, rtol=0)
+    assert first._carried is found.moving.carried
+    assert moved.SecondLook(squashed, replace(found, appearance=None), fitted.settings, progress=False)._carried.shades is None
+
+
 def test_a_damaged_stage_is_computed_again_and_the_rest_kept(squashed, found, spacing, cache, monkeypatch):
     damaged = next((cache / "reconstruction").glob("*/geometry.pt"))
     damaged.write_bytes(b"half a file")
@@ -204,5 +217,12 @@ def test_a_known_body_is_followed_through_another_sequence(squashed, found, tmp_
     known = (result.cues.weight > 0) & (found.cues.weight > 0)
     change = (result.cues.rotation - Q @ found.cues.rotation @ Q.T)[known].flatten(1).norm(dim=1)
     assert torch.rad2deg(change / 2**0.5).median() < 2.0 and known.float().mean() > 0.9
+    # colours known in another light than that of this film: its first frame says what they are here
+    normals = surface_normals(found.static.means, found.splats.means)
+    light = torch.tensor([0.3, -0.2, 0.4, 0, 0, 0, 0, 0])
+    relit = replace(found, static=replace(found.static, colors=found.static.colors / shading(light, normals, Q)[:, None]))
+    started = follow(other, squashed, relit, **pose, settings=SETTINGS, cache_dir=None, progress=False).static
+    off, before = ((known.colors - found.static.colors).abs().mean() for known in (started, relit.static))
+    assert off < 0.5 * before
     stored = follow(other, squashed, found, **pose, settings=SETTINGS, cache_dir=tmp_path, progress=False)
     assert torch.equal(stored.cues.positions, result.cues.positions) and len(list(tmp_path.rglob("motion.pt"))) == 1
