@@ -64,7 +64,7 @@ def camera_of(arena: Arena, size: int) -> Cameras:
     """One camera that sees what the body falls on, or the way that it is pushed."""
     focal = 1.5 * size
     top = getattr(arena.task, "top", 0.1)
-    target = torch.tensor([0.05, top + 0.05, 0.0])
+    target = torch.tensor([arena.task.watched, top + 0.05, 0.0])
     eye = target + torch.tensor([0.55, 0.42, 1.05])
     K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
     device = arena.rest.device

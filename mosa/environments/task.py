@@ -92,6 +92,8 @@ class Task(ABC):
     once: ClassVar[bool] = True
     """Whether a policy decides once, at the start; else in every control step."""
     ground_friction: ClassVar[float] = 0.3
+    watched: ClassVar[float] = 0.05
+    """x [m] of what pictures look at."""
 
     def __post_init__(self) -> None:
         """Errors: ConfigError naming the field that is out of its range."""

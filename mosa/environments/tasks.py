@@ -334,6 +334,7 @@ class Striking(Pushing):
     stroke: int = 5
     name = "striking"
     once = True
+    watched = 0.2
     DISTANCE, ASIDE, FLOOR = (0.31, 0.45), (-0.015, 0.015), (-0.003, 0.003)
 
     @property
