@@ -169,8 +169,9 @@ def test_directions_are_found_from_a_true_motion(monkeypatch, tmp_path):
     monkeypatch.setattr(directions, "PLATES", 3)
     records = []
     for name, plates in (("tiny", True), ("tiny_twin", False)):
-        path = directions.make(name, tmp_path, 0)
-        records.append(directions.fit(path, 150, settings, 0, 0.004, "cpu", plates, False))
+        directions.make(name, tmp_path, 0, ["train"])
+        path = tmp_path / f"{name}.npz"
+        records.append(directions.fit(path, 150, settings, 0, 0.004, "cpu", plates, False, False, ["train"]))
     body, twin = records
     assert max(body["true_E_along"]) == body["true_E_along"][0] > 1.5 * min(body["true_E_along"])
     assert max(twin["true_E_along"]) == pytest.approx(min(twin["true_E_along"]))
