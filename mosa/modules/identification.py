@@ -32,6 +32,9 @@ EVIDENCE_ITERATIONS = 5
 """Iterations in which the sizes of the blocks are found again, later they stay. Two sizes of the stiffness modes can each bear
 themselves out: a large one saturates the field, and what is saturated says nothing against it. On two drops of the rabbit the size
 fell to a twentieth in the ninth iteration, where the fit was done, and began again from a cost 20 times as large."""
+FLAT = 0.5
+"""Of minus the logarithm of the posterior: an iteration of the joint stage that lowers it by less, with the sizes settled, is the
+last. Numbers that still move then lie on a floor that the data do not tell apart."""
 COARSER = 1.25
 """Spacing of the second grid, on which the same numbers are rolled out to see what the first one gets wrong."""
 MOST_THREADS = 8
@@ -220,7 +223,9 @@ class Identification:
                                      settled=self.iteration >= NOISE_ITERATIONS and not self.calibrating)
         self.iteration += 1
         small = self.iteration > NOISE_ITERATIONS and report["length"] * report["share"] < self.settings.tolerance
-        self.converged = small or report["share"] == 0
+        gained = report["before"] - report["after"]
+        flat = self.iteration > EVIDENCE_ITERATIONS and not self.calibrating and gained < FLAT
+        self.converged = small or flat or report["share"] == 0
         return report
 
     def state(self) -> dict:

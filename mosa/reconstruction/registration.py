@@ -22,6 +22,7 @@ from mosa.reconstruction.rigid import (
     damped,
     huber,
     left_jacobian,
+    light_columns,
     lit_equations,
     make_level,
     normal_equations,
@@ -120,14 +121,20 @@ class Registered(NamedTuple):
     light: Tensor | None
 
 
+RELIT = (0, 2)
+"""Iterations in which the light's part of the Jacobian is made: it changes little with the pose and the light."""
+
+
 def refine_lit(
     body: RigidBody, level: Level, pose: Poses, before: Tensor, background: Tensor, *, iterations: int = 8, moves: bool = True
 ) -> tuple[Poses, Tensor]:
     """One pose and its light (8,), fitted together by Levenberg-Marquardt steps from the light `before`; moves: whether the pose is
     fitted too, or known. body: with normals."""
     best, trial, state, damping = (pose, before), (pose, before), None, torch.full((1,), 1e-3).to(before)
-    for _ in range(iterations):
-        found = lit_equations(body, level, *trial, before, background)
+    for i in range(iterations):
+        if i in RELIT:
+            columns = light_columns(body, level, *trial, background)
+        found = lit_equations(body, level, *trial, before, columns, background)
         if state is None or found[0] < state[0]:
             best, state, damping = trial, found, damping / 3
         else:
@@ -194,10 +201,10 @@ def register_pose(
     level = make_level(images[some], mattes[some], cameras.select(some), center, 56)
     poses, cost = refine(body, level, poses, background, iterations=8)
     best = poses.take(cost.argsort()[:1])
-    level = make_level(images, mattes, cameras, center, None)
-    best, _ = refine(body, level, best, background, iterations=8, central=True)
-    found = None
-    if normals is not None:
+    level, found = make_level(images, mattes, cameras, center, None), None
+    if normals is None:
+        best, _ = refine(body, level, best, background, iterations=8, central=True)
+    else:
         before = torch.zeros(LIGHT).to(body.arm) if light is None else light.to(body.arm)
         best, found = refine_lit(body, level, best, before, background)
     Q = best.rotation[0]

@@ -193,21 +193,26 @@ LIGHT_RIDGE = 1e-3
 numbers, and what they are then does not show."""
 
 
+def light_columns(body: RigidBody, level: Level, pose: Poses, light: Tensor, background: Tensor) -> Tensor:
+    """(8, P) derivative of the level's first frame in the numbers of the light, at one pose."""
+    frames = [body.shaded(pose.rotation[0], each).render(pose, level.cameras, background).flatten()
+              for each in (light, *(light + LIGHT_STEP * torch.eye(LIGHT).to(light)))]  # fmt: skip
+    return (torch.stack(frames[1:]) - frames[0]) / LIGHT_STEP
+
+
 def lit_equations(
-    body: RigidBody, level: Level, pose: Poses, light: Tensor, before: Tensor, background: Tensor
+    body: RigidBody, level: Level, pose: Poses, light: Tensor, before: Tensor, columns: Tensor, background: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Cost (), gradient (14,) and Gauss-Newton matrix (14, 14) of one pose and a light (8,) against the level's first frame; the
-    pose's numbers as of `normal_equations`. before: (8,) the light that the ridge pulls to."""
+    pose's numbers as of `normal_equations`. before: (8,) what the ridge pulls to; columns: of `light_columns`, near by."""
     shaded = body.shaded(pose.rotation[0], light)
     h = STEP_PX * level.pixel
     steps = h * torch.cat((torch.zeros(1, 6), torch.eye(6), -torch.eye(6))).to(light)
     around = Poses(pose.rotation.expand(13, 3, 3), pose.center.expand(13, 3))
     # the colours turn with the light's own columns alone: a pose's columns know its geometry
     seen = shaded.render(around.moved(steps[:, :3], steps[:, 3:] / body.radius), level.cameras, background).flatten(1)
-    brighter = [body.shaded(pose.rotation[0], light + LIGHT_STEP * e).render(pose, level.cameras, background).flatten()
-                for e in torch.eye(LIGHT).to(light)]  # fmt: skip
     residual = seen[0] - level.target[0].flatten()
-    J = torch.cat(((seen[1:7] - seen[7:]) / (2 * h), (torch.stack(brighter) - seen[:1]) / LIGHT_STEP))
+    J = torch.cat(((seen[1:7] - seen[7:]) / (2 * h), columns))
     cost, weight = huber(residual)
     weighted = J * weight
     matrix, gradient = weighted @ J.T, weighted @ residual

@@ -45,6 +45,15 @@ def run(found: Identification, most: int = 12) -> int:
     return most
 
 
+@pytest.mark.parametrize("lowered, stops", [(0.4, 6), (0.6, None)])
+def test_an_iteration_that_hardly_lowers_the_cost_is_the_last(monkeypatch, lowered, stops):
+    """Though it goes far, along what the data do not tell; not while noise and sizes are still being found."""
+    body = small_body()
+    found = identification(body, [take_and_turn(small_body(), 0.5)])
+    monkeypatch.setattr(found.newton, "iterate", lambda **_: {"before": 10.0, "after": 10.0 - lowered, "share": 1.0, "length": 3.0})
+    assert next((i + 1 for i in range(8) if found.iterate() and found.converged), None) == stops
+
+
 def values(body) -> dict[str, float]:
     return {name: float(value.detach()) for name, value in body.material.physical().items()}
 
