@@ -82,12 +82,15 @@ def informed_motion(
     *,
     reach: float,
     seed: int,
+    judging: Scaffold | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> tuple[ModalMotion, Tensor] | None:
     """(motion through all frames of `windows`, about predicted shapes of the body; those shapes (T, N, 3) [m] where it began); else
     as `fit_motion`. None where it follows the images much worse than `seen` does.
 
-    predicted, seen: (T, N, 3) [m] positions of the particles, a simulation's and those that were found without one.
+    predicted, seen: (T, N, 3) [m] positions of the particles, a simulation's and those that were found without one; judging: the
+    Gaussians by which the two motions are compared in the end, those that were not fitted as `seen` carried them: it would win by
+    that alone. None: `carried`.
     """
     motion = ModalMotion(offsets, scaffold.modes.energy, reach=reach)
     every = torch.arange(len(offsets), device=offsets.device)
@@ -120,6 +123,6 @@ def informed_motion(
 
     @torch.no_grad()
     def loss(of: ModalMotion) -> float:
-        return float(Objective(of, carried, scaffold, background, alone)(every, compared, compared.frame))
+        return float(Objective(of, judging or carried, scaffold, background, alone)(every, compared, compared.frame))
 
     return (motion, begun) if loss(motion) < WORSE * loss(first) + SLACK else None

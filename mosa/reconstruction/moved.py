@@ -198,7 +198,7 @@ class SecondLook:
         with tqdm(total=settings.informed.iterations, desc=title, disable=not self.progress, leave=False) as steps:
             found = informed_motion(parts.scaffold, self._carried, windows, parts.centres, self._background(),
                                     predicted.to(seen), seen, settings.informed, settings.dynamic, reach=parts.reach,
-                                    seed=self.seed, progress=steps.update)  # fmt: skip
+                                    seed=self.seed, judging=parts.carried, progress=steps.update)  # fmt: skip
         if found is None:
             log.warning("reconstruction.informed: what the calibrated law predicts of %s is no guide to its images, and the first "
                         "motion stays", sequence)
