@@ -20,6 +20,10 @@ from mosa.types import Appearance, Scene, Splats
 MOST_FRAMES = 6
 """Frames of free flight that a velocity is fitted to at most: more take longer and say little more."""
 
+FINER = 2
+"""Splats for each particle up to which they are what a body is looked for by: with more, a start takes longer than the coarse body
+that is simulated from it is worth."""
+
 
 def splats_of(body: Body) -> Splats:
     """The body's particles as (isotropic or not) splats with axes from their covariances."""
@@ -51,9 +55,9 @@ def first_contact(body: Body, start: Start, scene: Scene) -> int:
 
 
 def appearance_of(body: Body) -> Appearance:
-    """What a body is looked for by: the splats that it carries, which all training frames were fitted to, else its particles; with
-    the normals of its surface."""
-    if body.splats is not None:
+    """What a body is looked for by: the splats that it carries, which all training frames were fitted to; its particles where it
+    has no such splats or is far coarser than they are. With the normals of its surface."""
+    if body.splats is not None and len(body.splats) <= FINER * len(body.rest):
         found = body.splats.appearance
     else:
         splats = splats_of(body)
