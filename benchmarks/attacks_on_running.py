@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 from attacks import ROOT, Attack, refuse
-from long_runs import SMALL as SHORT
-from long_runs import leftovers
+from drawn_runs import SMALL as SHORT
+from drawn_runs import leftovers
 
 SMALL = [*(key for key in SHORT if "video" not in key), "reconstruction.dynamic.iterations=15",
          "reconstruction.carried.iterations=20", "reconstruction.informed.iterations=5",

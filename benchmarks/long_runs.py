@@ -3,14 +3,18 @@
     OMP_NUM_THREADS=1 python benchmarks/long_runs.py                     # small: about fifteen minutes on two cores
     OMP_NUM_THREADS=1 python benchmarks/long_runs.py --runs 200 --workers 30 --kills 2 --between 70 110 --launched 24 \\
         --rollouts 21600 --frames 4 --particles 1000 --device cuda       # all of it, on 32 cores and two GPUs
+    OMP_NUM_THREADS=1 python benchmarks/long_runs.py --parts runs --runs 200 --workers 14 --portion 100 --launched 28 \\
+        --between 70 110 --until 530 --record found.json                 # as far as it comes; the same once more goes on
     OMP_NUM_THREADS=1 python benchmarks/long_runs.py --parts rollouts --rollouts 2000
 
 Three parts, side by side where there are GPUs:
 
-- runs: drawn ones (law, criterion, adapter, numbers of the fit, seed) on the tiny scene, each in a process of its own, `workers`
-  beside each other. The same ones then as a sweep of joblib, and the first `launched` of them also of submitit's local executor.
-  Every process of a sweep is killed with SIGKILL at drawn moments, and the same command is given again, with resume=auto, until
-  it has come to its end. One after the other, or all three beside each other (--abreast).
+- runs (drawn_runs.py): drawn ones (law, criterion, adapter, numbers of the fit, seed) on the tiny scene, each in a process of its
+  own, `workers` beside each other. The same ones then as a sweep of joblib, whose processes make one after the other, and the
+  first `launched` of them also of submitit's local executor. Every process of a sweep is killed with SIGKILL at drawn moments, and
+  the same command is given again, with resume=auto, until it has come to its end. With --record each figure is kept as it comes,
+  --until stops all after so many seconds, and the same command goes on with what is missing; figures are compared where both are
+  of the same processor and the same program.
 - rollouts: `rollouts` drawn drops of one body in one process, of `frames` frames. 21,600 are a day of them on a CPU, of 4 s each.
   Every hundredth is made twice and compared.
 - equality (with --device cuda): two runs that are given the same, and two with deterministic=true; and what that costs a rollout
@@ -27,8 +31,6 @@ import argparse
 import contextlib
 import json
 import os
-import random
-import signal
 import subprocess
 import sys
 import tempfile
@@ -40,15 +42,9 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from drawn_runs import SMALL, Row, environment, figures, runs, started, told
 
 ROOT = Path(__file__).parents[1]
-SMALL = ["debug=default", "evaluation.video=false", "logger=none", "reconstruction.static.iterations=60",
-         "reconstruction.appearance.iterations=60", "reconstruction.dynamic.iterations=30", "identification.threads=1"]  # fmt: skip
-CHOICES = {
-    "prior": ["corotated", "neo_hookean", "linear", "stvk"], "criterion": ["corrected", "free"], "adapter": ["operator", "none"],
-    "fit.joint.newton_iterations": [1, 2], "identification.count": [20.0, 30.0], "seed": [0, 1, 2, 3],
-}  # fmt: skip
-MARKS = (".partial", ".tmp", ".lock")
 PARTS = ("runs", "rollouts", "equality")
 GROWTH = 20.0
 """MB that a process's memory may differ by after thousands of rollouts: an allocator's pools, not a leak of each."""
@@ -60,215 +56,6 @@ which their errors may differ."""
 SPREADS = (2 * ((1 + AGREE) ** 2 - 1)) ** 0.5
 """Standard deviations that two equal runs may be apart, 0.45: each is then off their middle by that over the root of two, and such
 a scatter of its own widens a standard deviation s to s (1 + SPREADS^2 / 2)^(1/2) = (1 + AGREE) s."""
-
-
-class Row(NamedTuple):
-    what: str
-    asked: str
-    found: str
-    met: bool
-
-
-def drawn(count: int, generator: random.Random) -> list[list[str]]:
-    """So many different sets of overrides, as far as there are."""
-    found: list[list[str]] = []
-    for _ in range(100 * count):
-        one = [f"{key}={generator.choice(values)}" for key, values in CHOICES.items()]
-        if one not in found:
-            found.append(one)
-        if len(found) == count:
-            break
-    return found
-
-
-def environment(gpu: int | None = None) -> dict[str, str]:
-    path = f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
-    seen = {} if gpu is None else {"CUDA_VISIBLE_DEVICES": str(gpu)}
-    return {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path, **seen}
-
-
-def started(arguments: list[str], log: Path, gpu: int | None = None) -> subprocess.Popen:
-    with open(log, "a") as file:
-        return subprocess.Popen([sys.executable, str(ROOT / "train.py"), *arguments], cwd=ROOT, env=environment(gpu), stdout=file,
-                                stderr=file, start_new_session=True)  # fmt: skip
-
-
-def figures(folder: Path) -> dict:
-    """Of a run, without what depends on the clock and the machine."""
-    path = folder / "metrics.json"
-    if not path.is_file():
-        return {"metrics.json": "none"}
-    return {key: value for key, value in json.loads(path.read_text()).items() if not key.startswith("time/")}
-
-
-def processes_with(text: str) -> list[int]:
-    """Of this machine's processes, those whose command line or folder names `text`, but this one and those that run parts."""
-    found = []
-    for place in Path("/proc").glob("[0-9]*"):
-        try:
-            told = (place / "cmdline").read_bytes().decode(errors="ignore")
-            folder = os.readlink(place / "cwd")
-        except OSError:
-            continue
-        if text in told + folder and "long_runs.py" not in told:
-            found.append(int(place.name))
-    return found
-
-
-def leftovers(*folders: Path) -> list[str]:
-    return [str(file) for folder in folders for file in folder.rglob("*") if file.name.endswith(MARKS)]
-
-
-class Swept(NamedTuple):
-    """Of the runs with these numbers what a sweep left, after `kills` kills that met so many unfinished jobs."""
-
-    launcher: str
-    numbers: list[int]
-    found: list[dict]
-    code: int
-    kills: int
-    met: int
-    took: float
-
-
-def told(row: Row) -> Row:
-    print(f"[{time.strftime('%H:%M:%S')}] {row.what}: {row.found}{'' if row.met else '   <- NOT AS ASKED'}", flush=True)
-    return row
-
-
-# -------------------------------------------------------------------------------------------------------------------------- runs
-
-
-def by_themselves(sets: list[list[str]], folder: Path, common: list[str], workers: int, within: float,
-                  compiled: threading.Event) -> list[dict | None]:  # fmt: skip
-    """The runs, each in a process of its own, `workers` beside each other; their figures, None for one that would have begun after
-    `within` seconds. `compiled` is set once the first of each law is complete."""
-
-    began = time.perf_counter()
-
-    def one(k: int) -> dict | None:
-        if time.perf_counter() - began > within:
-            return None
-        code = started([*common, *sets[k], f"hydra.run.dir={folder}/{k}"], folder / f"{k}.log").wait(900)
-        return figures(folder / str(k)) if code == 0 else {"exit code": code}
-
-    # the first of each law first, alone with the kernels that it compiles
-    laws = [next(k for k, s in enumerate(sets) if s[0] == law) for law in sorted({s[0] for s in sets})]
-    with ThreadPoolExecutor(workers) as pool:
-        try:
-            found = dict(zip(laws, pool.map(one, laws)))
-        finally:  # whoever waits for it would wait for ever
-            compiled.set()
-        others = [k for k in range(len(sets)) if k not in found]
-        found |= dict(zip(others, pool.map(one, others)))
-    return [found[k] for k in range(len(sets))]
-
-
-def experiments(sets: list[list[str]], folder: Path) -> str:
-    """One experiment file per set: what a sweep goes through, as its override."""
-    conf = folder / "conf" / "experiment"
-    conf.mkdir(parents=True)
-    for k, overrides in enumerate(sets):
-        pairs = [override.split("=") for override in overrides]
-        groups = [f"  - override /{key}: {value}" for key, value in pairs if "." not in key and key != "seed"]
-        tree: dict = {}
-        for key, value in pairs:
-            if "." in key or key == "seed":
-                *path, last = key.split(".")
-                at = tree
-                for part in path:
-                    at = at.setdefault(part, {})
-                at[last] = json.loads(value)
-        lines = ["# @package _global_", "defaults:", *groups, *(f"{key}: {json.dumps(value)}" for key, value in tree.items())]
-        (conf / f"drawn_{k}.yaml").write_text("\n".join(lines) + "\n")
-    return "experiment=" + ",".join(f"drawn_{k}" for k in range(len(sets)))
-
-
-def killed_sweep(sets: list[list[str]], folder: Path, common: list[str], launcher: str, workers: int, kills: int,
-                 span: tuple[float, float], generator: random.Random) -> tuple[list[dict], int, int, int]:  # fmt: skip
-    """The same runs as a sweep, killed at most `kills` times and given again.
-
-    Returns (their figures, exit code of the last, kills, jobs that a kill met unfinished)."""
-    folder.mkdir()
-    sweep = ["-m", "--config-dir", str(folder / "conf"), *common, f"hydra/launcher={launcher}", "resume=auto",
-             *([f"hydra.launcher.n_jobs={workers}"] if launcher == "joblib" else []), experiments(sets, folder),
-             f"hydra.sweep.dir={folder}/sweep", "hydra.sweep.subdir=${hydra.job.num}"]  # fmt: skip
-    met = count = 0
-    while True:
-        process = started(sweep, folder / "sweep.log")
-        try:
-            code = process.wait(generator.uniform(*span) if count < kills else 1800)
-            break
-        except subprocess.TimeoutExpired:
-            done = len(list((folder / "sweep").glob("*/metrics.json")))
-            met, count = met + len(sets) - done, count + 1
-            # as when the machine goes down: submitit's jobs are no children of the process that launched them
-            for number in {process.pid, *processes_with(str(folder))}:
-                try:
-                    os.kill(number, signal.SIGKILL)
-                except ProcessLookupError:
-                    continue
-            process.wait()
-            time.sleep(0.5)
-            print(f"{launcher}: kill {count} with {done} of {len(sets)} jobs complete", flush=True)
-    return [figures(folder / "sweep" / str(k)) for k in range(len(sets))], code, count, met
-
-
-def runs(options: argparse.Namespace, folder: Path) -> list[Row]:
-    sets = drawn(options.runs, random.Random(options.seed))
-    common = [*SMALL, "simulation.particles=100", *options.smaller, f"scene.cache={folder}/cache"]
-    (folder / "alone").mkdir()
-    compiled = threading.Event()
-
-    def timed_alone() -> tuple[list[dict | None], float]:
-        began = time.perf_counter()
-        return by_themselves(sets, folder / "alone", common, options.workers, options.within, compiled), time.perf_counter() - began
-
-    def swept(launcher: str, count: int, kills: int) -> Swept:
-        compiled.wait()
-        # beside each other nobody knows yet which of the runs begin too late
-        numbers = [k for k in range(len(sets)) if options.abreast or alone.result()[0][k] is not None][:count]
-        began, generator = time.perf_counter(), random.Random(f"{options.seed} {launcher}")
-        found = killed_sweep([sets[k] for k in numbers], folder / launcher, common, launcher, options.workers, kills,
-                             tuple(options.between), generator)  # fmt: skip
-        return Swept(launcher, numbers, *found, time.perf_counter() - began)
-
-    sweeps = [sweep for sweep in (("joblib", len(sets), options.kills), ("submitit_local", options.launched, 1)) if sweep[1]]
-    with ThreadPoolExecutor(1 + len(sweeps) if options.abreast else 1) as pool:
-        alone = pool.submit(timed_alone)
-        jobs = [pool.submit(swept, *sweep) for sweep in sweeps]
-        (found, took), again = alone.result(), [job.result() for job in jobs]
-    complete = [k for k, each in enumerate(found) if each is not None]
-    wrong = [k for k in complete if "exit code" in found[k] or "metrics.json" in found[k]]
-    for k in wrong:
-        print(f"run {k} failed: {' '.join(sets[k])}: {(folder / 'alone' / f'{k}.log').read_text()[-1500:]}")
-    rows = [told(Row(f"drawn runs, {options.workers} beside each other", f"{options.runs}, all complete",
-                     f"{len(complete) - len(wrong)} of {len(complete)}, {took:.0f} s",
-                     not wrong and len(complete) == options.runs))]  # fmt: skip
-    rows += [against(sweep, sets, found, folder) for sweep in again]
-    time.sleep(2.0)  # for what ends by itself: joblib's trackers
-    alive, left = processes_with(str(folder)), leftovers(folder)
-    print("\n".join(left))
-    rows.append(told(Row("left behind by them", "nothing", f"{len(alive)} processes, {len(left)} half-written files or locks",
-                         not alive and not left)))  # fmt: skip
-    return rows
-
-
-def against(sweep: Swept, sets: list[list[str]], alone: list[dict | None], folder: Path) -> Row:
-    """A sweep's figures beside those of the same runs by themselves."""
-    differ = [k for k, found in zip(sweep.numbers, sweep.found) if alone[k] is not None and found != alone[k]]
-    for k, again in zip(sweep.numbers, sweep.found):
-        if k in differ:
-            names = sorted(name for name in {*alone[k], *again} if alone[k].get(name) != again.get(name))
-            print(f"run {k} differs: {' '.join(sets[k])}: {names[:8]}")
-    if sweep.code or differ:
-        print((folder / sweep.launcher / "sweep.log").read_text()[-3000:])
-    count = len(sweep.numbers)
-    what = f"the {'same' if count == len(sets) else f'first {count}'} as a sweep of {sweep.launcher}, killed and resumed"
-    asked = "0 differ, exit code 0" + (", a kill met some" if sweep.kills else "")
-    found = (f"{len(differ)} with figures that differ, exit code {sweep.code}, {sweep.kills} kills met {sweep.met} unfinished "
-             f"jobs, {sweep.took:.0f} s")  # fmt: skip
-    return told(Row(what, asked, found, not differ and sweep.code == 0 and (sweep.met > 0 or not sweep.kills)))
 
 
 # ---------------------------------------------------------------------------------------------------------------------- rollouts
@@ -526,11 +313,12 @@ def main() -> None:
     parser.add_argument("--device", default="cpu", help="of rollouts and equality: cpu | cuda")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--runs", type=int, default=4)
-    parser.add_argument("--within", type=float, default=1e9, help="seconds after which no further run begins; fewer runs fail")
+    parser.add_argument("--until", type=float, default=1e9, help="seconds after which the runs are stopped; fewer fail")
+    parser.add_argument("--record", type=Path, default=None, help="of the runs: where what was found is kept, to go on with it")
+    parser.add_argument("--portion", type=int, default=None, help="runs that are made and then swept; default: all")
     parser.add_argument("--smaller", nargs="+", default=[], metavar="KEY=VALUE", help="further overrides of the drawn runs")
     parser.add_argument("--workers", type=int, default=2, help="runs beside each other")
-    parser.add_argument("--abreast", action="store_true", help="the runs and the sweeps of them beside each other")
-    parser.add_argument("--kills", type=int, default=2, help="of joblib's sweep; submitit's is killed once")
+    parser.add_argument("--kills", type=int, default=2, help="of each of joblib's sweeps; submitit's is killed once")
     parser.add_argument("--between", type=float, nargs=2, default=(15.0, 60.0), help="seconds until a kill")
     parser.add_argument("--launched", type=int, default=2, help="of the runs, by submitit's local executor")
     parser.add_argument("--rollouts", type=int, default=400)
