@@ -120,6 +120,7 @@ class Record:
 
     def __init__(self, path: Path | None, of: dict) -> None:
         self.path, self.lock, self.version = path, threading.Lock(), version()
+        self.seconds: list[float] = []  # of runs by themselves, this call's
         self.content: dict = {"of": of, "figures": {}, "sweeps": [], "left": []}
         if path is not None and path.is_file():
             self.content = json.loads(path.read_text())
@@ -177,7 +178,7 @@ def by_themselves(sets: list[list[str]], numbers: list[int], folder: Path, commo
     def one(k: int) -> None:
         if time.perf_counter() > until:
             return
-        log = folder / f"{k}.log"
+        log, began = folder / f"{k}.log", time.perf_counter()
         process = started([*common, *sets[k], f"hydra.run.dir={folder}/{k}"], log)
         try:
             code = process.wait(max(0.0, min(900.0, until - time.perf_counter())))
@@ -187,6 +188,7 @@ def by_themselves(sets: list[list[str]], numbers: list[int], folder: Path, commo
             return
         if code:
             print(f"run {k} failed: {' '.join(sets[k])}: {log.read_text()[-1500:]}", flush=True)
+        record.seconds.append(time.perf_counter() - began)
         record.put("alone", k, {"exit code": code} if code else figures(folder / str(k)))
 
     # the first of each law first, alone with the kernels that it compiles
@@ -283,12 +285,15 @@ def runs(options: argparse.Namespace, folder: Path) -> list[Row]:
         # the one whose runs by themselves are there
         launcher = min((kind for kind in SWEEPS if missing[kind]),
                        key=lambda kind: len(set(missing[kind]) - set(record.of_kind("alone"))))  # fmt: skip
-        numbers = missing[launcher][:portion]
+        # submitit's local executor starts all of its jobs at once
+        numbers = missing[launcher][: portion if launcher == "joblib" else min(portion, options.workers)]
         by_themselves(sets, [k for k in numbers if k not in record.of_kind("alone")], folder / "alone", common, options.workers,
                       until, record)  # fmt: skip
         numbers = [k for k in numbers if k in record.of_kind("alone")]
         if numbers and time.perf_counter() < until:
-            kills = Kills(options.kills if launcher == "joblib" else 1, tuple(options.between), generator)
+            kills = Kills(options.kills, tuple(options.between), generator)
+            if launcher == "submitit_local" and record.seconds:  # and so is at its end when one run is
+                kills = Kills(1, (0.3 * min(record.seconds), 0.9 * min(record.seconds)), generator)
             killed_sweep(sets, numbers, folder / f"{launcher}_{place}", common, launcher, options.workers, kills, until,
                          record)  # fmt: skip
         place += 1
