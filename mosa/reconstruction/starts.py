@@ -71,9 +71,9 @@ def sequence_start(body: Body, appearance: Appearance, scene: Scene, *, register
     """Pose and velocity of `scene`. register: find the pose by rendering (held-out sequences), in the light that it shows; else the
     rest shape's own. appearance: at rest, of `appearance_of`.
 
-    The free frames are found on the way: a velocity from the first two frames predicts the contact, the frames before it give
-    the final one. Where that one puts the contact earlier, into the frames it was fitted to, they are fewer: no velocity is kept
-    that frames after its own contact went into. Errors: DataError where contact comes before the second frame.
+    The free frames are found on the way: a rough velocity from the first two frames predicts the contact, the frames before it
+    give the final one. Where that one puts the contact earlier, into the frames it was fitted to, they are fewer: no velocity is
+    kept that frames after its own contact went into. Errors: DataError where contact comes before the second frame.
     """
     cameras = scene.training_cameras
     images, mattes = scene.images[cameras], scene.mattes[cameras]
@@ -87,16 +87,19 @@ def sequence_start(body: Body, appearance: Appearance, scene: Scene, *, register
         lit = shading(light, appearance.normals.to(light), rotation)
         splats = replace(splats, colors=splats.colors * lit.to(splats.colors)[:, None])
     start = Start(rotation.to(body.rest), center.to(body.rest), torch.zeros(3).to(body.rest), torch.zeros(3).to(body.rest))
-    count, most = 2, MOST_FRAMES
+    count, most, exact = 2, MOST_FRAMES, False
     while True:
         velocity, spin = initial_velocity(splats, (rotation, center), images[:, :count], mattes[:, :count], views,
                                           times=scene.times[:count], gravity=scene.gravity, background=scene.background,
-                                          rest_center=body.center)
+                                          rest_center=body.center, exact=exact)
         start = Start(start.rotation, start.center, velocity.to(body.rest), spin.to(body.rest))
         free = first_contact(body, start, scene)
-        if free < 2:
+        if free < 2 and exact:
             raise DataError(f"{scene.name}/{scene.sequence}: the object touches the ground before the second frame; at least two "
                             "frames of free flight are needed (scene.frames, scene.last_free_frame)")
+        if not exact:
+            count, exact = max(2, min(free, most)), True
+            continue
         if free < count:
             most = count - 1  # so that the loop ends
         elif count == min(free, most):
