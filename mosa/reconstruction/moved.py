@@ -20,7 +20,7 @@ from mosa.reconstruction.informed import informed_motion
 from mosa.reconstruction.modes import deformation_modes
 from mosa.reconstruction.motion import MotionSample
 from mosa.reconstruction.observed import Windows, object_windows
-from mosa.reconstruction.response import MODES, Response, image_matrices, response_of
+from mosa.reconstruction.response import MODES, UNEXPLAINED, Response, image_matrices, response_of
 from mosa.reconstruction.settings import ReconstructionSettings
 from mosa.rendering.carrying import bind
 from mosa.rendering.covariance import carried_covariance
@@ -30,9 +30,6 @@ from mosa.threads import threaded
 from mosa.types import MotionCues, Reconstruction, Scene, Splats
 
 log = logging.getLogger(__name__)
-
-UNEXPLAINED = 0.9
-"""A response that leaves more than so much of what it is measured on unexplained says nothing, and cues count as they are."""
 
 
 class MovingParts:
