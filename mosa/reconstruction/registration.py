@@ -304,7 +304,7 @@ def fit_flight(
         cost, gradient, matrix = normal_equations(body, level, poses, background, frame, central=central)
         J = flight_jacobian(trial, times, body.radius)
         new = (
-            cost.mean(),
+            cost.sum(),
             (J.transpose(1, 2) @ gradient[..., None]).sum(0)[:, 0],
             (J.transpose(1, 2) @ matrix @ J).sum(0),
         )

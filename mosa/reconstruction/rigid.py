@@ -157,25 +157,33 @@ def huber(residual: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(size < HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER)), HUBER / size.clamp(min=HUBER)
 
 
-def normal_equations(
-    body: RigidBody, level: Level, poses: Poses, background: Tensor, frame: Tensor, *, central: bool = True
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Cost (K,), gradient (K, 6) and Gauss-Newton matrix (K, 6, 6) of K poses against the frames (K,) of the level.
+def pose_columns(body: RigidBody, level: Level, poses: Poses, background: Tensor, *, central: bool) -> tuple[Tensor, Tensor]:
+    """What K poses look like, (K, P), and its derivative (K, 6, P) in their numbers: shift, then angle times the body's radius [m].
 
-    Parameters in metres: shift, then angle times the body's radius. One-sided differences (`central` false) cost half
-    and move the optimum a little: good enough on the way, not at the end.
-    """
+    One-sided differences (`central` false) cost half and move the optimum a little: good enough on the way, not at the end."""
     count, h = len(poses.center), STEP_PX * level.pixel
     sides = (torch.zeros(1, 6), torch.eye(6), -torch.eye(6))[: 3 if central else 2]
     steps = h * torch.cat(sides).to(poses.center)
     shift, angle = steps[:, :3].repeat(count, 1), steps[:, 3:].repeat(count, 1) / body.radius
     around = Poses(poses.rotation.repeat_interleave(len(steps), 0), poses.center.repeat_interleave(len(steps), 0))
     seen = body.render(around.moved(shift, angle), level.cameras, background).view(count, len(steps), -1)
-    residual = seen[:, 0] - level.target[frame].reshape(count, -1)
-    J = (seen[:, 1:7] - seen[:, 7:]) / (2 * h) if central else (seen[:, 1:] - seen[:, :1]) / h
+    return seen[:, 0], (seen[:, 1:7] - seen[:, 7:]) / (2 * h) if central else (seen[:, 1:] - seen[:, :1]) / h
+
+
+def equations(residual: Tensor, columns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Cost (K,), gradient (K, D) and Gauss-Newton matrix (K, D, D) of residuals (K, P) with derivatives (K, D, P), each residual
+    weighted by Huber's rule."""
     cost, weight = huber(residual)
-    weighted = J * weight[:, None]
-    return cost.mean(-1), (weighted @ residual[..., None])[..., 0], weighted @ J.transpose(1, 2)
+    weighted = columns * weight[:, None]
+    return cost.sum(-1), (weighted @ residual[..., None])[..., 0], weighted @ columns.transpose(1, 2)
+
+
+def normal_equations(
+    body: RigidBody, level: Level, poses: Poses, background: Tensor, frame: Tensor, *, central: bool = True
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`equations` of K poses against the frames (K,) of the level, in the numbers of `pose_columns`."""
+    seen, columns = pose_columns(body, level, poses, background, central=central)
+    return equations(seen - level.target[frame].flatten(1), columns)
 
 
 def damped(gradient: Tensor, matrix: Tensor, damping: Tensor) -> Tensor:
@@ -204,19 +212,12 @@ def lit_equations(
     body: RigidBody, level: Level, pose: Poses, light: Tensor, before: Tensor, columns: Tensor, background: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Cost (), gradient (14,) and Gauss-Newton matrix (14, 14) of one pose and a light (8,) against the level's first frame; the
-    pose's numbers as of `normal_equations`. before: (8,) what the ridge pulls to; columns: of `light_columns`, near by."""
-    shaded = body.shaded(pose.rotation[0], light)
-    h = STEP_PX * level.pixel
-    steps = h * torch.cat((torch.zeros(1, 6), torch.eye(6), -torch.eye(6))).to(light)
-    around = Poses(pose.rotation.expand(13, 3, 3), pose.center.expand(13, 3))
+    pose's numbers as of `pose_columns`. before: (8,) what the ridge pulls to; columns: of `light_columns`, near by."""
     # the colours turn with the light's own columns alone: a pose's columns know its geometry
-    seen = shaded.render(around.moved(steps[:, :3], steps[:, 3:] / body.radius), level.cameras, background).flatten(1)
-    residual = seen[0] - level.target[0].flatten()
-    J = torch.cat(((seen[1:7] - seen[7:]) / (2 * h), columns))
-    cost, weight = huber(residual)
-    weighted = J * weight
-    matrix, gradient = weighted @ J.T, weighted @ residual
+    seen, moved = pose_columns(body.shaded(pose.rotation[0], light), level, pose, background, central=True)
+    every = torch.cat((moved, columns[None]), 1)
+    cost, gradient, matrix = (found[0] for found in equations(seen - level.target[:1].flatten(1), every))
     ridge = LIGHT_RIDGE * matrix.diagonal()[6:].mean()
     matrix[6:, 6:] += ridge * torch.eye(LIGHT).to(light)
     gradient[6:] += ridge * (light - before)
-    return cost.sum() + 0.5 * ridge * (light - before).square().sum(), gradient, matrix
+    return cost + 0.5 * ridge * (light - before).square().sum(), gradient, matrix
