@@ -64,7 +64,7 @@ class Scale:
 
 
 @dataclass(frozen=True)
-class Carried:
+class ShownSplats:
     """M splats that a body's particles carry, over T frames: centers (T, M, 3) [m], covariances (T, M, 3, 3) [m^2], colors
     (T, M, 3) in [0, 1], in the light of each frame."""
 
@@ -74,12 +74,12 @@ class Carried:
 
 
 @dataclass(frozen=True)
-class Motion:
+class ShownMotion:
     """N particles over T frames: centers (T, N, 3) [m], covariances (T, N, 3, 3) [m^2]; carried: the splats that they carry."""
 
     centers: np.ndarray
     covariances: np.ndarray
-    carried: Carried | None = None
+    carried: ShownSplats | None = None
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class Clip:
 
     name: str
     times: np.ndarray
-    bodies: dict[str, Motion]
+    bodies: dict[str, ShownMotion]
     appearance: np.ndarray
     opacities: np.ndarray
     factor: np.ndarray
@@ -103,7 +103,7 @@ class Clip:
     splat_particles: np.ndarray | None = None
 
     @property
-    def learned(self) -> Motion:
+    def learned(self) -> ShownMotion:
         return self.bodies["learned"]
 
     @property
@@ -252,7 +252,7 @@ def read_run(folder: str | Path, checkpoint: str | Path | None = None) -> list[C
                                 f"{shape[0]} frames, found {particles} in {frames}; all files must be of one run")
             check_motion(stored, name, paths[kind], ("F_tot", "covariances"))
             x = stored[f"{name}/x"]
-            bodies[kind] = Motion(x, covariances(stored, name, body), carried_by(body, x))
+            bodies[kind] = ShownMotion(x, covariances(stored, name, body), carried_by(body, x))
         clips.append(Clip(name, rollouts[f"{name}/times"], bodies, body.colors.clamp(0, 1).numpy(), body.opacities.numpy(),
                           body.factor.numpy(), body.world, spread_of(spreads, name, shape, folder / "uncertainty.npz"),
                           **splat_keys(body)))  # fmt: skip
@@ -273,12 +273,12 @@ def shown_body(folder: Path, checkpoint: str | Path | None) -> ShownBody:
     return ShownBody.of(twin.body, twin.world)
 
 
-def carried_by(body: ShownBody, x: np.ndarray) -> Carried | None:
+def carried_by(body: ShownBody, x: np.ndarray) -> ShownSplats | None:
     """The body's splats with its particles at (T, N, 3) [m]; None where it has none."""
     if body.splats is None:
         return None
     shown = seen(body, torch.from_numpy(x).to(body.rest), None)
-    return Carried(*(value.numpy() for value in (shown.means, shown.covariances, shown.colors())))
+    return ShownSplats(*(value.numpy() for value in (shown.means, shown.covariances, shown.colors())))
 
 
 def splat_keys(body: ShownBody) -> dict[str, np.ndarray]:

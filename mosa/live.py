@@ -38,7 +38,7 @@ STEPS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
 
 
 @dataclass(frozen=True)
-class Drop:
+class Release:
     """How the body is let go. height [m]: of its lowest point above the ground; tilt [degrees] towards `heading` [degrees], which
     turns from the first view's right about the vertical; spin [turns/s] in the sense of the tilt; speed [m/s] along the heading."""
 
@@ -77,7 +77,7 @@ class Live:
         begun = twin.training_start
         Q, middle = begun.rotation.double().cpu().numpy(), begun.center.double().cpu().numpy()
         low = float(((self.arms @ Q.T + middle) @ self.up).min()) - self.ground
-        self.drop_as = Drop(height=min(max(low, 0.0), self.highest))
+        self.drop_as = Release(height=min(max(low, 0.0), self.highest))
         self.middle = middle
         self.running, self.uncertain, self.message = False, False, ""
         self.state: TwinState | None = None
@@ -88,13 +88,13 @@ class Live:
         self.target = self.home()
         self.begin(self.drop_as)
 
-    def axes(self, drop: Drop) -> tuple[np.ndarray, np.ndarray]:
+    def axes(self, drop: Release) -> tuple[np.ndarray, np.ndarray]:
         """((3,) heading, (3,) axis of tilt and spin): unit vectors."""
         side, angle = np.cross(self.up, self.across), math.radians(drop.heading)
         heading = math.cos(angle) * self.across + math.sin(angle) * side
         return heading, np.cross(self.up, heading)
 
-    def start(self, drop: Drop) -> dict:
+    def start(self, drop: Release) -> dict:
         """What `Twin.reset` takes."""
         heading, axis = self.axes(drop)
         return {
@@ -109,7 +109,7 @@ class Live:
         beside = self.middle - (self.middle @ self.up) * self.up - away * self.across
         return beside + (self.ground + max(1.1 * self.radius, 0.3 * self.size)) * self.up
 
-    def begin(self, drop: Drop) -> bool:
+    def begin(self, drop: Release) -> bool:
         """Let the body go from `drop`, at rest in time until `running`; whether it could be. The ball begins at its target, or at
         home where the body is."""
         self.message, self.running, self.others, self.spread, self.force = "", False, None, None, np.zeros(3)

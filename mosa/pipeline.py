@@ -47,7 +47,7 @@ from mosa.whole_files import write_whole
 log = logging.getLogger(__name__)
 
 
-class Clock:
+class StageTimes:
     """Wall time per stage, into `time/<stage>_s`. costs: of what is still to come, once that can be said."""
 
     def __init__(self) -> None:
@@ -70,7 +70,7 @@ def train(cfg: DictConfig) -> float | None:
     chosen(plain(cfg.logger))
     L.seed_everything(cfg.seed, verbose=False)
     exact_sums.use(cfg.deterministic)
-    clock, folder = Clock(), run_folder()
+    clock, folder = StageTimes(), run_folder()
     log.info("mosa %s: %s", __version__, " ".join(HydraConfig.get().overrides.task))
     if (done := finished(cfg, folder)) is not None:
         log.info("skipped: %s has its metrics.json (resume=auto)", folder)

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 from torch import Tensor
-
-if TYPE_CHECKING:
-    from mosa.reconstruction.moved import MovingParts
 
 
 @dataclass(frozen=True)
@@ -159,7 +156,8 @@ class Reconstruction:
     """Particles P_0 with their appearance at frame 0 and the motion cues. spacing [m]; volume: (N,) [m^3] initial volume;
     static: Gaussians of the static stage, which carry the images where other sequences of the body are followed; geometry: figures
     of the body that was filled (`mosa.reconstruction.geometry`); appearance: splats at frame 0 that the particles' motion carries
-    (`mosa.reconstruction.carried`); moving: what its motion was fitted with, for the second look at it."""
+    (`mosa.reconstruction.carried`); moving: what its motion was fitted with (`mosa.reconstruction.moved.MovingParts`), for the
+    second look at it."""
 
     splats: Splats
     spacing: float
@@ -168,7 +166,7 @@ class Reconstruction:
     static: Splats | None = None
     geometry: dict[str, float] = field(default_factory=dict)
     appearance: Appearance | None = None
-    moving: MovingParts | None = field(default=None, repr=False, compare=False)
+    moving: Any = field(default=None, repr=False, compare=False)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -17,13 +16,11 @@ from torch import Tensor
 
 from mosa.data.splats import save_ply
 from mosa.errors import ConfigError, DataError
+from mosa.modules.carried_splats import Seen
 from mosa.rendering.covariance import scales_and_rotations
 from mosa.rendering.spherical_harmonics import Y0, degree_of, mean_colors, rotated
 from mosa.types import Appearance, Splats
 from mosa.whole_files import written_whole
-
-if TYPE_CHECKING:
-    from mosa.modules.carried_splats import Seen
 
 FORMATS = ("ply", "splat", "spz", "usd")
 SPLAT = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])

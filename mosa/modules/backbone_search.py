@@ -5,16 +5,13 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.modules.body import Body
 from mosa.modules.material import FORMS, STIFFNESS
-
-if TYPE_CHECKING:
-    from mosa.modules.identification import Identification
 
 STIFFNESS_STEPS = (0.3, 0.6, 1.0, 1.5, 2.2, 3.2, 4.5, 7.0)
 POISSON_STEPS = (0.2, 0.32, 0.42)
@@ -27,6 +24,21 @@ STRIDES = {"E": 1.1, "mu": 1.1, "kappa": 1.1, "yield_stress": 1.1, "viscosity": 
 range and 17 degrees in that of the angle's."""
 FINEST = 0.2
 """Of the first steps: there a compass search ends, and Gauss-Newton goes on."""
+
+
+class Calibration(Protocol):
+    """What is asked of the identification (`identification.py`) whose start is sought."""
+
+    body: Body
+
+    def search(self) -> float:
+        """`search` of it."""
+
+    def iterate(self) -> dict[str, float]:
+        """One iteration of Gauss-Newton."""
+
+    def distance(self) -> float:
+        """Mean distance [m] of free rollouts from the cues."""
 
 
 def compass(at: Callable[[dict[str, float]], float], row: dict[str, float], strides: dict[str, float]) -> dict[str, float]:
@@ -47,7 +59,7 @@ def compass(at: Callable[[dict[str, float]], float], row: dict[str, float], stri
     return row
 
 
-def search(calibration: Identification) -> float:
+def search(calibration: Calibration) -> float:
     """Start a calibration near the smallest mean distance [m] of free rollouts from the cues, which is returned.
 
     The best of a coarse grid of stiffness and Poisson number, which goes on where its best is at an end of the stiffness; then,
@@ -101,7 +113,7 @@ TRIED = 4
 """Iterations after which candidates for the backbone are compared: from the best start of the grid they hardly move later."""
 
 
-def choose_law(body: Body, candidates: Sequence[str], build: Callable[[], Identification]) -> dict[str, float]:
+def choose_law(body: Body, candidates: Sequence[str], build: Callable[[], Calibration]) -> dict[str, float]:
     """Calibrate every candidate and leave `body` at the one with the smallest mean distance from the cues, which is returned for
     each [m], infinite where a law cannot be simulated. build: a calibration of `body`. Errors: SimulationDiverged where none can.
     """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -16,10 +16,6 @@ from mosa.rendering.lighting import LIGHT, shading
 from mosa.rendering.rasterizer import rasterize
 from mosa.rendering.spherical_harmonics import camera_centers, colors_in, constant_coefficients, mean_colors
 from mosa.types import Appearance, Cameras, Splats
-
-if TYPE_CHECKING:
-    from mosa.modules.body import Body
-    from mosa.shown_body import ShownBody
 
 COLORED = ("harmonics", "normals", "light")
 
@@ -109,7 +105,17 @@ class Seen:
         return (constant * shades[..., None]).clamp(0, 1)
 
 
-def seen(body: Body | ShownBody, positions: Tensor, F_tot: Tensor | None) -> Seen:
+class HasAppearance(Protocol):
+    """A body (`body.py`), or one that is only shown (`mosa/shown_body.py`). splats: None where particles are what is seen of it;
+    covariances: (N, 3, 3) [m^2], opacities: (N,), colors: (N, 3) of its particles."""
+
+    splats: CarriedSplats | None
+    covariances: Tensor
+    opacities: Tensor
+    colors: Tensor
+
+
+def seen(body: HasAppearance, positions: Tensor, F_tot: Tensor | None) -> Seen:
     """The body's splats where its particles are at positions (T, N, 3) [m]; where it has none the particles, deformed by F_tot
     (T, N, 3, 3), which splats do not need."""
     splats = body.splats

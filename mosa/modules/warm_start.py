@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
+from mosa.modules.adapter_base import Adapter
 from mosa.physics.engine.adapter_interface import MaterialState
-
-if TYPE_CHECKING:  # which calls this
-    from mosa.modules.adapter import StressAdapter
 
 SMALLEST_STRAIN = 1e-3
 
@@ -27,7 +24,7 @@ def drawn_stretches(count: int, largest: float, generator: torch.Generator) -> T
 
 @torch.no_grad()
 def warm_start(
-    adapter: StressAdapter,
+    adapter: Adapter,
     states: Callable[[Tensor], MaterialState],
     *,
     strain: float = 0.3,
@@ -36,8 +33,9 @@ def warm_start(
 ) -> float:
     """Fit the last layer of Phi to the prior's stress over random Hencky strains up to `strain`; (relative RMS error left).
 
-    states: of `mosa.modules.material.material_states`. Linear least squares of relative errors, so that the stiffness at
-    rest counts as much as that at large strain, with L_pre(0, 0) = 0. To be called after `switch_on`, before any training.
+    adapter: a `StressAdapter`, which calls this; states: of `mosa.modules.material.material_states`. Linear least squares of
+    relative errors, so that the stiffness at rest counts as much as that at large strain, with L_pre(0, 0) = 0. To be called after
+    `switch_on`, before any training.
     Errors: ConfigError for an adapter that has the prior stress or no E_ref.
     """
     if not adapter.operator.no_prior_stress:

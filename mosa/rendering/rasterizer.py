@@ -1,4 +1,4 @@
-"""Differentiable rasterisation of 3D Gaussians: one call for both backends, and depth.
+"""Differentiable rasterisation of 3D Gaussians: one call for both backends.
 
 `warp` (mosa/rendering/splatting.py) runs everywhere in float32 and float64; `gsplat` (gsplat_backend.py) is a
 CUDA package that one may choose instead.
@@ -132,45 +132,3 @@ def rasterize(
 
 def _over(image: Tensor, alpha: Tensor, background: Tensor | None) -> Tensor:
     return image if background is None else image + (1 - alpha)[..., None] * background.to(image)
-
-
-def depth_channel(means: Tensor, cameras: Cameras, state_index: Tensor) -> Tensor:
-    """Depth of every Gaussian's centre along the line of sight of every image as a feature (B, N, 1) [m]."""
-    w2c = cameras.w2c.to(means)
-    return (means[state_index] * w2c[:, None, 2, :3]).sum(-1, keepdim=True) + w2c[:, None, 2, 3:]
-
-
-def rasterize_with_depth(
-    means: Tensor,
-    covariances: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    cameras: Cameras,
-    state_index: Tensor,
-    background: Tensor | None = None,
-    preset: str = "gsplat",
-    *,
-    backend: str | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """`rasterize` with depth in the same pass: image (B, H, W, C), alpha (B, H, W), depth sum_i w_i z_i (B, H, W) [m].
-
-    Depth over alpha is the expected depth. Gradients and errors as of `rasterize`; depth has gradients to means,
-    covariances, opacities and cameras.
-    """
-    depths = depth_channel(means, cameras, state_index)
-    stacked = torch.cat((features.expand(len(cameras), -1, -1), depths), -1)
-    image, alpha = rasterize(means, covariances, opacities, stacked, cameras, state_index, preset=preset, backend=backend)
-    return _over(image[..., :-1], alpha, background), alpha, image[..., -1]
-
-
-def expected_depth(
-    means: Tensor, covariances: Tensor, opacities: Tensor, cameras: Cameras, state_index: Tensor, preset: str = "gsplat"
-) -> tuple[Tensor, Tensor]:
-    """Mean depth sum_i w_i z_i / alpha [m] per pixel, infinite where nothing is seen, and alpha; both (B, H, W).
-
-    Gradients to means, covariances, opacities and cameras where something is seen.
-    """
-    depths = depth_channel(means, cameras, state_index)
-    image, alpha = rasterize(means, covariances, opacities, depths, cameras, state_index, preset=preset)
-    seen = alpha > 0
-    return torch.where(seen, image[..., 0] / torch.where(seen, alpha, torch.ones_like(alpha)), torch.inf), alpha

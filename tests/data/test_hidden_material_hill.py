@@ -5,13 +5,14 @@ import math
 import pytest
 import torch
 
-from mosa.data.builtin.hill import COEFFICIENTS, HILL, HillMaterial
+from mosa.data.builtin.hill import COEFFICIENTS, HILL
 from mosa.errors import ConfigError
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.reference import deviator, hencky_material, polar
 from mosa.types import Ground, ParticleState
 
 from .anisotropic_states import check_gradients, drawn_rotations, drawn_states, mapped, stress
+from .hill_material import HillMaterial
 
 AXES = drawn_rotations(1, 31)[0]
 CLAY = HillMaterial(E=8.0, nu=0.3, yield_stress=0.8, coefficients=(0.6, 1.5, 2.2, 0.7, 1.9, 0.5), axes=AXES)

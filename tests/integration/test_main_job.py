@@ -28,6 +28,8 @@ from mosa.types import Ground
 
 ROOT = Path(__file__).parents[2]
 FIGURES = (ROOT / "docs" / "figures.md").read_text()
+FEW_FIGURES = ["evaluation.video=false", "evaluation.floor=false", "evaluation.samples=256", "evaluation.assignment=64"]
+"""Of runs whose fit is looked at, and not what comes after it."""
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +62,7 @@ def stepped(tmp_path_factory, cache):
     """A run of Adam in all stages, with steps of two cells of the contact offset."""
     folder = tmp_path_factory.mktemp("stepped")
     adam = [f"+fit.{stage}.optimizer=adam" for stage in ("prior", "prior_eta", "joint")]
-    result = call("train.py", folder, cache, *adam, "fit.prior.lr_contact=2", "logger=[tensorboard,csv]", "evaluation.video=false")
+    result = call("train.py", folder, cache, *adam, "fit.prior.lr_contact=2", "logger=[tensorboard,csv]", *FEW_FIGURES)
     assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
     return folder
 
@@ -206,7 +208,7 @@ def test_a_killed_run_resumes_bit_for_bit(run, cache, tmp_path):
     finally:
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
-    result = call("train.py", tmp_path / "resumed", cache, f"ckpt_path={checkpoint}")
+    result = call("train.py", tmp_path / "resumed", cache, f"ckpt_path={checkpoint}", *FEW_FIGURES)
     assert result.returncode == 0, result.stderr[-3000:]
     whole = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
     resumed = torch.load(tmp_path / "resumed" / "checkpoints" / "last.ckpt", weights_only=True)

@@ -55,7 +55,7 @@ def run(cache, folder, script, *overrides):
 
 def test_what_is_learned_from_is_not_held_out(cache, tmp_path):
     result = run(cache, tmp_path / "run", "train.py", "debug=default", f"scene.cache={cache}", "scene.also_train=[test_60]",
-                 "evaluation.video=false")
+                 "evaluation.video=false", "evaluation.floor=false", "reconstruction.informed.iterations=0")
     assert result.returncode == 0, result.stderr[-3000:]
     figures = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert "train/test_60/rms_m" in figures and "test/test_60/rms_m" not in figures

@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from depth import expected_depth, rasterize_with_depth
 from drawn_splats import CASES, NAMES, draw, objective, render, slopes
 
 from mosa.rendering.covariance import covariance_from
-from mosa.rendering.rasterizer import expected_depth, rasterize, rasterize_with_depth
+from mosa.rendering.rasterizer import rasterize
 from mosa.rendering.reference import rasterize_reference
 from mosa.rendering.spherical_harmonics import view_colors
 

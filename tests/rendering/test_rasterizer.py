@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from depth import expected_depth
 from drawn_splats import CASES, NAMES, dense, draw, edge, gradients, objective, render, ring, slopes
 
 from mosa.errors import ConfigError, DataError
-from mosa.rendering.rasterizer import expected_depth, rasterize
+from mosa.rendering.rasterizer import rasterize
 from mosa.rendering.reference import alphas, rasterize_reference, visible_covariance
 
 

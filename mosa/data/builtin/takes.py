@@ -34,7 +34,7 @@ TRUTH_PARTICLES = 8000
 
 
 @dataclass(frozen=True)
-class Take:
+class Film:
     """A filmed sequence. pictures: (V, T, H, W, 4) uint8, straight alpha; rest: (M, 3), positions: (T, M, 3) [m] of at most
     8000 of the truth's particles; rotation: (3, 3); velocity: (3,) [m/s]."""
 
@@ -79,7 +79,7 @@ def make(
     seed: int = 0,
     cache: str | Path | None = None,
     progress: bool = True,
-) -> Take:
+) -> Film:
     """The take of a sequence, from the cache folder where it lies there. Equal arguments give equal bytes.
 
     Errors: ConfigError for an unknown name, sequence or material, or a cache folder that cannot be written.
@@ -108,7 +108,7 @@ def built(shape_name: str, pitch: float, spacing: float, seed: int) -> tuple[Sur
     return surface, particles, bind(surface.vertices, particles, spacing)
 
 
-def film_drop(name: str, sequence: str, material: str, seed: int, progress: bool) -> Take:
+def film_drop(name: str, sequence: str, material: str, seed: int, progress: bool) -> Film:
     """Simulate and film, without the cache."""
     body, drop = OBJECTS[name], drop_named(name, sequence)
     film = body.footage
@@ -137,20 +137,20 @@ def film_drop(name: str, sequence: str, material: str, seed: int, progress: bool
             pictures.append(picture)
             bar.update()
     chosen = np.sort(np.random.default_rng([seed, 3]).permutation(len(particles))[:TRUTH_PARTICLES])
-    return Take(
+    return Film(
         np.stack(pictures, 1), fall.rest[chosen].astype(np.float32), fall.positions[:, chosen].astype(np.float32),
         fall.rotation,
         fall.velocity,
     )  # fmt: skip
 
 
-def read_take(file: Path) -> Take | None:
+def read_take(file: Path) -> Film | None:
     """A cached take, or None where there is none or a damaged one, which is then made again."""
     if not file.is_file():
         return None
     try:
         stored = read_npz(file)
-        take = Take(*(stored[n] for n in ("pictures", "rest", "positions", "rotation", "velocity")))
+        take = Film(*(stored[n] for n in ("pictures", "rest", "positions", "rotation", "velocity")))
         shapes = take.pictures.shape[1:2] + take.rest.shape, take.positions.shape
         if take.pictures.ndim != 5 or shapes[0] != shapes[1] or take.rotation.shape != (3, 3) or take.velocity.shape != (3,):
             raise DataError(f"{file}: not a film of a built-in scene")
@@ -160,7 +160,7 @@ def read_take(file: Path) -> Take | None:
         return None
 
 
-def write_take(file: Path, take: Take) -> None:
+def write_take(file: Path, take: Film) -> None:
     """Write atomically: a process that is stopped leaves no half file, two that write at once leave one whole."""
     file.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(file) as partial, open(partial, "wb") as stream:

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import Protocol
 
-if TYPE_CHECKING:
-    from mosa.physics.engine.adapter_chain import Chain
-    from mosa.physics.engine.workspace import Workspace
+from mosa.physics.engine.workspace import Workspace
+
+
+class HasWorkspaces(Protocol):
+    """A chain (`adapter_chain`), as its owner sees it. light, full: without and with buffers for the adjoint, None until made."""
+
+    light: Workspace | None
+    full: Workspace | None
 
 
 class Buffers:
@@ -19,7 +24,7 @@ class Buffers:
 
     def __init__(self) -> None:
         self.ran: set[tuple] = set()
-        self.chains: dict[tuple, Chain] = {}
+        self.chains: dict[tuple, HasWorkspaces] = {}
         self.probes: dict[tuple, tuple[bool, int]] = {}
         self._pools: list[dict[tuple, Workspace]] = [{}]
 

@@ -28,12 +28,11 @@ from mosa.physics.engine.segment import HeldSegment, advance_segment
 from mosa.physics.engine.solver import LeftWindow
 from mosa.types import ParticleState
 
-LONGEST = 256
-"""Most substeps of a segment of which no gradient is wanted, on CUDA: each segment costs a look at the host."""
-LONGEST_KEPT = 96
-"""The same where a gradient is wanted and all states are kept; its buffers hold those of a segment once more."""
 AHEAD = 256
-"""Most substeps, of whole frames, that are launched before the host looks at them, on CUDA: what fails is done again."""
+"""Most substeps that are launched before the host looks at them, on CUDA: of a segment of which no gradient is wanted, and of whole
+frames. What fails is done again."""
+LONGEST_KEPT = 96
+"""Most of a segment where a gradient is wanted and all states are kept; its buffers hold those of a segment once more."""
 
 
 @dataclass
@@ -95,7 +94,7 @@ class Prepared:
         if self.chains is not None:
             self.chains.begin(state, substeps, self.stride, wanted)
         elif self.gathers and not variable and not wanted:
-            self.most_alone = LONGEST
+            self.most_alone = AHEAD
         elif self.gathers and not variable and self.lanes.room:
             self.most_alone = max(SEGMENT, min(LONGEST_KEPT, substeps // 8))
 

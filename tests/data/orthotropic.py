@@ -1,4 +1,5 @@
-"""An orthotropic truth: stress linear in the stretch, in axes fixed to the material. For reference data; not a learner's prior."""
+"""An orthotropic law: stress linear in the stretch, in axes fixed to the material. Here to check the
+kinematics and the engine with a law that no scene has."""
 
 # ruff: noqa: RUF059
 # (Warp: results are unpacked whole)
