@@ -6,12 +6,13 @@
     python benchmarks/robustness.py --runs              # and whole processes: exit codes, a sweep of failures (minutes)
     python benchmarks/robustness.py --only habits_keys,habits_running  # how people type, and machines are (minutes each)
     python benchmarks/robustness.py --only afresh_keys,afresh_running  # values and files that are something else (half an hour)
+    python benchmarks/robustness.py --only films_again  # light, exposure, cameras, films of something else (a quarter of an hour)
     python benchmarks/robustness.py --only running      # kills, disks, screens, folders, limits (a quarter of an hour or more)
 
 Each attack ends in one clear message (a MosaError of one line), in a traceback, in a hang (over 60 s), or it runs. What runs is
 listed: those are the attacks that the program has no word against. The attacks are in attacks_on_files.py, attacks_on_calls.py,
 attacks_on_data.py, attacks_on_meaning.py, attacks_of_habit.py, attacks_afresh.py, attacks_afresh_running.py,
-attacks_on_running.py and attacks_on_cuda.py.
+attacks_on_running.py, attacks_on_films.py and attacks_on_cuda.py.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ import attacks_on_calls as calls
 import attacks_on_data as data
 import attacks_on_files as files
 from attacks_on_cuda import cuda, gpu_memory
+from attacks_on_films import films_again
 from attacks_on_meaning import MORE
 from attacks_on_running import running
 
@@ -42,11 +44,11 @@ GROUPS = {"checkpoints": files.checkpoints, "npz": files.npz, "overrides": calls
           "resumed": files.resumed, "runs": calls.runs} | MORE | {"running": running, "cuda": cuda}  # fmt: skip
 GROUPS |= {"gpu_memory": gpu_memory, "habits_data": habit.habits_data, "habits_keys": habit.habits_keys,
            "habits_running": habit.habits_running, "afresh_data": afresh.afresh_data, "afresh_keys": processes.afresh_keys,
-           "afresh_running": processes.afresh_running}  # fmt: skip
+           "afresh_running": processes.afresh_running, "films_again": films_again}  # fmt: skip
 """Name -> pairs of what is done and a function that does it, in a folder."""
 PATIENCE = 60
 LONGER = {"runs": 300, "cuda": 300, "gpu_memory": 300, "habits_keys": 120, "habits_running": 600, "running": 600,
-          "afresh_keys": 300, "afresh_running": 600}  # fmt: skip
+          "afresh_keys": 300, "afresh_running": 600, "films_again": 300}  # fmt: skip
 """Seconds until an attack counts as a hang; of whole processes."""
 HEAD = "| group | tried | one clear message | traceback or hang | ran |\n|---|---|---|---|---|"
 
