@@ -24,6 +24,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
 
 import attacks_afresh as afresh
@@ -84,12 +85,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default=",".join(name for name in GROUPS if name not in LONGER))
     parser.add_argument("--runs", action="store_true")
+    parser.add_argument("--share", default="0/1", metavar="K/N",
+                        help="every N-th attack of each group, from the K-th on: N processes make all of them beside each other")
     options = parser.parse_args()
+    first, every = map(int, options.share.split("/"))
     rows, said = [], []
     for name in [*options.only.split(","), *(["runs"] if options.runs else [])]:
         counts = dict.fromkeys(("message", "traceback", "hang", "ran"), 0)
         with tempfile.TemporaryDirectory() as folder:
-            for what, attack in GROUPS[name](Path(folder)):
+            for what, attack in islice(GROUPS[name](Path(folder)), first, None, every):
                 kind, text = outcome(attack, LONGER.get(name, PATIENCE))
                 counts[kind] += 1
                 if name in LONGER:  # whole processes: minutes in which nothing would be seen
