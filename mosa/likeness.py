@@ -22,7 +22,11 @@ USUAL = 0.9
 """Share of the outlines that a coarse body fills in its own film."""
 BRIGHTER = 0.15
 """Mean colour, of 0 to 1 per channel, by which the object may differ from the body: in one light and exposure the parts that turn
-to the light and away from it leave 0.005 (12 cameras) to 0.1 (two)."""
+to the light and away from it leave 0.005 (12 cameras, or four of them) to 0.1 (two)."""
+
+
+VIEWS = 4
+"""Looked at, evenly out of a film's cameras: large pictures of many splats take seconds each."""
 
 
 class Likeness(NamedTuple):
@@ -35,8 +39,9 @@ class Likeness(NamedTuple):
 
 @torch.no_grad()
 def likeness(body: Body, start: Start, scene: Scene) -> Likeness:
-    """Of the body at the start of a film to its first frame, in the cameras that learning may read."""
-    cameras, rotation = scene.training_cameras, start.rotation.to(body.rest)
+    """Of the body at the start of a film to its first frame, in some of the cameras that learning may read."""
+    every, rotation = scene.training_cameras, start.rotation.to(body.rest)
+    cameras = [every[i] for i in torch.linspace(0, len(every) - 1, min(VIEWS, len(every))).round().long().tolist()]
     x = (body.rest - body.center) @ rotation.T + start.center.to(body.rest)
     shown = seen(body, x[None], rotation.expand(1, len(x), 3, 3))
     views = scene.cameras.select(cameras).to(x.device)
