@@ -20,7 +20,15 @@ from attacks import ROOT, Attack, refuse
 from drawn_runs import SMALL as SHORT
 from drawn_runs import leftovers
 
-SMALL = [*(key for key in SHORT if "video" not in key), "reconstruction.dynamic.iterations=15",
+from mosa.analysis.figures import ffmpeg
+from mosa.errors import ConfigError
+
+try:
+    ffmpeg("")
+    VIDEO = []
+except ConfigError:  # then everything but the video is attacked
+    VIDEO = ["evaluation.video=false"]
+SMALL = [*(key for key in SHORT if "video" not in key), *VIDEO, "reconstruction.dynamic.iterations=15",
          "reconstruction.carried.iterations=20", "reconstruction.informed.iterations=5",
          "simulation.particles=100", "fit.joint.newton_iterations=1"]  # fmt: skip
 FILES = ("results.md", "splats.ply", "strip.png", "video.mp4")
@@ -197,7 +205,7 @@ def running(folder: Path) -> Iterator[Attack]:
     yield "a sweep whose second job fails", sweep
 
     def evaluated() -> None:
-        words = [f"ckpt_path={base}/checkpoints/last.ckpt", f"cache={cache}"]
+        words = [f"ckpt_path={base}/checkpoints/last.ckpt", f"cache={cache}", *VIDEO]
         program(*words, f"hydra.run.dir={folder}/e", script="eval.py")
         for number in (5, 12, 20):
             run = folder / f"e_{number}"

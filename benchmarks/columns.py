@@ -2,6 +2,7 @@
 
     OMP_NUM_THREADS=1 python benchmarks/columns.py                          # five aspect ratios, two friction angles, minutes
     OMP_NUM_THREADS=1 python benchmarks/columns.py --aspects 1 --cells 24   # a finer grid
+    OMP_NUM_THREADS=1 python benchmarks/columns.py --aspects 5 --young 2e6 --width 0.5 --rubbing 0.3    # stiffer grains, side walls
 
 A column of base d and height a d stands against a wall that does not rub and is let go at once, on a rough (sticking) ground,
 between slipping side walls. Run-out: (front - d)/d, the front being where 99 % of the mass lies behind it. Experiments in a
@@ -44,20 +45,24 @@ def published(aspect: float) -> float:
     return 1.2 * aspect if aspect < 2.3 else 1.9 * aspect ** (2 / 3)
 
 
-def run_out(aspect: float, angle: float, cells: int) -> tuple[float, float, float]:
-    """(run-out of 99 % of the mass, slope of the heap's middle [degrees], speed left [m/s]) after 6 sqrt(height/g)."""
-    dx, depth = BASE / cells, 2
+def run_out(
+    aspect: float, angle: float, cells: int, young: float = E, width: float | None = None, rubbing: float = 0.0
+) -> tuple[float, float, float]:
+    """(run-out of 99 % of the mass, slope of the heap's middle [degrees], speed left [m/s]) after 6 sqrt(height/g). young [Pa]: of
+    the grains; width: of the channel over the base, None for two cells; rubbing: friction of its side walls."""
+    dx, depth = BASE / cells, 2 if width is None else max(2, round(width * cells))
     h = dx / 2
     axes = [(torch.arange(n) + 0.5) * h for n in (2 * cells, round(2 * cells * aspect), 2 * depth)]
     x = torch.cartesian_prod(*axes)
     eye = torch.eye(3).expand(len(x), 3, 3).contiguous()
     state = ParticleState(x, torch.zeros_like(x), torch.zeros_like(eye), eye, eye)
-    lam, mu = E * NU / ((1 + NU) * (1 - 2 * NU)), E / (2 * (1 + NU))
+    lam, mu = young * NU / ((1 + NU) * (1 - 2 * NU)), young / (2 * (1 + NU))
     s = math.sin(math.radians(angle))
     alpha = math.sqrt(2 / 3) * 2 * s / (3 - s)
     duration, frame_dt = 6 * math.sqrt(aspect * BASE / GRAVITY), 0.01
-    planes = [Plane((0, 0, 0), (0, 1, 0)), Plane((0, 0, 0), (1, 0, 0), "slip"), Plane((0, 0, 0), (0, 0, 1), "slip"),
-              Plane((0, 0, depth * dx), (0, 0, -1), "slip")]  # fmt: skip
+    side = ("slip", 0.0) if rubbing == 0 else ("separate", rubbing)
+    planes = [Plane((0, 0, 0), (0, 1, 0)), Plane((0, 0, 0), (1, 0, 0), "slip"), Plane((0, 0, 0), (0, 0, 1), *side),
+              Plane((0, 0, depth * dx), (0, 0, -1), *side)]  # fmt: skip
     substeps = math.ceil(frame_dt * (math.sqrt((lam + 2 * mu) / DENSITY) + 3) / (0.5 * dx))
     simulator = Simulator("drucker_prager", dx=dx, substeps=substeps, frame_dt=frame_dt, gravity=(0, -GRAVITY, 0), planes=planes)
     parameters = {"mu": mu, "lam": lam, "friction_alpha": alpha, "cohesion": 0.0}
@@ -76,13 +81,16 @@ def main() -> None:
     angles = [30.0, triaxial_angle(31.0)]
     parser.add_argument("--angles", type=float, nargs="+", default=angles, help="of the cone [degrees]")
     parser.add_argument("--cells", type=int, default=16, help="of the base")
+    parser.add_argument("--young", type=float, default=E, help="of the grains [Pa]")
+    parser.add_argument("--width", type=float, default=None, help="of the channel, over the base; default: two cells")
+    parser.add_argument("--rubbing", type=float, default=0.0, help="friction of its side walls; 0: they slip")
     options = parser.parse_args()
     print("| aspect | published | cone [degrees] | in the channel | run-out | over published | slope [degrees] | speed [m/s] | s |")
     print("|---|---|---|---|---|---|---|---|---|")
     for angle in options.angles:
         for aspect in options.aspects:
             began = time.perf_counter()
-            reach, slope, speed = run_out(aspect, angle, options.cells)
+            reach, slope, speed = run_out(aspect, angle, options.cells, options.young, options.width, options.rubbing)
             print(f"| {aspect:g} | {published(aspect):.2f} | {angle:.1f} | {plane_angle(angle):.1f} | {reach:.2f} | "
                   f"{reach / published(aspect):.2f} | {slope:.0f} | {speed:.3f} | {time.perf_counter() - began:.0f} |", flush=True)
 

@@ -6,12 +6,13 @@
     python benchmarks/robustness.py --runs              # and whole processes: exit codes, a sweep of failures (minutes)
     python benchmarks/robustness.py --only habits_keys,habits_running  # how people type, and machines are (minutes each)
     python benchmarks/robustness.py --only afresh_keys,afresh_running  # values and files that are something else (half an hour)
+    python benchmarks/robustness.py --only films_again  # light, exposure, cameras, films of something else (a quarter of an hour)
     python benchmarks/robustness.py --only running      # kills, disks, screens, folders, limits (a quarter of an hour or more)
 
 Each attack ends in one clear message (a MosaError of one line), in a traceback, in a hang (over 60 s), or it runs. What runs is
 listed: those are the attacks that the program has no word against. The attacks are in attacks_on_files.py, attacks_on_calls.py,
 attacks_on_data.py, attacks_on_meaning.py, attacks_of_habit.py, attacks_afresh.py, attacks_afresh_running.py,
-attacks_on_running.py and attacks_on_cuda.py.
+attacks_on_running.py, attacks_on_films.py and attacks_on_cuda.py.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
 
 import attacks_afresh as afresh
@@ -32,6 +34,7 @@ import attacks_on_calls as calls
 import attacks_on_data as data
 import attacks_on_files as files
 from attacks_on_cuda import cuda, gpu_memory
+from attacks_on_films import films_again
 from attacks_on_meaning import MORE
 from attacks_on_running import running
 
@@ -42,11 +45,11 @@ GROUPS = {"checkpoints": files.checkpoints, "npz": files.npz, "overrides": calls
           "resumed": files.resumed, "runs": calls.runs} | MORE | {"running": running, "cuda": cuda}  # fmt: skip
 GROUPS |= {"gpu_memory": gpu_memory, "habits_data": habit.habits_data, "habits_keys": habit.habits_keys,
            "habits_running": habit.habits_running, "afresh_data": afresh.afresh_data, "afresh_keys": processes.afresh_keys,
-           "afresh_running": processes.afresh_running}  # fmt: skip
+           "afresh_running": processes.afresh_running, "films_again": films_again}  # fmt: skip
 """Name -> pairs of what is done and a function that does it, in a folder."""
 PATIENCE = 60
 LONGER = {"runs": 300, "cuda": 300, "gpu_memory": 300, "habits_keys": 120, "habits_running": 600, "running": 600,
-          "afresh_keys": 300, "afresh_running": 600}  # fmt: skip
+          "afresh_keys": 300, "afresh_running": 600, "films_again": 300}  # fmt: skip
 """Seconds until an attack counts as a hang; of whole processes."""
 HEAD = "| group | tried | one clear message | traceback or hang | ran |\n|---|---|---|---|---|"
 
@@ -82,12 +85,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default=",".join(name for name in GROUPS if name not in LONGER))
     parser.add_argument("--runs", action="store_true")
+    parser.add_argument("--share", default="0/1", metavar="K/N",
+                        help="every N-th attack of each group, from the K-th on: N processes make all of them beside each other")
     options = parser.parse_args()
+    first, every = map(int, options.share.split("/"))
     rows, said = [], []
     for name in [*options.only.split(","), *(["runs"] if options.runs else [])]:
         counts = dict.fromkeys(("message", "traceback", "hang", "ran"), 0)
         with tempfile.TemporaryDirectory() as folder:
-            for what, attack in GROUPS[name](Path(folder)):
+            for what, attack in islice(GROUPS[name](Path(folder)), first, None, every):
                 kind, text = outcome(attack, LONGER.get(name, PATIENCE))
                 counts[kind] += 1
                 if name in LONGER:  # whole processes: minutes in which nothing would be seen

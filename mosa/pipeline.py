@@ -20,7 +20,16 @@ from mosa.evaluation import sequences
 from mosa.extensions import load_extensions
 from mosa.extrapolation import check_can_extrapolate, extrapolated
 from mosa.fitting import fit, fit_estimate
-from mosa.guards import check_begin, check_configuration, check_evaluation, check_seen, check_starts, evaluated_scene
+from mosa.guards import (
+    check_begin,
+    check_configuration,
+    check_evaluation,
+    check_seen,
+    check_starts,
+    evaluated_scene,
+    warn_of_little,
+)  # fmt: skip
+from mosa.likeness import warn_of_others
 from mosa.limits import named_device
 from mosa.loggers import chosen, log_outcome
 from mosa.modules.body import Body, Start
@@ -106,6 +115,9 @@ def train(cfg: DictConfig) -> float | None:
     for prefix, start in run.starts.items():
         log.info("start of %s: velocity (%s) m/s", prefix, ", ".join(f"{v:.3f}" for v in start.velocity.tolist()))
     check_starts(world, body, run.starts)
+    if parallel.launched_rank() == 0:
+        warn_of_little(world, body, run.starts, [scene, *others])
+        warn_of_others(body, run.starts, [scene, *others])
     with clock.measure("fit"):
         module = run.module
         if cfg.extrapolate:
@@ -164,6 +176,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         found = {f"test/{s.sequence}": sequence_start(body, seen, s, register=True) for s in (scene, *held_out)}
         # the body moves in the world that the scene shows, among the run's walls and colliders
         world = build_world(world_config(scene) | (twin.config["cfg"].get("world") or {}))
+        warn_of_others(body, found, [scene, *held_out])
     else:
         found = {k: Start.read(s, body.rest) for k, s in (twin.config.get("starts") or {}).items()}
         if len(found) != 1 + len(held_out):

@@ -1,7 +1,9 @@
 """The rollout benchmark's check: ratios of times in one run against the stored ones."""
 
+import argparse
 import importlib
 import json
+import random
 from dataclasses import replace
 from pathlib import Path
 
@@ -158,6 +160,41 @@ def test_two_equal_runs_are_compared_in_what_they_say_they_do_not_know(monkeypat
     assert long_runs.apart(one, one)[0] == [] and not any(each.far for each in long_runs.apart(one, one)[1])
     widened = (1 + long_runs.SPREADS**2 / 2) ** 0.5  # of a standard deviation, by two runs that are so far apart
     assert widened == pytest.approx(1 + long_runs.AGREE)
+
+
+def test_drawn_runs_are_counted_over_calls_and_compared_where_one_program_made_both(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    drawn_runs = importlib.import_module("drawn_runs")
+    assert drawn_runs.drawn(4, random.Random(0)) == drawn_runs.drawn(9, random.Random(0))[:4]
+    options = argparse.Namespace(runs=4, launched=1, kills=1)
+    monkeypatch.setattr(drawn_runs, "version", lambda: "one")
+    first = drawn_runs.Record(tmp_path / "record.json", {"seed": 0})
+    for k in range(3):
+        first.put("alone", k, {"E": float(k)})
+    first.put("joblib", 0, {"E": 0.0})
+    resumed = {"skipped": 1, "went on": 1}
+    first.note("sweeps", {"launcher": "joblib", "jobs": 3, "code": None, "met": [2], "resumed": resumed, "took": 9})
+    first.note("left", [0, 0])
+    assert [row.met for row in drawn_runs.rows_of(first, options)] == [False, False, False, True]
+    monkeypatch.setattr(drawn_runs, "version", lambda: "other")  # the program changed between two calls
+    second = drawn_runs.Record(tmp_path / "record.json", {"seed": 0})
+    second.put("joblib", 1, {"E": 1.0})
+    assert second.complete() == [0, 1, 2] and second.compared("joblib") == {0: []} and second.of_kind("alone") == {}
+    for k in (1, 2, 3):
+        second.put("alone", k, {"E": float(k)})
+        second.put("joblib", k, {"E": float(k)})
+    second.put("alone", 0, {"E": 0.0})
+    second.put("submitit_local", 0, {"E": 0.0})
+    for launcher in ("joblib", "submitit_local"):
+        second.note("sweeps", {"launcher": launcher, "jobs": 3, "code": 0, "met": [1], "resumed": resumed, "took": 9})
+    assert all(row.met for row in drawn_runs.rows_of(second, options))
+    second.put("joblib", 2, {"E": 2.5})
+    assert second.compared("joblib")[2] == ["E"]
+    assert [row.met for row in drawn_runs.rows_of(second, options)] == [True, False, True, True]
+    second.put("alone", 3, {"exit code": 1})
+    assert [row.met for row in drawn_runs.rows_of(second, options)] == [False, False, True, True]
+    with pytest.raises(SystemExit, match="expected a record of"):
+        drawn_runs.Record(tmp_path / "record.json", {"seed": 1})
 
 
 def test_directions_are_found_from_a_true_motion(monkeypatch, tmp_path):

@@ -22,6 +22,9 @@ CLEAR = 0.9
 FLASH = 0.2
 """By which an object's mean colour, of 0 to 1, may leave the line between the frames beside it. Built-in films stay
 below 0.04."""
+DRIFT = 0.15
+"""By which it may change over a film, averaged over all learning cameras, so that what turns into one's view leaves another's: a
+body in one light that is exposed the same stays below 0.075 in the built-in films, at 0.022 in the bird's."""
 SQUARE, NEARLY = 2.0, 1.05
 """Ratios of the two focal lengths of a camera from which on they are refused, and warned of: sensors have square pixels."""
 
@@ -133,6 +136,7 @@ def check_mattes(scene: Scene, label: str) -> None:
             one = ": an opaque alpha channel, or an object too near; matte it, or restrict scene.frames"
             raise DataError(f"{label}: camera {name}, frame {t}: the matte covers {float(covered[v, t]):.0%} of the image"
                             f"{every if float(covered[v].min()) > FULL else one}")
+    check_gaps(scene, covered > 0, label)
     most = scene.mattes.amax((1, 2, 3))
     if float(most.min()) < CLEAR:
         v = int(most.argmin())
@@ -140,9 +144,25 @@ def check_mattes(scene: Scene, label: str) -> None:
                       "frame: expected 1 inside of the object; what is missing mixes the background into its colours", stacklevel=3)
 
 
+def check_gaps(scene: Scene, seen: torch.Tensor, label: str) -> None:
+    """No frame loses the object that frames after it show: in all cameras that is refused, in one a warning. seen: (V, T)."""
+    later = seen.flip(1).cummax(1).values.flip(1)
+    gap = later & ~seen
+    views = seen.sum(0)
+    if bool((lost := (views < 2) & (later.sum(0) >= 2)).any()):
+        t = int(lost.int().argmax())
+        raise DataError(f"{label}: {int(views[t])} of {len(seen)} cameras have a matte of the object in frame {t}, and more of "
+                        "them in a later one: expected two at least in every frame between; matte it, or restrict scene.frames")
+    if bool(gap.any()):
+        v, t = (int(i) for i in gap.nonzero()[0])
+        warnings.warn(f"{label}: camera {scene.cameras.names[v]}, frame {t}: the matte is empty, where it shows the object in a "
+                      f"later frame ({int(gap.sum())} such mattes): expected the object; what the camera shows there counts as "
+                      "nothing being there", stacklevel=4)  # fmt: skip
+
+
 def check_colors(scene: Scene, label: str) -> None:
     """A warning where the object's mean colour jumps in one frame of a camera and comes back: a frame that was not exposed, or
-    dropped and filled with black."""
+    dropped and filled with black. And one where all cameras' changes over the film: another exposure, or a light that changes."""
     inside = (scene.mattes > CLEAR).float()
     means = (scene.images * inside[..., None]).sum((2, 3)) / inside.sum((2, 3))[..., None].clamp(min=1)
     seen = inside.sum((2, 3)) > 0
@@ -152,6 +172,22 @@ def check_colors(scene: Scene, label: str) -> None:
         warnings.warn(f"{label}: camera {scene.cameras.names[v]}, frame {t + 1}: the object's mean colour is "
                       f"{float(jump[v, t]):.2f} beside that of the frames before and after: a dropped or flashed frame? expected "
                       "one light", stacklevel=3)
+        return
+    chosen = scene.training_cameras
+    weight = inside[chosen]
+    together = (scene.images[chosen] * weight[..., None]).sum((0, 2, 3)) / weight.sum((0, 2, 3))[:, None].clamp(min=1)
+    shown = weight.sum((0, 2, 3)) > 0
+    if int(shown.sum()) < 2:
+        return
+    change = together[shown].amax(0) - together[shown].amin(0)
+    if float(change.max()) > DRIFT:
+        channel = int(change.argmax())
+        values = torch.where(shown, together[:, channel], torch.nan)
+        first, last = (int(i) for i in (values.nan_to_num(2.0).argmin(), values.nan_to_num(-1.0).argmax()))
+        name = ("red", "green", "blue")[channel]
+        warnings.warn(f"{label}: the object's mean {name} over all cameras is {float(values[first]):.2f} in frame {first} and "
+                      f"{float(values[last]):.2f} in frame {last}: does the exposure, the white balance or the light change? "
+                      "expected one; colours are compared from frame to frame", stacklevel=3)
 
 
 def check_borders(scene: Scene, label: str) -> None:

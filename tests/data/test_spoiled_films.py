@@ -1,6 +1,7 @@
 """Films of which a frame, a matte or a number was spoiled on the way: said, and silent where nothing was."""
 
 import json
+import re
 import shutil
 import warnings
 
@@ -49,10 +50,15 @@ def speck(pixels):
     pixels[1:4, 1:4, 3] = 255
 
 
+def empty(pixels):
+    pixels[..., 3] = 0
+
+
 @pytest.mark.parametrize(("change", "where", "message"), [
     (black, {"camera": "2", "frame": 2}, "camera 2, frame 2: the object's mean colour is .* beside that of the frames before"),
     (faded, {"camera": "1"}, "camera 1: the matte is nowhere more than 0.7. in any frame"),
     (speck, {"frame": 0}, "frame 0, has 9 pixels apart from the object, .* cameras have such"),
+    (empty, {"camera": "1", "frame": 1}, r"camera 1, frame 1: the matte is empty, where .* later frame \(1 such mattes\)"),
 ])  # fmt: skip
 def test_what_is_suspicious_is_said(film, tmp_path, change, where, message):
     with pytest.warns(UserWarning, match=message):
@@ -86,3 +92,28 @@ def test_listings_that_say_two_things_are_refused(film, tmp_path, change, messag
     (folder / "transforms.json").write_text(change((folder / "transforms.json").read_text()))
     with pytest.raises(DataError, match=message):
         load_scene(format="transforms", path=str(folder), **WORLD)
+
+
+@pytest.mark.parametrize(("factors", "said"), [
+    ([1, 0.9, 0.75, 0.65, 0.5], "mean red over all cameras is .* in frame 4 and .* in frame 0"),
+    ([1, 0.98, 0.95, 0.97, 0.93], None),  # as much as a flicker
+])  # fmt: skip
+def test_an_exposure_that_changes_over_a_film_is_said(film, tmp_path, factors, said):
+    folder = shutil.copytree(film, tmp_path / "capture")
+    for entry in json.loads((folder / "transforms.json").read_text())["frames"]:
+        with Image.open(folder / entry["file_path"]) as picture:
+            pixels = np.array(picture)
+        pixels[..., :3] = (pixels[..., :3] * factors[round(50 * entry["time"])]).astype(np.uint8)
+        Image.fromarray(pixels).save(folder / entry["file_path"])
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        load_scene(format="transforms", path=str(folder), **WORLD)
+    told = [str(each.message) for each in found if "over all cameras" in str(each.message)]
+    assert len(told) == (said is not None), told
+    if said:
+        assert re.search(said, told[0])
+
+
+def test_a_frame_that_no_camera_shows_is_refused_where_a_later_one_is_seen(film, tmp_path):
+    with pytest.raises(DataError, match="0 of 6 cameras have a matte of the object in frame 2, and more of them in a later one"):
+        spoiled(film, tmp_path, empty, frame=2)
