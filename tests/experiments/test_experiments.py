@@ -396,9 +396,13 @@ def test_a_quick_variant_runs_to_its_table_and_is_not_run_again(cache, tmp_path,
     text, pictures = ANALYSES["directions"](one, records_of(jobs_of(one, tmp_path / "runs", more)), tmp_path / "law")
     assert "| tiny  | ours" in text and len(pictures) == 1
     rows = [line.split(",") for line in (tmp_path / "law_directions.csv").read_text().splitlines()[1:]]
-    text, _ = ANALYSES["compression"](one, records_of(jobs_of(one, tmp_path / "runs", more)), tmp_path / "law")
-    assert "| ours " in text and (tmp_path / "law_plates.png").is_file()
-    assert len((tmp_path / "law_plates.csv").read_text().splitlines()) == 1 + 2 * 13  # the truth and ours
+    (tiny,) = one.axes["scene"]
+    two = replace(one, axes=one.axes | {"scene": (tiny, replace(tiny, name="again"))})  # the same run in two columns
+    text, _ = ANALYSES["compression"](two, records_of(jobs_of(two, tmp_path / "runs", more)), tmp_path / "law")
+    assert "| tiny  | ours" in text and "| again | ours" in text and (tmp_path / "law_plates.png").is_file()
+    plates = [line.split(",") for line in (tmp_path / "law_plates.csv").read_text().splitlines()[1:]]
+    assert [row[:2] for row in plates[::13]] == [["tiny", "truth"], ["tiny", "ours"], ["again", "truth"], ["again", "ours"]]
+    assert len(plates) == 4 * 13 and [row[2:] for row in plates[:26]] == [row[2:] for row in plates[26:]]
     true = [float(row[5]) for row in rows]
     assert true[0] / true[18] == pytest.approx(1.6, rel=0.01)  # along the rabbit's fibres and across
     assert float(rows[0][4]) > 0 and float(rows[0][3]) >= 0
