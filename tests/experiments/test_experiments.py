@@ -448,8 +448,15 @@ def test_the_page_has_what_was_run_and_says_what_was_not(tmp_path):
     for job in jobs:
         write_metrics(job, rms=0.010 if "adapter=operator" in job.overrides else 0.030)
     write_results(found, jobs, tmp_path / "docs" / "results", "the command")
+    (tmp_path / "docs" / "results" / "law_from_motion.md").write_text("# A law\n\ntext\n")
     assert run(arguments(["--page", "--results", str(tmp_path / "docs" / "results")])) == 0
     text = (tmp_path / "docs" / "results.md").read_text()
+    assert "[A law](results/law_from_motion.md)." in text
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
+    glance = {row[0]: row[1:] for row in rows if len(row) == 4}
+    assert glance["Ablations of the paper's adapter and of its motion cues"] == ["not run", "", "4 not run"]
+    jobs_complete, _, claims = glance["Generalisation to drops that were not seen"]
+    assert jobs_complete == "4 of 4" and claims == "2 hold against what was run, 2 not run"
     for name in NAMES:
         assert f"## {load_experiment(PAPER, name).title}" in text
     assert "31.35 / 92.3" in text and "`the command`" in text and "](results/table_generalisation.png)" in text
