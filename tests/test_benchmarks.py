@@ -124,17 +124,25 @@ def test_the_errors_of_a_calibration_s_cues_are_smooth_and_as_large_as_asked(mon
         assert calibration.overrides_of(name)[:2] == ["scene=standin", f"scene.name={name}"]
 
 
-def test_a_calibration_s_table_says_whether_its_posteriors_are_honest(monkeypatch):
+def test_a_calibration_s_table_says_whether_its_posteriors_are_honest(monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     calibration = importlib.import_module("calibration")
     numbers = {
         "E": {"true": 1e5, "start": 2e5, "found": 1e5 * np.exp(0.2), "error": 0.22, "sd_of_noise": 0.01, "sd": 0.1},  # relative
         "nu": {"true": 0.3, "start": 0.2, "found": 0.34, "error": 0.13, "sd_of_noise": 0.002, "sd": 0.04},
     }
-    record = {"scene": "ball", "set": [], "particles": 9, "parameters": numbers, "rms_mm": 1.0, "seconds": 2.0}
-    *rows, _, last = calibration.table([record, record]).splitlines()
+    record = {"scene": "ball", "set": [], "particles": 9, "seed": 0, "parameters": numbers, "rms_mm": 1.0, "seconds": 2.0,
+              "noise": 0.004, "commit": "1234567", "machine": "a card"}  # fmt: skip
+    *rows, _, counted, _, last = calibration.table([record, record]).splitlines()
     assert [row.split(" | ")[-3] for row in rows[2:]] == ["2.00", "1.00"] * 2
     assert last.endswith("1.58 (4 numbers)") and len({row.count("|") for row in rows}) == 1
+    assert counted == "of 4 numbers 0 met, 4 not determined, 0 missed"
+    assert calibration.verdict("E", numbers["E"] | {"sd": 0.09}) == "missed"  # 2.2 of its standard deviations
+    assert calibration.verdict("nu", numbers["nu"] | {"error": 0.099}) == "met" == calibration.verdict("kappa", {"error": 0.1})
+    assert calibration.verdict("mu", numbers["E"] | {"error": 0.06}) == "not determined"
+    calibration.draw([record], tmp_path / "results")
+    assert "| ball |" in (tmp_path / "results" / "calibration_from_motion.md").read_text()
+    assert json.loads((tmp_path / "results" / "calibration_from_motion.json").read_text()) == [record]
 
 
 def equal_run(folder, *, E: float, nu: float, moved: float, error: float):

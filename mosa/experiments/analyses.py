@@ -256,53 +256,61 @@ def pressed_modulus(body: Body, variant: str, directions: Tensor) -> list[Presse
 
 
 def compression(experiment: Experiment, records: Sequence[Record], stem: Path) -> tuple[str, list[Path]]:
-    """E(theta) from the force on two plates, of the true law and of every model, in the plane of the fibres and the vertical."""
+    """E(theta) from the force on two plates, of the true law and of every model, in the plane of the fibres and the vertical; a row
+    of the picture for each column of the table."""
     angles, n = directions_in_plane((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), 13)
     variants = {"": "adapted", "prior/": "prior"}
-    found: list[tuple[str, list[Pressed]]] = []
+    found: dict[str, dict[str, list[Pressed]]] = {}
+    truths: dict[tuple[str, str], list[Pressed]] = {}
     for record, twin in loaded(records, tuple(variants)):
-        if twin.body.adapter is not None and twin.body.adapter.own_dynamics and not prefix(record):
-            continue  # no law that a specimen could be made of
-        name = twin.config["cfg"]["scene"].get("name")
-        if not found and name in OBJECTS:
-            hidden = OBJECTS[name].material.variant(twin.config["cfg"]["scene"].get("material", "anisotropic"))
+        scene, name = twin.config["cfg"]["scene"], label(experiment, record)
+        of_law = (scene.get("name"), scene.get("material", "anisotropic"))
+        if of_law[0] not in OBJECTS or (twin.body.adapter is not None and twin.body.adapter.own_dynamics and not prefix(record)):
+            continue  # nothing to compare with, or no law that a specimen could be made of
+        if of_law not in truths:
+            hidden = OBJECTS[of_law[0]].material.variant(of_law[1])
             one = {key: (value[0] if value.ndim else value) for key, value in hidden.parameters(torch.zeros(1, 3)).items()}
-            found.append(("truth", [press(hidden.law, one, k, modulus=hidden.wave_modulus(), poisson=hidden.known["nu"],
-                                          density=hidden.density, stiffening=1.0) for k in n]))  # fmt: skip
+            truths[of_law] = [press(hidden.law, one, k, modulus=hidden.wave_modulus(), poisson=hidden.known["nu"],
+                                    density=hidden.density, stiffening=1.0) for k in n]  # fmt: skip
+        own = found.setdefault(record.place[experiment.columns].name, {"truth": truths[of_law]})
         try:
-            found.append((label(experiment, record), pressed_modulus(twin.body, variants[prefix(record)], n)))
+            own[name] = pressed_modulus(twin.body, variants[prefix(record)], n)
         except SimulationDiverged as error:
-            found.append((label(experiment, record), []))
-            log.warning("%s: %s", label(experiment, record), error)
-    if len(found) < 2 or found[0][0] != "truth":
+            own[name] = []
+            log.warning("%s: %s", name, error)
+    if not found:
         return "", []
-    true = found[0][1]
     degrees = torch.rad2deg(angles)
-    canvas = Canvas(figsize=(9.0, 3.6), layout="constrained")
-    left, right = canvas.subplots(1, 2, subplot_kw=None)
+    canvas = Canvas(figsize=(9.0, 3.6 * len(found)), layout="constrained")
     rows, lines = [], []
-    for name, results in found:
-        if not results:
-            lines.append([name, "", "", ""])
-            continue
-        E = torch.tensor([each.modulus for each in results])
+    for (column, laws), (left, right) in zip(found.items(), canvas.subplots(len(found), 2, squeeze=False)):
+        true = laws["truth"]
         reference = torch.tensor([each.modulus for each in true])
-        style = "k--" if name == "truth" else "-"
-        left.plot(degrees, E / 1e3, style, label=name)
-        right.plot(100 * results[0].strain, results[0].force, style, label=name)
-        rows += [[name, f"{float(a):.1f}", f"{float(e):.6g}", f"{float(t):.6g}"] for a, e, t in zip(degrees, E, reference)]
-        if name != "truth":
-            off = (E / reference - 1).abs()
-            forces = [abs(force_at(a, 0.04) / force_at(b, 0.04) - 1) for a, b in zip(results, true)]
-            lines.append([name, f"{100 * float(off.mean()):.1f}", f"{100 * float(off.max()):.1f}", f"{100 * max(forces):.1f}"])
+        for name, results in laws.items():
+            if not results:
+                lines.append([column, name, "", "", ""])
+                continue
+            E = torch.tensor([each.modulus for each in results])
+            style = "k--" if name == "truth" else "-"
+            left.plot(degrees, E / 1e3, style, label=name)
+            right.plot(100 * results[0].strain, results[0].force, style, label=name)
+            rows += [[column, name, f"{float(a):.1f}", f"{float(e):.6g}", f"{float(t):.6g}"]
+                     for a, e, t in zip(degrees, E, reference)]  # fmt: skip
+            if name != "truth":
+                off = (E / reference - 1).abs()
+                forces = [abs(force_at(a, 0.04) / force_at(b, 0.04) - 1) for a, b in zip(results, true)]
+                lines.append([column, name, f"{100 * float(off.mean()):.1f}", f"{100 * float(off.max()):.1f}",
+                              f"{100 * max(forces):.1f}"])  # fmt: skip
+        left.set_title(column, fontsize=10)
+        left.set_ylim(0, 1.05 * left.get_ylim()[1])
+        left.set_ylabel("E between plates [kPa]")
+        right.set_ylabel("force [N]")
+        left.legend(fontsize=8, loc="lower left")
     left.set_xlabel("angle from x towards y [degrees]")
-    left.set_ylabel("E between plates [kPa]")
     right.set_xlabel("strain along x [%]")
-    right.set_ylabel("force [N]")
-    left.legend(fontsize=8)
     path = stem.with_name(stem.name + "_plates")
-    write_table(path.with_suffix(".csv"), [experiment.rows, "degrees", "E_Pa", "true_E_Pa"], rows)
-    header = [experiment.rows, "E off, mean [%]", "E off, largest [%]", "force at 4 % strain off, largest [%]"]
+    write_table(path.with_suffix(".csv"), [experiment.columns, experiment.rows, "degrees", "E_Pa", "true_E_Pa"], rows)
+    header = [experiment.columns, experiment.rows, "E off, mean [%]", "E off, largest [%]", "force at 4 % strain off, largest [%]"]
     return "A specimen between plates, first seed, against the true law:\n\n" + markdown(header, lines), [save(canvas, path)]
 
 

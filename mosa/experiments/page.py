@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import json
 import math
+import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -54,12 +56,13 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
     """results.md beside the folder of results. folder: of the experiments' files. Errors: ConfigError, DataError."""
     if not results.is_dir():
         raise ConfigError(f"--results: expected a folder with results, found none at {results}")
-    parts = [INTRODUCTION]
+    parts, lines = [], []
     for name in sorted(names, key=lambda name: not name.startswith("table_")):
         experiment = load_experiment(folder, name)
         parts.append(f"## {experiment.title}\n\n{experiment.note.strip()}")
         found = read_tables(results / f"{name}.json")
         tables, about = found if found is not None else ({}, EMPTY)
+        lines.append([experiment.title, *state_of(about["provenance"]), claims_of(experiment, tables)])
         parts += older(about["provenance"])
         if any(cell for rows in tables.values() for cells in rows.values() for cell in cells.values()):
             parts.append(ours(experiment, tables))
@@ -74,9 +77,38 @@ def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
             parts.append("\n".join(f"- {claim.text}: **{verdict(experiment, claim, tables)}**" for claim in experiment.claims))
         if about["provenance"]:
             parts.append(f"All of it: [{name}.md]({results.name}/{name}.md). " + "; ".join(about["provenance"]) + ".")
+    beside = [f"[{read_title(page)}]({results.name}/{page.name})" for page in sorted(results.glob("*_from_motion.md"))]
+    if beside:
+        parts.append(f"## Without images\n\nLaws that were learned from the true motion of a body: {', '.join(beside)}.")
     page = results.parent / "results.md"
-    write_whole(page, "\n\n".join(parts) + "\n")
+    whole = [INTRODUCTION, markdown(["", "jobs complete", "commit (changes of the program since)", "claims"], lines), *parts]
+    write_whole(page, "\n\n".join(whole) + "\n")
     return page
+
+
+def read_title(page: Path) -> str:
+    return page.read_text().partition("\n")[0].lstrip("# ")
+
+
+def state_of(lines: Sequence[str]) -> tuple[str, str]:
+    """(jobs complete of all, age) by the lines that say where figures come from."""
+    jobs = re.search(r"\b(\d+ of \d+) jobs complete\b", "; ".join(lines))
+    if jobs is None:
+        return NOT_RUN, ""
+    since = commits_since(lines)
+    return jobs[1], "" if since is None else f"{since[0]} ({since[1]})"
+
+
+OUTCOMES = {"holds against": "hold against what was run", "holds": "hold", "within": "within the spread",
+            "none is determined": "not determined", "does not": "do not hold", NOT_RUN: NOT_RUN}  # fmt: skip
+"""What a verdict begins with, the longer words first, and how such are counted."""
+
+
+def claims_of(experiment: Experiment, tables: Tables) -> str:
+    """How many of the claims hold, and how many not."""
+    verdicts = [verdict(experiment, claim, tables) for claim in experiment.claims]
+    counts = Counter(next(word for begins, word in OUTCOMES.items() if said.startswith(begins)) for said in verdicts)
+    return ", ".join(f"{counts[word]} {word}" for word in OUTCOMES.values() if counts[word])
 
 
 def older(lines: Sequence[str]) -> list[str]:

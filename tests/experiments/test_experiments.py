@@ -396,9 +396,13 @@ def test_a_quick_variant_runs_to_its_table_and_is_not_run_again(cache, tmp_path,
     text, pictures = ANALYSES["directions"](one, records_of(jobs_of(one, tmp_path / "runs", more)), tmp_path / "law")
     assert "| tiny  | ours" in text and len(pictures) == 1
     rows = [line.split(",") for line in (tmp_path / "law_directions.csv").read_text().splitlines()[1:]]
-    text, _ = ANALYSES["compression"](one, records_of(jobs_of(one, tmp_path / "runs", more)), tmp_path / "law")
-    assert "| ours " in text and (tmp_path / "law_plates.png").is_file()
-    assert len((tmp_path / "law_plates.csv").read_text().splitlines()) == 1 + 2 * 13  # the truth and ours
+    (tiny,) = one.axes["scene"]
+    two = replace(one, axes=one.axes | {"scene": (tiny, replace(tiny, name="again"))})  # the same run in two columns
+    text, _ = ANALYSES["compression"](two, records_of(jobs_of(two, tmp_path / "runs", more)), tmp_path / "law")
+    assert "| tiny  | ours" in text and "| again | ours" in text and (tmp_path / "law_plates.png").is_file()
+    plates = [line.split(",") for line in (tmp_path / "law_plates.csv").read_text().splitlines()[1:]]
+    assert [row[:2] for row in plates[::13]] == [["tiny", "truth"], ["tiny", "ours"], ["again", "truth"], ["again", "ours"]]
+    assert len(plates) == 4 * 13 and [row[2:] for row in plates[:26]] == [row[2:] for row in plates[26:]]
     true = [float(row[5]) for row in rows]
     assert true[0] / true[18] == pytest.approx(1.6, rel=0.01)  # along the rabbit's fibres and across
     assert float(rows[0][4]) > 0 and float(rows[0][3]) >= 0
@@ -444,8 +448,15 @@ def test_the_page_has_what_was_run_and_says_what_was_not(tmp_path):
     for job in jobs:
         write_metrics(job, rms=0.010 if "adapter=operator" in job.overrides else 0.030)
     write_results(found, jobs, tmp_path / "docs" / "results", "the command")
+    (tmp_path / "docs" / "results" / "law_from_motion.md").write_text("# A law\n\ntext\n")
     assert run(arguments(["--page", "--results", str(tmp_path / "docs" / "results")])) == 0
     text = (tmp_path / "docs" / "results.md").read_text()
+    assert "[A law](results/law_from_motion.md)." in text
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
+    glance = {row[0]: row[1:] for row in rows if len(row) == 4}
+    assert glance["Ablations of the paper's adapter and of its motion cues"] == ["not run", "", "4 not run"]
+    jobs_complete, _, claims = glance["Generalisation to drops that were not seen"]
+    assert jobs_complete == "4 of 4" and claims == "2 hold against what was run, 2 not run"
     for name in NAMES:
         assert f"## {load_experiment(PAPER, name).title}" in text
     assert "31.35 / 92.3" in text and "`the command`" in text and "](results/table_generalisation.png)" in text
