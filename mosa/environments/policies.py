@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from mosa.environments.arena import Arena, play, play_all
-from mosa.environments.task import Task
+from mosa.environments.task import Task, View
 from mosa.errors import ConfigError, DataError
 
 METHODS = ("gradient", "cma", "model", "sac", "ppo")
@@ -65,7 +65,7 @@ class Search:
 
     By gradients: Adam at `rate`; `clip`: largest norm of a trial's gradient with respect to one action, as one that bounces off an
     edge may have any. By covariance matrix adaptation: `candidates` policies an iteration, drawn with a standard deviation of
-    `spread` at first. By a model of the loss: `candidates` times `batch` trials an iteration, with actions `spread` about the
+    `spread` at first. By a model of how trials end: `candidates` times `batch` trials an iteration, with actions `spread` about the
     policy's."""
 
     iterations: int = 60
@@ -171,41 +171,63 @@ def by_evolution(train: Arena, check: Arena, search: Search, seed: int, say: Cal
     return Found(policy.requires_grad_(False), history, time.perf_counter() - began, played)
 
 
-class LossModel(nn.Module):
-    """What an action costs in a situation: `MEMBERS` networks that begin differently and are fitted to trials that were played.
-    Where they disagree nothing like it was tried. Inputs are observations, scaled to their ranges, and actions."""
+class OutcomeModel(nn.Module):
+    """What comes of an action in a situation: `MEMBERS` networks that begin differently and are fitted to trials that were
+    played. Where they disagree nothing like it was tried. Inputs are observations, scaled to their ranges, and actions; outputs
+    are `OUTCOME`."""
 
-    def __init__(self, inputs: int, generator: torch.Generator) -> None:
+    def __init__(self, inputs: Tensor, outcomes: Tensor, generator: torch.Generator) -> None:
         super().__init__()
-        sizes = (inputs, HIDDEN, HIDDEN, 1)
+        self.register_buffer("middle", outcomes.median(0).values)
+        self.register_buffer("spread", (outcomes - self.middle).abs().mean(0).clamp_min(1e-6))
+        sizes = (inputs.shape[1], HIDDEN, HIDDEN, outcomes.shape[1])
         begun = [torch.randn(MEMBERS, a, b, generator=generator) / math.sqrt(a) for a, b in pairwise(sizes)]
         self.weights = nn.ParameterList(begun)
         self.biases = nn.ParameterList([torch.zeros(MEMBERS, 1, b) for b in sizes[1:]])
 
-    def forward(self, inputs: Tensor) -> Tensor:
-        """(members, n) of (n, inputs)."""
+    def scaled(self, inputs: Tensor) -> Tensor:
         x = inputs.expand(MEMBERS, *inputs.shape)
         for k, (weight, bias) in enumerate(zip(self.weights, self.biases)):
             x = torch.baddbmm(bias, x, weight)
             x = torch.nn.functional.silu(x) if k + 1 < len(self.weights) else x
-        return x[..., 0]
+        return x
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """(members, n, outputs) of (n, inputs)."""
+        return self.middle + self.spread * self.scaled(inputs)
 
 
 MEMBERS, HIDDEN = 5, 64
 FITTED, DESCENDED, IMAGINED = 400, 300, 512
 """Steps of Adam on the model, steps on the policy, and situations drawn for those."""
+OUTCOME = (("center", 3), ("velocity", 3), ("upright", 3), ("lowest", 1))
+"""Of a `View`: the numbers that a loss is made of."""
+
+
+def _outcome(view: View) -> Tensor:
+    """(B, 10)."""
+    return torch.cat([getattr(view, name).reshape(-1, size) for name, size in OUTCOME], 1).detach().cpu().float()
+
+
+def _seen_as(outcome: Tensor) -> View:
+    """The view of numbers (B, 10)."""
+    center, velocity, upright, lowest = outcome.split([size for _, size in OUTCOME], 1)
+    return View(center, velocity, torch.nn.functional.normalize(upright, dim=1), lowest[:, 0])
 
 
 @torch.enable_grad()
-def _fitted_model(inputs: Tensor, loss: Tensor, generator: torch.Generator) -> LossModel:
-    model = LossModel(inputs.shape[1], generator)
+def _fitted_model(inputs: Tensor, outcomes: Tensor, generator: torch.Generator) -> OutcomeModel:
+    model = OutcomeModel(inputs, outcomes, generator)
+    wanted = (outcomes - model.middle) / model.spread
     optimiser = torch.optim.AdamW(model.parameters(), lr=3e-3, weight_decay=1e-2)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, FITTED)
     # every member leaves out other trials, so that they differ where few were played
-    counted = (torch.rand(MEMBERS, len(loss), generator=generator) < 0.8).float()
+    counted = (torch.rand(MEMBERS, len(inputs), 1, generator=generator) < 0.8).float()
     for _ in range(FITTED):
         optimiser.zero_grad()
-        ((model(inputs) - loss).square() * counted).mean().backward()
+        # a body that was missed is thrown about: it shall not outweigh those that were not
+        away = torch.nn.functional.smooth_l1_loss(model.scaled(inputs), wanted.expand(MEMBERS, -1, -1), beta=0.3, reduction="none")
+        (away * counted).mean().backward()
         optimiser.step()
         schedule.step()
     return model.requires_grad_(False)
@@ -213,8 +235,8 @@ def _fitted_model(inputs: Tensor, loss: Tensor, generator: torch.Generator) -> L
 
 @torch.no_grad()
 def by_model(train: Arena, check: Arena, search: Search, seed: int, say: Callable[[str], None] = lambda line: None) -> Found:
-    """A model of the loss is fitted to all that was tried in the simulator, and the policy is descended on the model; then more is
-    tried about what that policy does. Bounces leave a rough slope for single trials, and the model a smooth one over hundreds.
+    """A model of how trials end is fitted to all that was tried in the simulator, and the policy is descended on the model; then
+    more is tried about what that policy does. Bounces leave a rough slope for single trials, and the model a smooth one over many.
     train, check: of the same simulator and a task of one decision, the former with `search.candidates` times `search.batch` worlds.
     Errors: ConfigError for a task that decides in every step."""
     began, task = time.perf_counter(), train.task
@@ -242,22 +264,25 @@ def by_model(train: Arena, check: Arena, search: Search, seed: int, say: Callabl
         action = (about + wide * torch.randn(about.shape, generator=generator)).clamp(-1, 1)
         outcome = play(train, trials, lambda _, action=action: action)
         played += train.count
-        tried.append((seen, action, outcome.loss.cpu().to(seen)))
-        seen, action, loss = (torch.cat(part) for part in zip(*tried))
-        model = _fitted_model(torch.cat([seen, action], 1), loss, generator)
+        whole = ~outcome.diverged
+        tried.append((seen[whole], action[whole], _outcome(train.view)[whole]))
+        seen, action, ends = (torch.cat(part) for part in zip(*tried))
+        model = _fitted_model(torch.cat([seen, action], 1), ends, generator)
         _descend(policy, model, task, generator)
     policy.load_state_dict(best[1])
     return Found(policy.requires_grad_(False), history, time.perf_counter() - began, played)
 
 
 @torch.enable_grad()
-def _descend(policy: LinearPolicy, model: LossModel, task: Task, generator: torch.Generator) -> None:
+def _descend(policy: LinearPolicy, model: OutcomeModel, task: Task, generator: torch.Generator) -> None:
     """The policy's numbers to the least cost that the model's members agree on: their mean and their standard deviation."""
-    observed = task.draw(IMAGINED, generator).observed
+    trials = task.draw(IMAGINED, generator)
+    observed, many = trials.observed, trials.select(torch.arange(IMAGINED).repeat(MEMBERS))
     optimiser = torch.optim.Adam(policy.parameters(), lr=0.02)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, DESCENDED)
     for _ in range(DESCENDED):
-        found = model(torch.cat([policy.scaled(observed), policy(observed)], 1))
+        ends = model(torch.cat([policy.scaled(observed), policy(observed)], 1))
+        found = task.loss(many, _seen_as(ends.flatten(0, 1))).view(MEMBERS, IMAGINED)
         optimiser.zero_grad()
         (found.mean(0) + found.std(0)).mean().backward()
         optimiser.step()
