@@ -89,12 +89,12 @@ def look(state: TwinState, weights: Tensor, tool: int | None) -> View:
 @dataclass(frozen=True)
 class Played:
     """loss: (B,) of the last moments, with its graph where the play was differentiable; success, diverged: (B,) bool; states: of
-    worlds that were recorded, (x (T, B, N, 3), F_tot (T, B, N, 3, 3), the tool's rotation and position (T, B, 3, 4) or None)."""
+    worlds that were recorded, (x (T, B, N, 3), F_tot (T, B, N, 3, 3), the solids' rotations and positions (T, B, K, 3, 4))."""
 
     loss: Tensor
     success: Tensor
     diverged: Tensor
-    states: tuple[Tensor, Tensor, Tensor | None] | None = None
+    states: tuple[Tensor, Tensor, Tensor] | None = None
 
 
 class Arena:
@@ -111,7 +111,7 @@ class Arena:
         names = [solid["name"] for solid in task.solids()]
         self.tool = None if task.tool is None else names.index(task.tool)
         self.trials: Trials | None = None
-        self.states: list[tuple[Tensor, Tensor, Tensor | None]] | None = None
+        self.states: list[tuple[Tensor, Tensor, Tensor]] | None = None
 
     def reset(self, trials: Trials, *, differentiable: bool = False, record: bool = False) -> Tensor:
         """Begin these trials, one a world; the first observation (B, O). Errors: ConfigError."""
@@ -170,10 +170,8 @@ class Arena:
     def _see(self, state: TwinState) -> None:
         self.view = look(state, self.weights, self.tool)
         if self.states is not None:
-            tool = None
-            if self.tool is not None:
-                tool = torch.cat([state.rotation[:, self.tool], state.position[:, self.tool, :, None]], 2).detach().cpu()
-            self.states.append((state.positions.detach().cpu(), state.F_tot.detach().cpu(), tool))
+            places = torch.cat([state.rotation, state.position[..., None]], 3)
+            self.states.append(tuple(value.detach().cpu() for value in (state.positions, state.F_tot, places)))
 
 
 LOST = 5.0
@@ -196,8 +194,7 @@ def play(
             seen, over = arena.step(policy(seen))
         states = None
         if record:
-            parts = list(zip(*arena.states))
-            states = (torch.stack(parts[0]), torch.stack(parts[1]), None if arena.tool is None else torch.stack(parts[2]))
+            states = tuple(torch.stack(parts) for parts in zip(*arena.states))
         return Played(arena.loss(), arena.success(), arena.diverged, states)
 
 

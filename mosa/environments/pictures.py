@@ -25,7 +25,7 @@ PITCH = 0.011
 """[m] between the Gaussians of a solid."""
 GROUND, TILE = 0.6, 0.03
 """Half width of the ground that is drawn [m], and its pitch."""
-COLORS = {"box": (0.96, 0.96, 0.95), "paddle": (0.25, 0.45, 0.75), "arm left": (0.55, 0.57, 0.62), "arm right": (0.55, 0.57, 0.62),
+COLORS = {"box": (0.96, 0.96, 0.95), "paddle": (0.25, 0.45, 0.75), "jaw left": (0.25, 0.45, 0.75), "jaw right": (0.25, 0.45, 0.75),
           "column": (0.45, 0.47, 0.52)}  # fmt: skip
 SKY = (0.80, 0.86, 0.92)
 MARK, THIN = (0.85, 0.20, 0.20), 0.004
@@ -47,14 +47,15 @@ def mark(target: Tensor, near: float) -> tuple[Tensor, Tensor, Tensor]:
     return points, torch.full((len(points),), 0.5 * THIN), torch.tensor(MARK).expand(len(points), 3)
 
 
-def scenery(solids: Sequence[Mapping[str, Any]], tool: int | None, place: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """(means (K, 3), standard deviations (K,) [m], colours (K, 3)) of ground and solids. tool: number of the solid at `place`."""
+def scenery(solids: Sequence[Mapping[str, Any]], places: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """(means (K, 3), standard deviations (K,) [m], colours (K, 3)) of ground and solids. places: (solids, 3, 4) poses, None for
+    those that they begin at."""
     flat = lattice(2 * GROUND, 2 * GROUND, TILE)
     ground = torch.stack([flat[:, 0], torch.full((len(flat),), -0.5 * TILE), flat[:, 1]], 1)
     tiles = ((flat / 0.12).floor().sum(1) % 2)[:, None] * torch.tensor([0.08, 0.08, 0.08]) + torch.tensor([0.66, 0.65, 0.62])
     parts = [(ground, torch.full((len(ground),), 0.5 * TILE), tiles)]
     for k, solid in enumerate(colliders_from_config(solids, "solids")):
-        points = solid_surface(solid, place if k == tool else None)
+        points = solid_surface(solid, None if places is None else places[k])
         color = torch.tensor(COLORS.get(solid.name, (0.5, 0.5, 0.5)))
         parts.append((points, torch.full((len(points),), WIDTH * PITCH), shaded(points, torch.tensor([0.0, 1.0, 0.0]), color)))
     return tuple(torch.cat(values) for values in zip(*parts))
@@ -63,8 +64,8 @@ def scenery(solids: Sequence[Mapping[str, Any]], tool: int | None, place: Tensor
 def camera_of(arena: Arena, size: int) -> Cameras:
     """One camera that sees what the body falls on, or the way that it is pushed."""
     focal = 1.5 * size
-    top = getattr(arena.task, "top", 0.1)
-    target = torch.tensor([arena.task.watched, top + 0.05, 0.0])
+    height = getattr(arena.task, "top", 0.0) + 0.05
+    target = torch.tensor([arena.task.watched, height if height > 0.05 else arena.task.watched_height, 0.0])
     eye = target + torch.tensor([0.55, 0.42, 1.05])
     K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
     device = arena.rest.device
@@ -73,12 +74,12 @@ def camera_of(arena: Arena, size: int) -> Cameras:
 
 
 @torch.no_grad()
-def picture(arena: Arena, x: Tensor, F_tot: Tensor, tool: Tensor | None, size: int = 240, world: int = 0) -> np.ndarray:
-    """(size, size, 3) uint8 of a body with particles x (N, 3) [m], F_tot (N, 3, 3), the tool at the pose (3, 4), and the target of
-    the trial that is played in `world`."""
+def picture(arena: Arena, x: Tensor, F_tot: Tensor, places: Tensor | None, size: int = 240, world: int = 0) -> np.ndarray:
+    """(size, size, 3) uint8 of a body with particles x (N, 3) [m], F_tot (N, 3, 3), the solids at their poses (K, 3, 4), and the
+    target of the trial that is played in `world`."""
     device = arena.rest.device
     body = seen(arena.body, x[None].to(arena.rest), F_tot[None].to(arena.rest))
-    parts = [scenery(arena.task.solids(), arena.tool, tool)]
+    parts = [scenery(arena.task.solids(), places)]
     if arena.trials is not None and (targets := arena.task.targets(arena.trials)) is not None:
         parts.append(mark(targets[world], arena.task.near))
     means, widths, colors = (torch.cat(values).to(arena.rest) for values in zip(*parts))
@@ -92,11 +93,11 @@ def picture(arena: Arena, x: Tensor, F_tot: Tensor, tool: Tensor | None, size: i
     return to_uint8(image.clamp(0, 1).cpu())
 
 
-def film(arena: Arena, states: tuple[Tensor, Tensor, Tensor | None], world: int, frames: int, size: int = 240) -> list[np.ndarray]:
+def film(arena: Arena, states: tuple[Tensor, Tensor, Tensor], world: int, frames: int, size: int = 240) -> list[np.ndarray]:
     """`frames` pictures, from the first to the last moment, of one recorded world (`Played.states`)."""
-    x, F_tot, tool = states
+    x, F_tot, places = states
     chosen = np.linspace(0, len(x) - 1, min(frames, len(x))).round().astype(int)
-    return [picture(arena, x[t, world], F_tot[t, world], None if tool is None else tool[t, world], size, world) for t in chosen]
+    return [picture(arena, x[t, world], F_tot[t, world], places[t, world], size, world) for t in chosen]
 
 
 def write_films(folder: Path, films: Mapping[str, list[np.ndarray]], name: str) -> list[Path]:

@@ -1,4 +1,5 @@
-"""Policies of few numbers, and how they are found: by gradients through the simulator, or by reinforcement learning."""
+"""Policies of few numbers, and how they are found: by gradients through the simulator, by a model of what was tried in it, or by
+reinforcement learning."""
 
 from __future__ import annotations
 
@@ -6,6 +7,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,10 +15,11 @@ import torch
 from torch import Tensor, nn
 
 from mosa.environments.arena import Arena, play, play_all
-from mosa.environments.task import Task
+from mosa.environments.task import Task, View
 from mosa.errors import ConfigError, DataError
 
-METHODS = ("gradient", "cma", "sac", "ppo")
+METHODS = ("gradient", "cma", "model", "sac", "ppo")
+REINFORCEMENT = ("sac", "ppo")
 
 
 class LinearPolicy(nn.Module):
@@ -31,9 +34,13 @@ class LinearPolicy(nn.Module):
         weight, bias = task.starting_weights()
         self.weight, self.bias = nn.Parameter(weight.clone()), nn.Parameter(bias.clone())
 
+    def scaled(self, observation: Tensor) -> Tensor:
+        """(B, O) in [-1, 1] where a trial is within its ranges."""
+        return (observation.to(self.weight) - self.middle) / self.spread
+
     def forward(self, observation: Tensor) -> Tensor:
         """(B, A) of (B, O)."""
-        return torch.tanh((observation.to(self.weight) - self.middle) / self.spread @ self.weight.T + self.bias)
+        return torch.tanh(self.scaled(observation) @ self.weight.T + self.bias)
 
     def written(self) -> dict[str, list]:
         """Plain numbers, fit for JSON; `read` gives the same policy."""
@@ -58,7 +65,8 @@ class Search:
 
     By gradients: Adam at `rate`; `clip`: largest norm of a trial's gradient with respect to one action, as one that bounces off an
     edge may have any. By covariance matrix adaptation: `candidates` policies an iteration, drawn with a standard deviation of
-    `spread` at first."""
+    `spread` at first. By a model of how trials end: `candidates` times `batch` trials an iteration, with actions `spread` about the
+    policy's."""
 
     iterations: int = 60
     batch: int = 16
@@ -163,6 +171,124 @@ def by_evolution(train: Arena, check: Arena, search: Search, seed: int, say: Cal
     return Found(policy.requires_grad_(False), history, time.perf_counter() - began, played)
 
 
+class OutcomeModel(nn.Module):
+    """What comes of an action in a situation: `MEMBERS` networks that begin differently and are fitted to trials that were
+    played. Where they disagree nothing like it was tried. Inputs are observations, scaled to their ranges, and actions; outputs
+    are `OUTCOME`."""
+
+    def __init__(self, inputs: Tensor, outcomes: Tensor, generator: torch.Generator) -> None:
+        super().__init__()
+        self.register_buffer("middle", outcomes.median(0).values)
+        self.register_buffer("spread", (outcomes - self.middle).abs().mean(0).clamp_min(1e-6))
+        sizes = (inputs.shape[1], HIDDEN, HIDDEN, outcomes.shape[1])
+        begun = [torch.randn(MEMBERS, a, b, generator=generator) / math.sqrt(a) for a, b in pairwise(sizes)]
+        self.weights = nn.ParameterList(begun)
+        self.biases = nn.ParameterList([torch.zeros(MEMBERS, 1, b) for b in sizes[1:]])
+
+    def scaled(self, inputs: Tensor) -> Tensor:
+        x = inputs.expand(MEMBERS, *inputs.shape)
+        for k, (weight, bias) in enumerate(zip(self.weights, self.biases)):
+            x = torch.baddbmm(bias, x, weight)
+            x = torch.nn.functional.silu(x) if k + 1 < len(self.weights) else x
+        return x
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """(members, n, outputs) of (n, inputs)."""
+        return self.middle + self.spread * self.scaled(inputs)
+
+
+MEMBERS, HIDDEN = 5, 64
+FITTED, DESCENDED, IMAGINED = 400, 300, 512
+"""Steps of Adam on the model, steps on the policy, and situations drawn for those."""
+OUTCOME = (("center", 3), ("velocity", 3), ("upright", 3), ("lowest", 1))
+"""Of a `View`: the numbers that a loss is made of."""
+
+
+def _outcome(view: View) -> Tensor:
+    """(B, 10)."""
+    return torch.cat([getattr(view, name).reshape(-1, size) for name, size in OUTCOME], 1).detach().cpu().float()
+
+
+def _seen_as(outcome: Tensor) -> View:
+    """The view of numbers (B, 10)."""
+    center, velocity, upright, lowest = outcome.split([size for _, size in OUTCOME], 1)
+    return View(center, velocity, torch.nn.functional.normalize(upright, dim=1), lowest[:, 0])
+
+
+@torch.enable_grad()
+def _fitted_model(inputs: Tensor, outcomes: Tensor, generator: torch.Generator) -> OutcomeModel:
+    model = OutcomeModel(inputs, outcomes, generator)
+    wanted = (outcomes - model.middle) / model.spread
+    optimiser = torch.optim.AdamW(model.parameters(), lr=3e-3, weight_decay=1e-2)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, FITTED)
+    # every member leaves out other trials, so that they differ where few were played
+    counted = (torch.rand(MEMBERS, len(inputs), 1, generator=generator) < 0.8).float()
+    for _ in range(FITTED):
+        optimiser.zero_grad()
+        # a body that was missed is thrown about: it shall not outweigh those that were not
+        away = torch.nn.functional.smooth_l1_loss(model.scaled(inputs), wanted.expand(MEMBERS, -1, -1), beta=0.3, reduction="none")
+        (away * counted).mean().backward()
+        optimiser.step()
+        schedule.step()
+    return model.requires_grad_(False)
+
+
+@torch.no_grad()
+def by_model(train: Arena, check: Arena, search: Search, seed: int, say: Callable[[str], None] = lambda line: None) -> Found:
+    """A model of how trials end is fitted to all that was tried in the simulator, and the policy is descended on the model; then
+    more is tried about what that policy does. Bounces leave a rough slope for single trials, and the model a smooth one over many.
+    train, check: of the same simulator and a task of one decision, the former with `search.candidates` times `search.batch` worlds.
+    Errors: ConfigError for a task that decides in every step."""
+    began, task = time.perf_counter(), train.task
+    if not task.once:
+        raise ConfigError(f"policy: expected a task of one decision with policy=model, found task={task.name}")
+    generator = torch.Generator().manual_seed(seed)
+    validation = task.draw(search.validation, torch.Generator().manual_seed(10**6 + seed))
+    policy, history, played = LinearPolicy(task), [], 0
+    best: tuple[float, dict] = (math.inf, {})
+    tried: list[tuple[Tensor, Tensor, Tensor]] = []
+    for iteration in range(search.iterations + 1):
+        if iteration % search.every == 0 or iteration == search.iterations:
+            loss, success = play_all(check, validation, policy)
+            played += len(validation)
+            history.append({"iteration": iteration, "loss": float(loss.mean()), "success": float(success.float().mean())})
+            say(f"iteration {iteration}: loss {history[-1]['loss']:.3f}, success {history[-1]['success']:.2f}")
+            if history[-1]["loss"] < best[0]:
+                best = history[-1]["loss"], {name: value.clone() for name, value in policy.state_dict().items()}
+        if iteration == search.iterations:
+            break
+        trials = task.draw(train.count, generator)
+        seen = policy.scaled(trials.observed)
+        about = policy(trials.observed)
+        wide = search.spread / (1 + iteration)
+        action = (about + wide * torch.randn(about.shape, generator=generator)).clamp(-1, 1)
+        outcome = play(train, trials, lambda _, action=action: action)
+        played += train.count
+        whole = ~outcome.diverged
+        tried.append((seen[whole], action[whole], _outcome(train.view)[whole]))
+        seen, action, ends = (torch.cat(part) for part in zip(*tried))
+        model = _fitted_model(torch.cat([seen, action], 1), ends, generator)
+        _descend(policy, model, task, generator)
+    policy.load_state_dict(best[1])
+    return Found(policy.requires_grad_(False), history, time.perf_counter() - began, played)
+
+
+@torch.enable_grad()
+def _descend(policy: LinearPolicy, model: OutcomeModel, task: Task, generator: torch.Generator) -> None:
+    """The policy's numbers to the least cost that the model's members agree on: their mean and their standard deviation."""
+    trials = task.draw(IMAGINED, generator)
+    observed, many = trials.observed, trials.select(torch.arange(IMAGINED).repeat(MEMBERS))
+    optimiser = torch.optim.Adam(policy.parameters(), lr=0.02)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, DESCENDED)
+    for _ in range(DESCENDED):
+        ends = model(torch.cat([policy.scaled(observed), policy(observed)], 1))
+        found = task.loss(many, _seen_as(ends.flatten(0, 1))).view(MEMBERS, IMAGINED)
+        optimiser.zero_grad()
+        (found.mean(0) + found.std(0)).mean().backward()
+        optimiser.step()
+        schedule.step()
+
+
 def _side_by_side(policy: LinearPolicy, numbers: Tensor, batch: int) -> Callable[[Tensor], Tensor]:
     """Policies of numbers (P, (O + 1) A), the first in the first `batch` worlds, and so on."""
     actions, seen = policy.weight.shape
@@ -186,8 +312,8 @@ def by_reinforcement(method: str, train: Arena, steps: int, seed: int, options: 
     """stable-baselines3's SAC or PPO on the arena's worlds. steps: decisions in all worlds together; options: of the algorithm.
 
     Errors: ConfigError for another method, or where stable-baselines3 is not installed."""
-    if method not in METHODS[2:]:
-        raise ConfigError(f"policy: expected one of {', '.join(METHODS)}, found {method!r}")
+    if method not in REINFORCEMENT:
+        raise ConfigError(f"policy: expected one of {', '.join(REINFORCEMENT)}, found {method!r}")
     from mosa.environments.gymnasium_api import library_worlds, reinforcement_library
 
     library = reinforcement_library()

@@ -21,7 +21,7 @@ from mosa.analysis.tables import markdown
 from mosa.costs import duration
 from mosa.environments.arena import Arena, Simulator, play, play_all, scene_of, simulator_named, truth_of
 from mosa.environments.pictures import film, write_films
-from mosa.environments.policies import Found, LinearPolicy, Search, by_evolution, by_gradient, by_reinforcement
+from mosa.environments.policies import Found, LinearPolicy, Search, by_evolution, by_gradient, by_model, by_reinforcement
 from mosa.environments.task import Task
 from mosa.environments.tasks import task_named
 from mosa.errors import ConfigError, DataError
@@ -89,20 +89,23 @@ class Bench:
         return self._arenas[key]
 
 
+SEARCHES = {"gradient": by_gradient, "cma": by_evolution, "model": by_model}
+"""Of a linear policy's numbers, by `Search`; other policies are a library's."""
+
+
 def train(bench: Bench, simulator: str, seed: int) -> Found:
     """A policy found in that simulator. Errors: ConfigError."""
     s = bench.setting
     torch.manual_seed(seed)
-    worlds = s.search.batch * (s.search.candidates if s.policy == "cma" else 1)
+    worlds = s.search.batch * (s.search.candidates if s.policy in ("cma", "model") else 1)
     arena = bench.arena(simulator, worlds, training=True)
 
     def say(line: str) -> None:
         log.info("%s, %s, seed %d: %s", s.task, simulator, seed, line)
 
-    if s.policy in ("gradient", "cma"):
+    if s.policy in SEARCHES:
         check = bench.arena(simulator, min(s.worlds, s.search.validation), training=True)
-        search = by_gradient if s.policy == "gradient" else by_evolution
-        return search(arena, check, s.search, seed, say)
+        return SEARCHES[s.policy](arena, check, s.search, seed, say)
     return by_reinforcement(s.policy, arena, s.decisions, seed)
 
 
@@ -127,7 +130,8 @@ def expected(bench: Bench, simulator: str) -> str:
             taken = time.perf_counter() - began
     looks = search.validation * (1 + math.ceil(search.iterations / search.every))
     drawn = search.iterations * search.batch
-    episodes = {"gradient": looks + drawn, "cma": looks + drawn * search.candidates}
+    episodes = {"gradient": looks + drawn, "cma": looks + drawn * search.candidates,
+                "model": looks + drawn * search.candidates}
     searched = episodes.get(s.policy, s.decisions / (1 if task.once else task.steps))
     slower = (BACKWARD - 1) * drawn if s.policy == "gradient" else 0
     tested = s.trials * (1 if simulator == "truth" else 2)

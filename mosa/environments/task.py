@@ -33,9 +33,11 @@ RANGES: dict[str, Kind] = {
     "extents": Kind("three lengths of the body [m]", lambda v: isinstance(v, (tuple, list)) and len(v) == 3 and all(
         is_number(x) and 0 <= x <= ROOM for x in v)),
     "steps": whole(1, 10**5), "control_dt": number(1e-4, 1), "low": number(CLEARANCE, ROOM), "high": number(CLEARANCE, ROOM),
-    "tilt": _ANGLE, "unsteady_tilt": _ANGLE, "askew": _ANGLE, "lean": number(1e-3, math.pi), "near": _SOME, "radius": _SOME,
+    "tilt": _ANGLE, "unsteady_tilt": _ANGLE, "askew": _ANGLE, "lean": number(1e-3, math.pi), "near": _SOME,
     "still": number(1e-4, 100), "fastest": number(1e-4, 100), "turning": number(0, 100),
-    "slowest": number(1e-4, 100), "across": number(0, 100), "stroke": whole(1, 10**5), "narrow": number(0.1, 2),
+    "slowest": number(1e-4, 100), "across": number(0, 100), "stroke": whole(1, 10**5), "leaning": number(-math.pi, math.pi),
+    "hardest": number(0, 100), "unsteady_throw": number(0, 100),
+    "shut": whole(0, 10**5), "closing": whole(1, 10**5), "squeeze": number(0, 0.9),
 }  # fmt: skip
 """What a field of a task may be: lengths [m] where nothing else is said."""
 
@@ -94,6 +96,8 @@ class Task(ABC):
     ground_friction: ClassVar[float] = 0.3
     watched: ClassVar[float] = 0.05
     """x [m] of what pictures look at."""
+    watched_height: ClassVar[float] = 0.15
+    """Its height [m], where nothing lies under the body."""
 
     def __post_init__(self) -> None:
         """Errors: ConfigError naming the field that is out of its range."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -50,9 +50,13 @@ class Release(Task):
         return self.drawn[0]
 
     @property
+    def unsteady(self) -> tuple[float, ...]:
+        """By how much the hand is off at most, in what an action asks."""
+        return self.unsteady_tilt, self.unsteady_tilt, self.unsteady_aim, self.unsteady_aim
+
+    @property
     def drawn(self) -> tuple[tuple[Quantity, ...], tuple[Quantity, ...]]:
-        tilt, aim = self.unsteady_tilt, self.unsteady_aim
-        limits = zip(self.actions, (tilt, tilt, aim, aim))
+        limits = zip(self.actions, self.unsteady)
         hidden = tuple(Quantity(f"unsteady {q.name}", q.unit, -limit, limit) for q, limit in limits)
         return (Quantity("height", "m", self.low, self.high), *self.situation), hidden
 
@@ -63,7 +67,11 @@ class Release(Task):
 
     @abstractmethod
     def release(self, trials: Trials, given: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
-        """(tilts (B, 2) [rad], horizontal velocity (B, 2) [m/s]) of what the hand does (B, 4), with falling times (B,) [s]."""
+        """(tilts (B, 2) [rad], horizontal velocity (B, 2) [m/s]) of what the hand does (B, A), with falling times (B,) [s]."""
+
+    def thrown(self, given: Tensor) -> Tensor:
+        """(B,) downward speed [m/s] with which the hand lets go."""
+        return torch.zeros_like(given[:, 0])
 
     @property
     @abstractmethod
@@ -77,7 +85,9 @@ class Release(Task):
 
     def starts(self, trials: Trials, action: Tensor | None, rest: Tensor, gravity: float) -> list[dict]:
         given = self.physical(action).cpu() + trials.hidden
-        time = (2 * (trials.observed[:, 0] - CLEARANCE) / gravity).sqrt()
+        down = self.thrown(given)
+        fallen = (down.square() + 2 * gravity * (trials.observed[:, 0] - CLEARANCE)).sqrt()
+        time = (fallen - down) / gravity
         tilts, flight = self.release(trials, given, time)
         found = []
         for b in range(len(trials)):
@@ -86,7 +96,7 @@ class Release(Task):
                 "rotation": (exponential(turn) @ self.held).to(given),
                 "position": torch.stack([given[b, 2], 0 * given[b, 2], given[b, 3]]),
                 "height": self.top + CLEARANCE,
-                "velocity": torch.stack([flight[b, 0], -gravity * time[b].to(flight), flight[b, 1]]),
+                "velocity": torch.stack([flight[b, 0], -fallen[b].to(flight), flight[b, 1]]),
                 "angular_velocity": (0.0, 0.0, 0.0),
             })  # fmt: skip
         return found
@@ -146,78 +156,105 @@ class Placement(Release):
 
 @dataclass(frozen=True)
 class Hanging(Release):
-    """Hang the body between the two arms of a tower, nose down: at the end they carry it, and it reaches down between them.
+    """Hang the body on a tower: thrown to the ground before it, the body bounces up, and the tower's two jaws close about it.
 
-    The hand is in front of the tower, `close` to `far` [m] along x and up to `aside` beside it, and tosses the body onto the arms:
-    it gives the horizontal velocity that reaches the aim in free fall. The arms point along x, `narrow` times the body's
-    narrower side apart, which a third of the contact's thickness narrows further: at rest it cannot fall through.
-    Success: the lowest particle is at least `deep` below the arms' tops and `free` above the ground, the centre is within `near` of
-    the arms' middle along them and between them across, and its speed is below `still`.
+    The body is held leaning by `leaning` [rad] about z, its lowest particle `low` to `high` above the ground, `close` to `far` in
+    front of where it lands and up to `aside` beside it. The hand turns it, throws it down at up to `hardest` [m/s], and gives the
+    horizontal velocity that brings it to the aim, about `before` in front of the jaws. A light barrier 4 cm above the ground starts
+    a clock; after `shut` control steps the jaws close within `closing`, to a gap that is narrower than the body by the share
+    `squeeze`. What is between them hangs.
+    Success: at the end the centre is within `near` of the jaws' middle, along x and in height, no particle is lower than `free`,
+    and the speed is below `still`.
     """
 
-    low: float = 0.3
-    high: float = 0.35
+    steps: int = 32
+    tilt: float = 0.25
+    aim: float = 0.08
+    low: float = 0.35
+    high: float = 0.45
     unsteady_tilt: float = 0.005
     unsteady_aim: float = 0.001
-    near: float = 0.05
-    deep: float = 0.02
+    unsteady_throw: float = 0.01
+    leaning: float = math.radians(60.0)
+    hardest: float = 2.0
+    before: float = 0.25
+    far: float = 0.1
+    close: float = 0.0
+    aside: float = 0.03
+    grip: float = 0.36
+    shut: int = 13
+    closing: int = 3
+    squeeze: float = 0.2
+    near: float = 0.03
     free: float = 0.05
     still: float = 0.25
-    radius: float = 0.02
-    narrow: float = 0.85
-    tilt: float = 0.5
-    aim: float = 0.1
-    far: float = 0.15
-    close: float = 0.05
-    aside: float = 0.03
     name = "hanging"
+    watched_height = 0.25
+    JAW, OPEN = (0.12, 0.08, 0.05), 0.09
+    """Edges of a jaw [m], and how far an open one is from the body's side."""
+
+    @property
+    def actions(self) -> tuple[Quantity, ...]:
+        tilt_x, tilt_z, aim_x, aim_z = super().actions
+        return (tilt_x, tilt_z, replace(aim_x, low=aim_x.low - self.before, high=aim_x.high - self.before), aim_z,
+                Quantity("downward speed", "m/s", 0.0, self.hardest))  # fmt: skip
+
+    @property
+    def unsteady(self) -> tuple[float, ...]:
+        return *super().unsteady, self.unsteady_throw
 
     @property
     def situation(self) -> tuple[Quantity, ...]:
-        return Quantity("beside x", "m", -self.far, -self.close), Quantity("beside z", "m", -self.aside, self.aside)
+        return (Quantity("beside x", "m", -self.before - self.far, -self.before - self.close),
+                Quantity("beside z", "m", -self.aside, self.aside))  # fmt: skip
 
     def release(self, trials: Trials, given: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
         return given[:, :2], (given[:, 2:4] - trials.observed[:, 1:3]) / time[:, None]
 
-    @property
-    def gap(self) -> float:
-        return round(self.narrow * min(self.extents[0], self.extents[2]), 3)
+    def thrown(self, given: Tensor) -> Tensor:
+        return given[:, 4].clamp_min(0.0)
 
     @property
     def top(self) -> float:
-        """[m]: a body that hangs does not reach the ground."""
-        return round(1.4 * max(self.extents), 2)
-
-    @property
-    def reach(self) -> float:
-        """[m] of the arms."""
-        return round(1.33 * max(self.extents), 2)
+        """[m]: what it falls on is the ground."""
+        return 0.0
 
     @property
     def held(self) -> Tensor:
-        return exponential(torch.tensor([0.0, 0.0, -0.5 * math.pi], dtype=torch.float64))
+        return exponential(torch.tensor([0.0, 0.0, self.leaning], dtype=torch.float64))
+
+    @property
+    def apart(self) -> float:
+        """Half the distance between the faces of the open jaws [m]."""
+        return 0.5 * self.extents[2] + self.OPEN
 
     def solids(self) -> list[Mapping[str, Any]]:
         touch = {"mode": "separate", "friction": FRICTION, "thickness": THICKNESS}
-        z, y = 0.5 * self.gap + self.radius, self.top - self.radius
-        arms = [{"type": "capsule", "name": f"arm {side}", "radius": self.radius, "length": self.reach,
-                 "position": [0, y, sign * z], "rotation": [0, 1, 0, 90], **touch}
-                for side, sign in (("left", -1), ("right", 1))]  # fmt: skip
-        column = {"type": "box", "name": "column", "size": [0.06, y, 2 * z + 2 * self.radius],
-                  "position": [0.5 * self.reach + 0.03, 0.5 * y, 0], **touch}  # fmt: skip
-        return [*arms, column]
+        z = self.apart + 0.5 * self.JAW[2]
+        jaws = [{"type": "box", "name": f"jaw {side}", "size": list(self.JAW), "position": [0, self.grip, sign * z], **touch}
+                for side, sign in SIDES]  # fmt: skip
+        high = self.grip + 0.1
+        column = {"type": "box", "name": "column", "size": [0.06, high, 0.12],
+                  "position": [0.8 * max(self.extents) + 0.15, 0.5 * high, 0], **touch}  # fmt: skip
+        return [*jaws, column]
+
+    def command(self, action: Tensor, step: int) -> Mapping[str, Any] | None:
+        shut = 0.5 * (1 - self.squeeze) * self.extents[2]
+        going = self.shut <= step < self.shut + self.closing
+        speed = (self.apart - shut) / (self.closing * self.control_dt) if going else 0.0
+        return {f"jaw {side}": {"velocity": (0.0, 0.0, -sign * speed)} for side, sign in SIDES}
 
     def miss(self, trials: Trials, view: View) -> Tensor:
-        along, across = (view.center[:, 0] / self.near).square(), (view.center[:, 2] / (0.5 * self.gap)).square()
-        # where a body is whose side rests on the arms: it may be lower, never by much higher
-        fallen = torch.relu(self.top - view.center[:, 1]) / self.near
-        shallow = torch.relu(view.lowest - (self.top - self.deep)) / self.deep
-        return along + across + fallen.square() + shallow.square()
+        x, y, z = view.center.unbind(1)
+        return (x.square() + (y - self.grip).square() + z.square()) / self.near**2
 
     def succeeded(self, trials: Trials, view: View) -> Tensor:
-        hangs = (view.lowest < self.top - self.deep) & (view.lowest > self.free)
-        middle = (view.center[:, 0].abs() < self.near) & (view.center[:, 2].abs() < 0.5 * self.gap)
-        return hangs & middle & (view.velocity.norm(dim=1) < self.still)
+        away = torch.hypot(view.center[:, 0], view.center[:, 1] - self.grip)
+        return (away < self.near) & (view.lowest > self.free) & (view.velocity.norm(dim=1) < self.still)
+
+
+SIDES = (("left", -1.0), ("right", 1.0))
+"""Of the jaws, and the sign of their z."""
 
 
 @dataclass(frozen=True)

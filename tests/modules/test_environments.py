@@ -19,7 +19,7 @@ from mosa.environments import arena as arenas
 from mosa.environments import command, pictures, study
 from mosa.environments.arena import LOST, Arena, Simulator, play, play_all, simulator_named, world_of
 from mosa.environments.pictures import film
-from mosa.environments.policies import LinearPolicy, Search, _side_by_side, by_evolution, by_gradient, by_reinforcement
+from mosa.environments.policies import LinearPolicy, Search, _side_by_side, by_evolution, by_gradient, by_model, by_reinforcement
 from mosa.environments.study import Bench, Setting
 from mosa.environments.task import View
 from mosa.environments.tasks import CLEARANCE, TASKS, task_named
@@ -101,14 +101,14 @@ def test_success_is_what_the_task_says_and_the_loss_falls_towards_it():
     rest = torch.tensor([[0.0, 0, 0], [0.2, 0.24, 0.16]])
     placement, hanging, striking, pushing = (task_named(name, rest) for name in TASKS)
     nothing = {task.name: task.draw(1, torch.Generator()) for task in (placement, hanging, striking, pushing)}
-    top, under = placement.top, hanging.top
+    top, grip = placement.top, hanging.grip
     tx, tz = nothing["pushing"].observed[0].tolist()
     sx, sz = nothing["striking"].observed[0].tolist()
     good = {placement: {"center": (0.01, top + 0.1, 0.0), "lowest": top},
-            hanging: {"center": (0.01, under, 0.0), "lowest": under - 0.04}, pushing: {"center": (tx, 0.1, tz)},
+            hanging: {"center": (0.01, grip - 0.02, 0.0), "lowest": grip - 0.15}, pushing: {"center": (tx, 0.1, tz)},
             striking: {"center": (sx, 0.1, sz)}}  # fmt: skip
     bad = {placement: ({"center": (0.08, top + 0.1, 0.0)}, {"lean": 0.6}, {"lowest": 0.0}, {"speed": 0.5}),
-           hanging: ({"center": (0.08, under, 0.0)}, {"lowest": 0.02}, {"lowest": under - 0.01}, {"speed": 0.5}),
+           hanging: ({"center": (0.04, grip, 0.0)}, {"center": (0.0, grip - 0.04, 0.0)}, {"lowest": 0.02}, {"speed": 0.5}),
            pushing: ({"center": (tx + 0.05, 0.1, tz)}, {"lean": 0.6}, {"speed": 0.3}),
            striking: ({"center": (sx + 0.02, 0.1, sz)}, {"lean": 0.6}, {"speed": 0.3})}  # fmt: skip
     for task, values in good.items():
@@ -123,18 +123,21 @@ def test_success_is_what_the_task_says_and_the_loss_falls_towards_it():
 
 def test_a_hand_reaches_its_aim_in_free_fall():
     made = arena("hanging", worlds=4, steps=1)
-    trials, action = drawn(made, 4), torch.tensor([[0.5, -0.5, 0.4, -0.8]]).repeat(4, 1)
+    trials, action = drawn(made, 4), torch.tensor([[0.5, -0.5, 0.4, -0.8, 0.2]]).repeat(4, 1)
+    action[1:3, 4] = torch.tensor([-1.0, 1.0])  # let go at rest, thrown as hard as may be
     starts = made.task.starts(trials, action, made.rest, made.gravity)
     made.reset(trials)
     made.step(action)
     told = made.task.physical(action) + trials.hidden
     upright = made.rest @ made.task.held.float().T
     for b, begun in enumerate(starts):
-        time = torch.sqrt(2 * (trials.observed[b, 0] - CLEARANCE) / made.gravity)
+        down, high = float(told[b, 4].clamp_min(0)), float(trials.observed[b, 0] - CLEARANCE)
+        time = float(np.roots([0.5 * made.gravity, down, -high]).max())
+        assert float(begun["velocity"][1]) == pytest.approx(-down - made.gravity * time, rel=1e-5)
         flown = trials.observed[b, 1:3] + time * begun["velocity"][[0, 2]]
         torch.testing.assert_close(flown, told[b, 2:4], atol=1e-6, rtol=0)
         turned = made.rest @ begun["rotation"].T
-        assert float(turned[:, 1].min()) < float(upright[:, 1].min())  # tilted: it reaches further down
+        assert float((turned - upright).norm(dim=1).max()) > 0.01
     first = made.worlds.reset(starts, colliders=made.task.solids(), control_dt=made.task.control_dt)
     torch.testing.assert_close(first.positions[..., 1].amin(1), torch.full((4,), made.task.top + CLEARANCE), atol=1e-6, rtol=0)
 
@@ -147,8 +150,9 @@ def test_every_trial_is_its_own_world(name):
     together, apart = play(many, trials, policy, record=True), [play(alone, trials.select([b]), policy) for b in range(3)]
     torch.testing.assert_close(together.loss, torch.cat([p.loss for p in apart]), rtol=1e-4, atol=1e-5)
     assert together.success.tolist() == [bool(p.success) for p in apart] and not together.diverged.any()
-    x, F, tool = together.states
-    assert x.shape[:2] == (many.task.steps + 1, 3) and F.shape == (*x.shape, 3) and (tool is None) == (many.task.tool is None)
+    x, F, places = together.states
+    assert x.shape[:2] == (many.task.steps + 1, 3) and F.shape == (*x.shape, 3)
+    assert places.shape == (*x.shape[:2], len(many.task.solids()), 3, 4)
     torch.testing.assert_close(x[-1][..., 1].amin(1), many.view.lowest)
     losses, _ = play_all(many, drawn(many, 5), policy)  # more than there are worlds
     assert losses.shape == (5,)
@@ -196,13 +200,45 @@ def test_a_paddle_turns_as_it_is_told_and_a_picture_shows_it_and_the_target():
     shown = play(made, trials, lambda _: action, record=True).states
     turned = made.task.turning * action[:, 2] * 2 * made.task.control_dt
     torch.testing.assert_close(made.view.tool_turn.float(), turned)
-    face = shown[2][-1, :, :, 0]  # where the paddle's own x axis points
+    face = shown[2][-1, :, made.tool, :, 0]  # where the paddle's own x axis points
     torch.testing.assert_close(torch.atan2(face[:, 2], face[:, 0]).float(), turned)
     torch.testing.assert_close(made.task.observe(trials, made.view)[:, -1].float(), turned)
     images = [film(made, shown, world, 1, size=96)[0].astype(float) for world in (0, 1)]
     assert np.abs(images[0] - images[1]).mean() > 0.5
     red = [((image[..., 0] > 150) & (image[..., 1] < 110)).sum() for image in images]
     assert min(red) >= 4, red
+
+
+def test_the_jaws_of_the_tower_close_about_what_is_between_them():
+    """A body that is there when they close is held, and one that is not goes on."""
+    made = arena("hanging", worlds=2, steps=20, shut=0, closing=3, close=0.0, far=0.0, aside=0.0, grip=0.1, free=0.01, squeeze=0.4)
+    played = []
+    for before in (0.0, 0.3):
+        object.__setattr__(made.task, "before", before)
+        trials = drawn(made, 2)
+        played.append(play(made, trials, lambda _: torch.tensor([[0.0, 0, 0, 0, -1.0]]).repeat(2, 1), record=True))
+    apart = [shown.states[2][:, 0, 1, 2, 3] - shown.states[2][:, 0, 0, 2, 3] - made.task.JAW[2] for shown in played]
+    wide = made.task.extents[2]
+    for faces in apart:
+        assert float(faces[0]) == pytest.approx(wide + 2 * made.task.OPEN, abs=1e-6)
+        torch.testing.assert_close(faces[3:].float(), torch.full((18,), 0.6 * wide), atol=1e-6, rtol=0)
+    moved = [(shown.states[0][-1] - shown.states[0][-2]).mean(1).norm(dim=1) for shown in played]
+    assert float(moved[0].max()) < 1e-3 and float(moved[1].min()) > 1e-2, moved
+    shots = [film(made, (x[-1:], F[-1:], places[[k]]), 0, 1, size=96)[0].astype(float) for x, F, places in [played[1].states]
+             for k in (0, -1)]  # fmt: skip
+    assert np.abs(shots[0] - shots[1]).mean() > 0.5  # pictures show them where they are
+
+
+def test_a_model_of_what_was_tried_leads():
+    search = Search(iterations=2, batch=12, every=2, validation=4, candidates=2, spread=0.5)
+    train, check = arena("hanging", 24), arena("hanging", 4)
+    found = by_model(train, check, search, seed=0)
+    losses = [entry["loss"] for entry in found.history]
+    assert losses[-1] < losses[0] - 0.2 and found.trials == 2 * 24 + 2 * 4
+    again = by_model(train, check, search, seed=0)
+    assert again.history == found.history
+    with pytest.raises(ConfigError, match="policy: expected a task of one decision with policy=model, found task=pushing"):
+        by_model(arena("pushing", 2), arena("pushing", 2), search, seed=0)
 
 
 def test_a_stroke_is_one_decision_after_which_the_paddle_stands():
@@ -315,7 +351,7 @@ def test_the_command_takes_its_configuration(tmp_path, monkeypatch):
     setting = command.setting_of(values)
     assert setting.worlds == command.AT_A_TIME and setting.search == Search() and setting.trials == 100
     for change, message in (({"task": "juggling"}, "task: expected one of placement"), ({"trials": 0}, "trials: expected a whole"),
-                            ({"policy": "magic"}, "policy: expected one of gradient, cma, sac, ppo"),
+                            ({"policy": "magic"}, "policy: expected one of gradient, cma, model, sac, ppo"),
                             ({"options": {"nearr": 1.0}}, "options.nearr: expected one of steps"),
                             ({"search": {**values["search"], "rat": 1}}, "search.rat: unknown key")):  # fmt: skip
         with pytest.raises(ConfigError, match=message):
@@ -347,7 +383,7 @@ def test_without_gymnasium_the_message_says_what_to_install(monkeypatch):
     monkeypatch.setattr(builtins, "__import__", missing)
     with pytest.raises(ConfigError, match=r"expected Gymnasium, found none; pip install 'mosa\[environments\]'"):
         by_reinforcement("sac", arena(), 8, 0)
-    with pytest.raises(ConfigError, match="policy: expected one of gradient, cma, sac, ppo"):
+    with pytest.raises(ConfigError, match="policy: expected one of gradient, cma, model, sac, ppo"):
         by_reinforcement("magic", arena(), 8, 0)
 
 
