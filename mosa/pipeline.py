@@ -38,6 +38,7 @@ from mosa.physics.contact.colliders import colliders_from_config
 from mosa.plan import plan, plan_text
 from mosa.reconstruction.resolution import ENOUGH, resolution
 from mosa.reconstruction.starts import appearance_of, sequence_start
+from mosa.rendering.rasterizer import use_backend
 from mosa.rollout_file import save_observed
 from mosa.run import (
     begins_from,
@@ -155,6 +156,8 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
     exact_sums.use(cfg.deterministic)
     folder = run_folder()
     twin = Twin.load(cfg.ckpt_path, named_device(cfg.device))
+    # as the run rendered; a machine without it renders the same pictures by warp
+    use_backend((twin.config["cfg"].get("rendering") or {}).get("backend", "warp"), required=False)
     if cfg.plan is not None:
         ranked = plan(twin, count=cfg.plan)
         log.info("\n%s", plan_text(ranked))

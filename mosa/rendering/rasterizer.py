@@ -27,18 +27,21 @@ BACKENDS = ("warp", "gsplat")
 _backend = "warp"
 
 
-def use_backend(name: str) -> None:
+def use_backend(name: str, *, required: bool = True) -> None:
     """Choose the backend of all later calls of `rasterize` in this process that do not name one.
 
     gsplat then serves the calls it has kernels for (CUDA, float32, preset gsplat, no gradient to K), warp the others.
-    Errors: ConfigError for an unknown name, and for gsplat where it cannot run, with the reason.
+    required: whether gsplat has to run here; else warp does all where it cannot. Errors: ConfigError for an unknown name, and for
+    gsplat where it is required and cannot run, with the reason.
     """
     global _backend
     if name not in BACKENDS:
         raise ConfigError(f"rendering.backend: expected one of {', '.join(BACKENDS)}, found {name!r}")
     if name == "gsplat":
         reason = gsplat_backend.why_unavailable()
-        if reason:
+        if reason and not required:
+            name = "warp"
+        elif reason:
             raise ConfigError(f"rendering.backend: gsplat cannot be used here: {reason}; choose rendering=warp")
     _backend = name
 

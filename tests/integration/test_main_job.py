@@ -277,6 +277,13 @@ def evaluated(run, tmp_path, monkeypatch, *overrides) -> dict:
     return seen
 
 
+def test_eval_renders_as_the_run_did(run, tmp_path, monkeypatch):
+    used = []
+    monkeypatch.setattr(pipeline, "use_backend", lambda name, required: used.append((name, required)))
+    evaluated(run, tmp_path, monkeypatch)
+    assert used == [("warp", False)]
+
+
 def test_eval_puts_the_starts_where_the_body_is(run, tmp_path, monkeypatch):
     """Its device and type: on a GPU they stayed on the CPU, where the type is float32."""
     for sequence in evaluated(run, tmp_path, monkeypatch)["sequences"]:

@@ -9,7 +9,7 @@ import torch
 from drawn_splats import NAMES, draw, render
 
 from mosa.errors import ConfigError
-from mosa.rendering import gsplat_backend
+from mosa.rendering import gsplat_backend, rasterizer
 from mosa.rendering.rasterizer import rasterize, use_backend
 from mosa.rendering.reference import visible_covariance
 
@@ -31,6 +31,15 @@ def test_gsplat_is_refused_with_the_reason_where_it_cannot_run():
         use_backend("gsplat")
     with pytest.raises(ConfigError, match=r"gsplat backend cannot be used for this call: .*use backend='warp'"):
         render(draw(5), rasterize, backend="gsplat")
+
+
+def test_gsplat_that_is_not_required_leaves_the_work_to_warp(monkeypatch, back_to_warp):
+    for reason, expected in (("not installed", "warp"), (None, "gsplat")):
+        monkeypatch.setattr(gsplat_backend, "why_unavailable", lambda reason=reason: reason)
+        use_backend("gsplat", required=False)
+        assert rasterizer._backend == expected
+    with pytest.raises(ConfigError, match="found 'opengl'"):
+        use_backend("opengl", required=False)
 
 
 def test_unknown_backends_are_named():
