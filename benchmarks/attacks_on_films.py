@@ -138,9 +138,10 @@ def films_again(folder: Path) -> Iterator[Attack]:
         said = [line for line in said if not any(usual in line for usual in EXPECTED)]
         if errors:
             raise MosaError(errors[0]) if len(errors) == 1 else AssertionError(f"{len(errors)} messages: {errors}")
-        if not (place / "run" / "metrics.json").is_file():
+        figures = place / "run" / "metrics.json"
+        if not figures.is_file() and not said:  # what was said before the time was over counts
             raise AssertionError(f"no figures: {told[-400:]}")
-        return json.loads((place / "run" / "metrics.json").read_text()), said
+        return json.loads(figures.read_text()) if figures.is_file() else {}, said
 
     def attack(name: str, film: Callable[[], Scene], held_out: Callable[[], Scene], *more: str) -> Attack:
         def told():
