@@ -70,7 +70,8 @@ def run_out(
         out = simulator.rollout(state, parameters, torch.full((len(x),), h**3), DENSITY, round(duration / frame_dt) + 1)
     last = out.x[-1]
     front = float(last[:, 0].quantile(0.99))
-    columns = [float(last[(last[:, 0] > a) & (last[:, 0] < a + dx), 1].max()) for a in (0.5 * BASE, front - 2 * dx)]
+    there = [last[(last[:, 0] > a) & (last[:, 0] < a + dx), 1] for a in (0.5 * BASE, front - 2 * dx)]
+    columns = [float(heights.max()) if len(heights) else 0.0 for heights in there]  # grains may have flown on
     slope = math.degrees(math.atan2(columns[0] - columns[1], front - 2 * dx - 0.5 * BASE))
     return (front - BASE) / BASE, slope, float(out.v[-1].norm(dim=1).mean())
 
