@@ -23,8 +23,9 @@ REINFORCEMENT = ("sac", "ppo")
 
 
 class LinearPolicy(nn.Module):
-    """Actions tanh(W o + b) in [-1, 1] of observations scaled to their ranges: (O + 1) A numbers, 16 for a release, 9 for a
-    stroke and 30 for a push. It begins as the task says: with weights 0, at the middle of what may be asked of a hand."""
+    """Actions tanh(W o + b) in [-1, 1] of observations scaled to their ranges: (O + 1) A numbers, 16 for a placement, 20 for a
+    throw, 9 for a stroke and 30 for a push. It begins as the task says: with weights 0, at the middle of what may be asked of a
+    hand."""
 
     def __init__(self, task: Task) -> None:
         super().__init__()

@@ -383,7 +383,7 @@ def test_without_gymnasium_the_message_says_what_to_install(monkeypatch):
     monkeypatch.setattr(builtins, "__import__", missing)
     with pytest.raises(ConfigError, match=r"expected Gymnasium, found none; pip install 'mosa\[environments\]'"):
         by_reinforcement("sac", arena(), 8, 0)
-    with pytest.raises(ConfigError, match="policy: expected one of gradient, cma, model, sac, ppo"):
+    with pytest.raises(ConfigError, match="policy: expected one of sac, ppo"):
         by_reinforcement("magic", arena(), 8, 0)
 
 
