@@ -234,10 +234,15 @@ def fit(
                      "machine": device_label(device)}
 
 
-HEADS = ("body", "law", "drops", "particles", "cells of height", "noise [%]", "rms [mm]", "true law here [mm]",
+HEADS = ("body", "law", "set", "drops", "particles", "cells of height", "noise [%]", "rms [mm]", "true law here [mm]",
          "E off, mean and largest [%]", "its level", "its shape off, mean and largest [%]", "largest less smallest w",
          "stiffest over softest", "stiffest from the fibre [deg]", "95 % cone [deg]", "E between plates off, mean and largest [%]",
          "force off, largest [%]", "s")  # fmt: skip
+
+
+def settings(record: dict) -> str:
+    """Overrides that the law was learned with, but for those that change no figure."""
+    return " ".join(word for word in record["set"] if not word.startswith("identification.threads="))
 
 
 def shown(value: float | None, digits: int, scale: float = 1.0) -> str:
@@ -259,7 +264,8 @@ def table(records: list[dict]) -> str:
     rows = []
     for r in records:
         plates = r.get("plates") or {}
-        where = [len(r["drops"]), r["particles"], shown(r["cells"], 1), shown(r["noise"], 1, 100) + ", own grid" * r["own_grid"]]
+        where = [settings(r), len(r["drops"]), r["particles"], shown(r["cells"], 1),
+                 shown(r["noise"], 1, 100) + ", own grid" * r["own_grid"]]
         floor = shown(r["floor_mm"], 1)
         rows.append([r["body"], "isotropic", *where, shown(r["prior_mm"], 1), floor, *[""] * 7, *off(plates.get("prior")), ""])
         rows.append([r["body"], r["method"], *where, shown(r["learned_mm"], 1), floor, two(r, "E_off"), shown(r["E_level"], 3),
@@ -282,6 +288,7 @@ def draw(records: list[dict], folder: Path) -> None:
             degrees = plates["degrees"] if plates else r["degrees"]
             label = r["method"] + (f", {r['particles']} particles" if len({s["particles"] for s in same}) > 1 else "")
             label += f", {len(r['drops'])} drops" if len(r["drops"]) > 1 else ""
+            label += f"\n{settings(r)}" if settings(r) else ""
             if not above.lines:
                 above.plot(degrees, [e / 1e3 for e in (plates["true"] if plates else r["true_E_along"])], "k--", label="truth")
                 if plates:

@@ -226,4 +226,5 @@ def test_directions_are_found_from_a_true_motion(monkeypatch, tmp_path):
     directions.draw(records, tmp_path / "results")
     page = (tmp_path / "results" / "directions_from_motion.md").read_text()
     assert (tmp_path / "results" / "directions_from_motion.png").stat().st_size > 10_000
-    assert "| tiny " in page and "| tiny_twin " in page and "commit" in page
+    assert "| tiny " in page and "| tiny_twin " in page and "commit" in page and f"| {' '.join(settings)} |" in page
+    assert directions.settings({"set": [*settings, "identification.threads=1"]}) == " ".join(settings)
