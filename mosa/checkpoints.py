@@ -49,6 +49,9 @@ GOING_ON: dict[str, Kind] = {
     "stage": whole(0), "steps_done": whole(0), "particles": whole(1), "misfit": POSITIVE,
     "losses": Kind("numbers", lambda v: isinstance(v, list) and all(is_number(x) for x in v)),
     "compared": or_null(Kind("distances by law", lambda v: isinstance(v, Mapping) and all(map(is_number, v.values())))),
+    "ground_gain": or_null(Kind("a number", lambda v: isinstance(v, float) and not math.isnan(v))),
+    "grounds": or_null(Kind("distances by contact", lambda v: isinstance(v, Mapping) and all(
+        isinstance(x, float) and not math.isnan(x) for x in v.values()))),
 }  # fmt: skip
 """Of `mosa`, what a fit goes on from."""
 NODES, DEPTH = 2_000_000, 40
@@ -452,6 +455,9 @@ def check_resumed(checkpoint: Mapping[str, Any], path: str | Path) -> None:
         check_responses(saved.get("responses"))
         check_identification(saved.get("identification"))
         check_retreat(saved.get("retreat"))
+        if (ground := ((saved.get("config") or {}).get("world") or {}).get("ground")) is not None:
+            parts(ground, ("height", "mode", "friction"), "mosa.config.world.ground")
+            check({"world": {"ground": ground}}, {key: kind for key, kind in STORED.items() if key.startswith("world.ground.")})
         if saved.get("compared"):
             law = saved["config"]["cfg"]["prior"]["law"] if "config" in saved else None
             if not isinstance(law, str):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import torch
@@ -30,7 +30,7 @@ from mosa.physics.contact.planes import Plane
 from mosa.physics.engine.law_options import LawOptions
 from mosa.reconstruction.settings import build_settings
 from mosa.schema import known_keys
-from mosa.types import Ground, Scene
+from mosa.types import AUTO, Ground, Scene
 
 SIZES = ("particles", "particles_per_cell", "dx")
 """Keys of `simulation` that say how fine the body is: the reconstruction's."""
@@ -55,6 +55,8 @@ def world_config(scene: Scene) -> dict[str, Any]:
 def build_world(config: Mapping[str, Any]) -> World:
     """walls: {mode, friction} of the box's six sides, or None; colliders: list, see `colliders_from_config`; both may be absent."""
     ground = Ground(**config["ground"]) if config["ground"] is not None else None
+    if ground is not None and ground.mode == AUTO:  # where it is found, it is written down; until then the body sticks
+        ground = replace(ground, mode="sticky")
     gravity, up, box = (torch.tensor(config[k], dtype=torch.float32) for k in ("gravity", "up", "box"))
     return World(ground, gravity, up, box, build_walls(config.get("walls"), box),
                  colliders_from_config(config.get("colliders") or ()))

@@ -66,6 +66,8 @@ def coarser(cfg: DictConfig, run: Run, law: str) -> Identified:
         fewer.prior.law, fewer.ckpt_path = law, None
         fewer.prior.pop("candidates", None)
     module = assemble(fewer, run.device, held_out=False).module
+    if module.ground_is_sought:
+        module.settle_ground(run.module.world.ground)
     module.identify()
     return identified(module)
 

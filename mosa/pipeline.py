@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 import warnings
 from contextlib import contextmanager
+from dataclasses import replace
 
 import lightning as L
 from hydra.core.hydra_config import HydraConfig
@@ -52,6 +54,7 @@ from mosa.run import (
     shared_starts,
 )  # fmt: skip
 from mosa.twin import Twin
+from mosa.types import AUTO
 from mosa.whole_files import write_whole
 
 log = logging.getLogger(__name__)
@@ -126,6 +129,7 @@ def train(cfg: DictConfig) -> float | None:
         if parallel.launched_rank() == 0:
             log.info(fit_estimate(module, clock.costs, len(device_names(cfg))))
         fit(cfg, module, run.data, folder, device)
+    world = module.world  # where how the ground is touched was sought, it has been found
     if parallel.launched_rank() != 0:
         return None
     learned_from = [prefix for prefix in run.starts if prefix.startswith("train")]
@@ -135,6 +139,8 @@ def train(cfg: DictConfig) -> float | None:
         figures, kept = figures_of(build_evaluation(plain(cfg)), body, evaluated, world, module.posterior, folder)
         figures |= start_figures(run.starts["train"]) | reconstruction.geometry
         figures |= {f"id_prior/compared/{law}_m": distance for law, distance in module.compared.items()}
+        figures |= {f"id_prior/ground/{each}_m": distance for each, distance in module.grounds.items() if math.isfinite(distance)}
+        figures |= {"id_prior/ground_gain": module.ground_gain} if math.isfinite(module.ground_gain or math.inf) else {}
     if cfg.extrapolate:
         with clock.measure("extrapolation"):
             figures |= extrapolated(cfg, run, scene.known_parameters)
@@ -179,6 +185,9 @@ def evaluate_checkpoint(cfg: DictConfig) -> float | None:
         found = {f"test/{s.sequence}": sequence_start(body, seen, s, register=True) for s in (scene, *held_out)}
         # the body moves in the world that the scene shows, among the run's walls and colliders
         world = build_world(world_config(scene) | (twin.config["cfg"].get("world") or {}))
+        if scene.ground is not None and scene.ground.mode == AUTO and twin.world.ground is not None:
+            touched = replace(twin.world.ground, height=scene.ground.height)  # as the run found it
+            world = replace(world, ground=touched)
         warn_of_others(body, found, [scene, *held_out])
     else:
         found = {k: Start.read(s, body.rest) for k, s in (twin.config.get("starts") or {}).items()}

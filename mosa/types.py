@@ -34,9 +34,15 @@ class Cameras:
         return replace(self, K=self.K.to(device), w2c=self.w2c.to(device))
 
 
+AUTO = "auto"
+"""Mode of a ground of which only the height is known: how it is touched is found with the law."""
+
+
 @dataclass(frozen=True)
 class Ground:
-    """The half space below `height` [m] along the up axis. mode: sticky | slip | separate; friction: Coulomb, separate only."""
+    """The half space below `height` [m] along the up axis. mode: sticky | slip | separate; friction: Coulomb, separate only.
+
+    In a scene the mode may be `AUTO`; a world that is simulated has one of the three."""
 
     height: float
     mode: str = "sticky"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from mosa.metrics import IMAGE_METRICS, MOTION_METRICS
+from mosa.modules.ground_search import EXPLAINED, rival_of, taken_of
 
 MODELS = (("floor", "floor/"), ("prior", "prior/"), ("prior + eta", "prior_eta/"), ("adapted", ""))
 UNITS = {"rms_m": ("rms [mm]", 1e3, 2),
@@ -53,6 +54,22 @@ NOTICEABLE = 1.1
 """Ratio of the largest to the smallest Young's modulus below which a law counts as isotropic."""
 
 
+def ground_text(distances: Mapping[str, float], gain: float | None = None) -> str:
+    """How the body touches the ground, of distances [m] by contact (`mosa.modules.ground_search`), in sentences. gain: of the body
+    that leaves it freely over the one that sticks, about the learned law, where that was asked."""
+    words = {name: name.replace("separate_", "leaves it freely, friction ").replace("sticky", "sticks to it") for name in distances}
+    taken, rival = taken_of(distances), rival_of(distances)
+    if rival is not None and gain is not None:
+        other = f"separate_{rival:.3g}"
+        said = (f" About the learned law, a body that {words[other]} explains the motion {'better' if gain > 0 else 'worse'} by "
+                f"{abs(gain):.1f} of the logarithm of the likelihood.")
+        taken = other if gain > EXPLAINED else taken
+    else:
+        said = ""
+    listed = ", ".join(f"{words[name]} {distances[name] * 1e3:.2f} mm" for name in sorted(distances, key=distances.get))
+    return f"Ground: the body {words[taken]} (mean distance from the training motion after calibration: {listed}).{said}"
+
+
 def determined_text(figures: Mapping[str, float]) -> str:
     """What the data determine and what they do not, in sentences; empty where a run kept no posterior."""
     compared = {k.removeprefix("id_prior/compared/").removesuffix("_m"): v for k, v in figures.items()
@@ -62,8 +79,12 @@ def determined_text(figures: Mapping[str, float]) -> str:
         taken = min(compared, key=compared.get)
         listed = ", ".join(f"{law} {distance * 1e3:.2f} mm" for law, distance in sorted(compared.items(), key=lambda each: each[1]))
         lines = [f"Backbone: {taken}, which is nearest to the training motion (mean distance after calibration: {listed}).", ""]
+    touched = {k.removeprefix("id_prior/ground/").removesuffix("_m"): v for k, v in figures.items()
+               if k.startswith("id_prior/ground/") and k.endswith("_m")}
+    if touched:
+        lines += [ground_text(touched, figures.get("id_prior/ground_gain")), ""]
     if "posterior/draws" not in figures:
-        return "\n".join(lines[:1])
+        return "\n".join(lines[:-1])
     lines += ["What the data determine:", ""]
     for name, unit in (("E", "Pa"), ("mu", "Pa"), ("kappa", "Pa"), ("yield_stress", "Pa")):
         if f"posterior/{name}_relative_sd" in figures:

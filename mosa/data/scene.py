@@ -12,7 +12,7 @@ from mosa.data.scene_from_footage import check_fps, scene_from_footage
 from mosa.data.validation import validate
 from mosa.errors import ConfigError
 from mosa.schema import is_number
-from mosa.types import Ground, Scene
+from mosa.types import AUTO, Ground, Scene
 
 FORMATS = {
     "pacnerf": "mosa.data.pacnerf:load_pacnerf",
@@ -136,8 +136,8 @@ def ground_from(keys) -> Ground | None:
     if unknown:
         raise ConfigError(f"scene.ground.{min(unknown)}: expected the keys height, mode and friction only")
     mode, friction = keys.get("mode", "sticky"), keys.get("friction") or 0.0
-    if not isinstance(mode, str) or mode not in ("sticky", "slip", "separate"):
-        raise ConfigError(f"scene.ground.mode: expected sticky, slip or separate, found {mode!r}")
+    if not isinstance(mode, str) or mode not in (AUTO, "sticky", "slip", "separate"):
+        raise ConfigError(f"scene.ground.mode: expected sticky, slip, separate or auto, found {mode!r}")
     if not is_number(keys.get("height")):
         raise ConfigError(f"scene.ground.height: expected a height in metres, found {keys.get('height')!r}")
     if not is_number(friction) or friction < 0:

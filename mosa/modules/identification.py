@@ -210,13 +210,16 @@ class Identification:
         found = [self.rollout(self.body, i).x - take.cues.positions for i, take in enumerate(self.takes)]
         return sum(float(d[1:].norm(dim=-1).mean()) for d in found) / len(found)
 
-    def iterate(self) -> dict[str, float]:
-        """One iteration of Gauss-Newton, see `GaussNewton.iterate`."""
-        # substeps are a step function of the numbers: held fixed, differences are those of a smooth function
+    def _hold_substeps(self) -> None:
+        """Substeps are a step function of the numbers: held fixed, differences are those of a smooth function."""
         self.substeps = []
         for i in range(len(self.takes)):
             self.rollout(self.body, i)
             self.substeps.append(-(-int(1.05 * self.body.last_substeps) // ROUNDED) * ROUNDED)
+
+    def iterate(self) -> dict[str, float]:
+        """One iteration of Gauss-Newton, see `GaussNewton.iterate`."""
+        self._hold_substeps()
         if self.iteration < NOISE_ITERATIONS or self.noise is None:
             self._measure_noise()
         report = self.newton.iterate(learn=1 <= self.iteration < EVIDENCE_ITERATIONS,
@@ -268,7 +271,7 @@ class Identification:
         if self.calibrating or own not in RIVALS:
             return {}
         kept, found = len(newton.seats[0].read()) - self.knows_grid, {}  # the grid's multiple is last
-        own_cost = newton.cost(newton.seats[0].read(), newton.seats[0].residuals())
+        own_cost = self.cost()
         for law in RIVALS:
             if law == own:
                 continue
@@ -282,6 +285,11 @@ class Identification:
             if cost < IMPLAUSIBLE * own_cost:
                 found[law] = numbers[:kept]
         return found
+
+    def cost(self) -> float:
+        """Minus the logarithm of the posterior at the numbers in use, but for a constant, under the noise in use."""
+        seat = self.newton.seats[0]
+        return self.newton.cost(seat.read(), seat.residuals())
 
     def independent(self) -> float:
         """Share of the data that a calibration counts which its residuals bear out, in (0, 1].

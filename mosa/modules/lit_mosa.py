@@ -6,7 +6,10 @@ the modules that those two wire.
 
 from __future__ import annotations
 
+import copy
+import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 
 import lightning as L
 import torch
@@ -31,6 +34,7 @@ from mosa.modules.retreat import Retreat
 from mosa.modules.stages import Stage
 from mosa.modules.takes import Take, seen_again, with_positions
 from mosa.modules.terms import check_terms
+from mosa.types import AUTO, Ground
 
 
 class LitMosa(NewtonSteps, GradientSteps, Restorable, L.LightningModule):
@@ -57,6 +61,7 @@ class LitMosa(NewtonSteps, GradientSteps, Restorable, L.LightningModule):
         check_terms(weights, body.adapter)
         self.automatic_optimization = False
         self.body, self.world, self.takes, self.background = body, world, list(takes), background
+        self.first_takes = list(takes)
         self.stages = list(stages)
         self.weights, self.clip, self.config = dict(weights), clip, config or {}
         self.stage_index, self.losses, self.steps_done = 0, [], 0
@@ -69,6 +74,9 @@ class LitMosa(NewtonSteps, GradientSteps, Restorable, L.LightningModule):
         self.retreat, self.saved_retreat = Retreat(), None  # of the running stage, where it is Adam's
         self.informed = False  # whether the takes have the cues about the calibrated backbone
         self.compared: dict[str, float] = {}  # mean distance [m] of the calibrated candidates for the backbone
+        self.ground_gain: float | None = None  # of another contact about the learned law, once it has been looked for
+        self.untouched = copy.deepcopy(body.state_dict()) if self.ground_is_sought else None  # what a fit begins again from
+        self.grounds: dict[str, float] = {}  # mean distance [m] of the contacts with the ground that were tried
 
     @classmethod
     def from_config(cls, config: dict, body: Body, *, takes: Sequence[Take | None], background: Tensor) -> LitMosa:
@@ -93,7 +101,8 @@ class LitMosa(NewtonSteps, GradientSteps, Restorable, L.LightningModule):
                               "steps_done": self.steps_done, "particles": len(self.body.rest), "misfit": self.misfit,
                               "start": self.takes[0].start.written(),
                               "identification": self.identification.state() if self.identification else None,
-                              "compared": self.compared, "retreat": self.retreat.written(),
+                              "compared": self.compared, "grounds": self.grounds, "ground_gain": self.ground_gain,
+                              "retreat": self.retreat.written(),
                               "cues": [take.cues.positions.cpu() for take in self.takes] if self.informed else None,
                               "responses": [take.response and take.response.written() for take in self.takes]
                               if self.informed else None,
@@ -119,6 +128,9 @@ class LitMosa(NewtonSteps, GradientSteps, Restorable, L.LightningModule):
             for material in (self.body.material, *(variant["material"] for variant in self.body.frozen.values())):
                 material.choose(law)
             self.settle_law()
+        self.grounds, self.ground_gain = dict(saved.get("grounds") or {}), saved.get("ground_gain")
+        if self.ground_is_sought and (written := saved["config"]["world"]["ground"]) is not None:
+            self.settle_ground(Ground(**written))
         self.posterior = Posterior.read(saved["posterior"]) if saved.get("posterior") else None
         if saved.get("cues") is not None and self.takes:
             self.takes, self.informed = with_positions(self.takes, saved["cues"], saved.get("responses")), True
@@ -132,6 +144,24 @@ class LitMosa(NewtonSteps, GradientSteps, Restorable, L.LightningModule):
         prior = dict(self.config.get("cfg", {}).get("prior", {}))
         if prior:
             self.config["cfg"]["prior"] = prior | {"law": self.body.material.law, "candidates": []}
+
+    @property
+    def ground_is_sought(self) -> bool:
+        """Whether nobody said how the ground is touched (scene.ground.mode=auto), and it is not found yet."""
+        return ((self.config.get("world") or {}).get("ground") or {}).get("mode") == AUTO
+
+    def settle_ground(self, ground: Ground) -> None:
+        """What is simulated and written from now on meets this ground."""
+        self.world = replace(self.world, ground=ground)
+        self.config["world"]["ground"] = asdict(ground)
+
+    def begin_again(self, ground: Ground) -> None:
+        """All stages from the start, on another ground, with the motion that was seen at first: the second look was about a body
+        that met the old one."""
+        self.settle_ground(ground)
+        self.body.load_state_dict(self.untouched)
+        self.takes, self.informed = list(self.first_takes), False
+        self.stage_index, self.losses, self.identification, self.posterior = 0, [], None, None
 
     # ---------------------------------------------------------------- one step
     def training_step(self, batch, _index: int) -> None:
@@ -149,6 +179,10 @@ class LitMosa(NewtonSteps, GradientSteps, Restorable, L.LightningModule):
         """What a stage starts from."""
         if stage.start is not None:
             self.body.thaw(stage.start)
+        if self.ground_is_sought and not stage.newton:
+            warnings.warn(f"scene.ground.mode: auto asks for fit.{stage.name}.optimizer=gauss_newton, which compares contacts; "
+                          "found adam, and the body sticks to the ground: say sticky, slip or separate", stacklevel=1)
+            self.settle_ground(self.world.ground)
         if stage.looks_again or not (stage.calibrates or self.informed):
             self.inform(response=stage.newton and not stage.calibrates)
         adapter, material = self.body.adapter, self.body.material

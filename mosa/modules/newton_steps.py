@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import copy
+import logging
+import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from mosa import parallel
-from mosa.errors import DataError, MosaError
+from mosa.errors import DataError, MosaError, SimulationDiverged
 from mosa.modules.backbone_search import choose_law
-from mosa.modules.identification import Identification
+from mosa.modules.ground_search import EXPLAINED, choose_ground, rival_of
+from mosa.modules.identification import EVIDENCE_ITERATIONS, Identification
 from mosa.modules.residuals import SAMPLES
 from mosa.modules.stages import Stage
 from mosa.progress import tqdm
+from mosa.types import Ground
+
+log = logging.getLogger(__name__)
+RIVAL_ITERATIONS = 3
+"""In which a learned law is fitted to another contact with the ground, before the two are compared."""
 
 
 class NewtonSteps:
@@ -33,13 +43,20 @@ class NewtonSteps:
         self.steps_done += 1
         self.report_newton(found)
         if self.identification.converged or stage.ended(self.losses):
+            if (ground := self.better_ground(stage)) is not None:
+                self.begin_again(ground)
+                return
             self.keep_posterior(stage)
             self.finish(stage)
 
     def begun(self, stage: Stage, saved: Mapping[str, Any] | None = None) -> Identification:
         """A stage's identification, ready for its first iteration, or for the next one where `saved` is what a checkpoint kept."""
-        searched = bool(self.body.material.candidates)  # then the best of them is where its calibration left it
-        if searched:
+        searched = False  # else the best of the candidates is where its calibration left it
+        if self.ground_is_sought and stage.calibrates:
+            self.find_ground(stage)
+            searched = True
+        if self.body.material.candidates:
+            searched = True
             self.compared = choose_law(self.body, self.body.material.candidates, lambda: self.identifying(stage))
             self.settle_law()
         identification = self.identifying(stage)
@@ -49,6 +66,41 @@ class NewtonSteps:
             identification.search()
         return identification
 
+    def find_ground(self, stage: Stage) -> None:
+        """How the body touches the ground, by a calibration on each that may be."""
+        ground, self.grounds = choose_ground(self.body, self.world.ground.height, lambda each: self.identifying(stage, each))
+        self.settle_ground(ground)
+
+    def better_ground(self, stage: Stage) -> Ground | None:
+        """Where the ground was sought and the law has been learned of a body that sticks to it: another contact that explains the
+        motion better, about that law. None where there is none, and once the fit has begun again."""
+        friction = rival_of(self.grounds) if stage.learns_adapter and self.grounds and self.ground_gain is None else None
+        if friction is None:
+            return None
+        ground = Ground(self.world.ground.height, "separate", friction)
+        self.ground_gain = parallel.mean(self.gained_on(ground, stage))
+        log.info("ground: a body that leaves it freely, with friction %.3g, explains the motion %s than one that sticks (by %.1f "
+                 "of the logarithm of the likelihood)%s", friction, "better" if self.ground_gain > 0 else "worse",
+                 abs(self.ground_gain), "; the fit begins again" if self.ground_gain > EXPLAINED else "")  # fmt: skip
+        return ground if self.ground_gain > EXPLAINED else None
+
+    def gained_on(self, ground: Ground, stage: Stage) -> float:
+        """By how much the running identification's cost falls on another ground, from the same numbers and under the same noise, in
+        `RIVAL_ITERATIONS`; minus infinity where the body cannot be simulated there. The fit itself stays where it stands."""
+        own = self.identification
+        other = Identification(copy.deepcopy(self.body), self.takes, replace(self.world, ground=ground), stage, self.criterion,
+                               self.settings, own.kinds)
+        state = own.state()
+        other.restore(state | {"iteration": max(state["iteration"], EVIDENCE_ITERATIONS)})
+        try:
+            for _ in range(RIVAL_ITERATIONS):
+                cost = other.iterate()["after"]
+                if other.converged:
+                    break
+        except SimulationDiverged:
+            return -math.inf
+        return own.cost() - cost
+
     def keep_posterior(self, stage: Stage) -> None:
         """Of the running identification, where it is the last one."""
         alone = self.body.adapter is None and self.body.heterogeneity is None  # then the calibration is all there is
@@ -57,20 +109,24 @@ class NewtonSteps:
 
     def identify(self) -> None:
         """All stages by Gauss-Newton without a trainer: nothing is logged or kept. Errors: those of an iteration."""
-        for stage in self.stages[self.stage_index :]:
+        while (stage := self.stage) is not None:
             self.begin(stage)
             self.identification = self.begun(stage)
             for _ in tqdm(range(stage.iterations), f"stage {stage.name}", leave=False):
                 self.identification.iterate()
                 if self.identification.converged:
                     break
+            if (ground := self.better_ground(stage)) is not None:
+                self.begin_again(ground)
+                continue
             self.keep_posterior(stage)
             self.end(stage)
 
-    def identifying(self, stage: Stage) -> Identification:
-        """A stage's identification on the takes, from where the body stands."""
+    def identifying(self, stage: Stage, ground: Ground | None = None) -> Identification:
+        """A stage's identification on the takes, from where the body stands. ground: another one than the world's."""
+        world = self.world if ground is None else replace(self.world, ground=ground)
         kinds = tuple(self.weights.get(name, 0.0) != 0 for name in ("position", "rotation", "stretch"))
-        return Identification(self.body, self.takes, self.world, stage, self.criterion, self.settings, kinds)
+        return Identification(self.body, self.takes, world, stage, self.criterion, self.settings, kinds)
 
     def go_on(self, identification: Identification, saved: Mapping[str, Any]) -> None:
         """The identification as a checkpoint has it, whose containers were checked. Errors: DataError where it is another fit's."""

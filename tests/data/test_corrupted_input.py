@@ -219,7 +219,7 @@ KEYS = [
     ({"box": [0, 1]}, "scene.box: expected three numbers"),
     ({"density": -5.0}, "scene.density: expected a positive number"),
     ({"fps": 0.0}, "scene.fps: expected a positive number"),
-    ({"ground": {"height": 0.0, "mode": "rubber"}}, "scene.ground.mode: expected sticky, slip or separate"),
+    ({"ground": {"height": 0.0, "mode": "rubber"}}, "scene.ground.mode: expected sticky, slip, separate or auto"),
     ({"ground": {"hight": 0.0}}, "scene.ground.hight"),
     ({"ground": {"mode": "slip"}}, "scene.ground.height: expected a height"),
     ({"ground": {"height": 0.0, "friction": -1.0}}, "scene.ground.friction"),

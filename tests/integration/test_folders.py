@@ -15,6 +15,7 @@ from mosa import pipeline
 from mosa.data.export import export_particles, export_transforms
 from mosa.data.scene import load_scene
 from mosa.evaluation import run_sequences
+from mosa.modules.ground_search import named, taken_of
 from mosa.twin import Twin
 
 ROOT = Path(__file__).parents[2]
@@ -69,6 +70,15 @@ def run(tmp_path_factory, cache):
                   "scene.also_train=[test_60]", "scene.test=[{path: test_40, name: second}]", f"scene.cache={cache}")
     assert result.returncode == 0, result.stderr[-3000:]
     return folder / "run"
+
+
+def test_how_the_ground_is_touched_is_found_where_nobody_says_it(run):
+    """And the twin of the run meets the same ground."""
+    figures = json.loads((run / "metrics.json").read_text())
+    tried = {key.split("/")[-1].removesuffix("_m"): value for key, value in figures.items() if key.startswith("id_prior/ground/")}
+    assert {"sticky", "separate_0.15", "separate_1.2"} <= set(tried) and all(0 < value < 0.1 for value in tried.values())
+    ground = Twin.load(run / "checkpoints" / "last.ckpt").world.ground
+    assert taken_of(tried) == named(ground) and "Ground: the body" in (run / "results.md").read_text()
 
 
 def test_a_folder_that_is_held_out_has_figures(run):

@@ -1,0 +1,195 @@
+"""How a small body touches its ground, found from its own rollouts; what a run makes of it."""
+
+import math
+from dataclasses import asdict, replace
+
+import pytest
+import torch
+from small_bodies import NU, WORLD, E, small_body, start, take_of
+
+from mosa.analysis.tables import ground_text
+from mosa.checkpoints import check_resumed
+from mosa.errors import DataError, SimulationDiverged
+from mosa.modules import ground_search
+from mosa.modules.body import World
+from mosa.modules.criteria import Criterion
+from mosa.modules.ground_search import choose_ground, named, taken_of
+from mosa.modules.identification import Identification
+from mosa.modules.identification_settings import IdentificationSettings
+from mosa.modules.lit_mosa import LitMosa
+from mosa.modules.stages import Stage
+from mosa.types import AUTO, Ground
+
+FRAMES = 12
+
+
+def world(ground: Ground) -> World:
+    return World(ground, WORLD.gravity, WORLD.up, WORLD.box)
+
+
+def search(body, take):
+    """`choose_ground` as a run does it."""
+    stage, criterion, settings = Stage("prior", 40, 0.1), Criterion("corrected"), IdentificationSettings()
+    return choose_ground(body, 0.0, lambda g: Identification(body, [take], world(g), stage, criterion, settings, seats=1))
+
+
+@pytest.mark.parametrize("truth", [Ground(0.0, "sticky"), Ground(0.0, "separate", 0.2), Ground(0.0, "separate", 0.6)])
+def test_contact_and_friction_are_found_with_the_law(truth):
+    """A turned block that moves along the ground. The friction is known to within the steps of the search."""
+    begins = start(turn=0.5, speed=-2.0)
+    begins.velocity[0] = 0.8
+    take = take_of(small_body(adapter=False), begins, FRAMES, world(truth))
+    body = small_body(adapter=False, E=1.7 * E, nu=0.3)
+    found, distances = search(body, take)
+    assert found.mode == truth.mode and found.height == 0.0
+    assert distances[named(found)] == min(distances.values()) and len(distances) == 5 + 2 * (truth.mode == "separate")
+    if truth.mode == "separate":
+        assert truth.friction / 2**0.25 * 0.99 < found.friction < truth.friction * 2**0.25 * 1.01
+    values = {name: float(value.detach()) for name, value in body.material.physical().items()}
+    assert values["E"] == pytest.approx(E, rel=0.05) and values["nu"] == pytest.approx(NU, abs=0.03)
+
+
+def test_a_contact_that_cannot_be_simulated_is_left_out(monkeypatch):
+    """And the body is where the best one's calibration left it."""
+    body, seen = small_body(adapter=False), []
+
+    class Calibration:
+        def __init__(self, ground):
+            self.ground = ground
+
+        def search(self):
+            seen.append(self.ground)
+
+        def iterate(self):
+            if self.ground.friction > 0.5:
+                raise SimulationDiverged("it cannot")
+            with torch.no_grad():
+                body.material.raw["E"].fill_(self.ground.friction)
+
+        def distance(self):
+            return (1 + self.ground.friction) * (self.ground.mode == "separate") + 2 * (self.ground.mode == "sticky")
+
+    found, costs = choose_ground(body, 0.1, Calibration)
+    assert found.height == 0.1 and found.mode == "separate" and found.friction == pytest.approx(0.15 / math.sqrt(2))
+    assert [ground.mode for ground in seen] == ["sticky"]
+    assert math.isinf(costs["separate_0.6"]) and math.isinf(costs["separate_1.2"]) and costs["sticky"] == 2
+    assert float(body.material.raw["E"].detach()) == pytest.approx(found.friction)
+    monkeypatch.setattr(Calibration, "iterate", lambda self: (_ for _ in ()).throw(SimulationDiverged("nowhere")))
+    with pytest.raises(SimulationDiverged):  # not even the body that sticks
+        choose_ground(body, 0.1, Calibration)
+
+
+def test_a_body_sticks_unless_another_contact_is_clearly_nearer():
+    """Rough grounds hold a body about as one that it sticks to does, and an isotropic law is wrong by more than the difference."""
+    assert taken_of({"sticky": 1.0, "separate_1.2": 0.92, "separate_0.15": 3.0}) == "sticky"
+    assert taken_of({"sticky": 1.0, "separate_1.2": 0.88, "separate_0.15": 3.0}) == "separate_1.2"
+
+
+def test_a_report_says_how_the_ground_is_touched():
+    text = ground_text({"sticky": 20e-3, "separate_0.3": 12e-3, "separate_0.6": 15.5e-3})
+    assert text.startswith("Ground: the body leaves it freely, friction 0.3 (mean distance from the training motion")
+    assert text.endswith("friction 0.3 12.00 mm, leaves it freely, friction 0.6 15.50 mm, sticks to it 20.00 mm).")
+    near = {"sticky": 20e-3, "separate_0.6": 19.5e-3}
+    assert ground_text(near, 7.5).startswith("Ground: the body leaves it freely, friction 0.6 (mean")
+    assert ground_text(near, 7.5).endswith("leaves it freely, friction 0.6 explains the motion better by 7.5 of the logarithm of "
+                                           "the likelihood.")  # fmt: skip
+    assert ground_text(near, -2.0).startswith("Ground: the body sticks to it (mean") and "worse by 2.0" in ground_text(near, -2.0)
+
+
+def fit_of(take, **changed) -> LitMosa:
+    """A calibration of a body whose ground is sought, as a run has it."""
+    body = small_body(adapter=False, E=1.7 * E, nu=0.3)
+    config = {"world": {"ground": {"height": 0.0, "mode": AUTO, "friction": 0.0}}}
+    stage = replace(Stage("prior", 1, 0.1), optimizer="gauss_newton", **changed)
+    return LitMosa(body, takes=[take], world=world(Ground(0.0, "sticky")), background=torch.ones(3), config=config,
+                   weights={"position": 1.0}, stages=[stage])  # fmt: skip
+
+
+def test_a_run_goes_on_with_the_ground_that_it_found():
+    """Its world, what it keeps, and a fit that goes on from that; until then it is a ground that nobody knows."""
+    truth = Ground(0.0, "separate", 0.3)
+    begins = start(turn=0.5, speed=-2.0)
+    begins.velocity[0] = 0.8
+    take = take_of(small_body(adapter=False), begins, FRAMES, world(truth))
+    take.again = None
+    module = fit_of(take)
+    assert module.ground_is_sought
+    module.identify()
+    assert not module.ground_is_sought and module.world.ground == truth and module.config["world"]["ground"] == asdict(truth)
+    checkpoint: dict = {}
+    module.on_save_checkpoint(checkpoint)
+    assert checkpoint["mosa"]["grounds"]["separate_0.3"] == min(checkpoint["mosa"]["grounds"].values())
+    again = fit_of(take)
+    again.on_load_checkpoint(checkpoint)
+    assert again.world.ground == truth and again.config["world"]["ground"] == asdict(truth) and again.grounds == module.grounds
+
+
+@pytest.mark.parametrize("truth", [Ground(0.0, "separate", 1.2), Ground(0.0, "sticky")])
+def test_a_fit_begins_again_on_the_ground_that_explains_the_learned_law_better(monkeypatch, truth):
+    """Where the isotropic law could not tell: here nothing is near enough to be taken but the body that sticks. The rival has the
+    friction with which the isotropic law is nearest."""
+    monkeypatch.setattr(ground_search, "NEARER", 0.0)
+    begins = start(turn=0.5, speed=-2.0)
+    begins.velocity[0] = 0.8
+    numbers = torch.linspace(-0.02, 0.03, 19, dtype=torch.float64)
+    take = take_of(small_body(numbers=numbers), begins, FRAMES, world(truth))
+    take.again = None
+    body = small_body(E=1.2 * E, nu=0.3, on=False)
+    config = {"world": {"ground": {"height": 0.0, "mode": AUTO, "friction": 0.0}}}
+    stages = [replace(Stage(name, 8, 0.1), optimizer="gauss_newton") for name in ("prior", "joint")]
+    module = LitMosa(body, takes=[take], world=world(Ground(0.0, "sticky")), background=torch.ones(3), config=config,
+                     weights={"position": 1.0}, stages=stages, criterion=Criterion("corrected"),
+                     settings=IdentificationSettings(grid_error=0.0))  # fmt: skip
+    begun = []
+    begin = module.begin
+    monkeypatch.setattr(module, "begin", lambda stage: begun.append((stage.name, module.world.ground)) or begin(stage))
+    module.identify()
+    sticks = Ground(0.0, "sticky")
+    rough = Ground(0.0, "separate", 0.6)  # whoever hardly slides is as near at 0.6 as at 1.2
+    again = [("prior", rough), ("joint", rough)] if truth.mode == "separate" else []
+    assert begun == [("prior", sticks), ("joint", sticks), *again]
+    assert module.world.ground.mode == truth.mode and (module.ground_gain > ground_search.EXPLAINED) == (truth.mode == "separate")
+    assert float(body.material.physical()["E"].detach()) == pytest.approx(E, rel=0.1) and module.posterior is not None
+    checkpoint: dict = {}
+    module.on_save_checkpoint(checkpoint)
+    assert checkpoint["mosa"]["ground_gain"] == module.ground_gain  # so that a fit that goes on does not begin again once more
+
+
+def test_a_contact_that_cannot_be_simulated_gains_nothing(monkeypatch):
+    """And leaves the fit where it was."""
+    module = fit_of(take_of(small_body(adapter=False), start(turn=0.5), FRAMES))
+    module.begin(stage := module.stages[0])
+    module.identification = module.identifying(stage)
+    module.identification.iterate()
+    before = {name: value.clone() for name, value in module.body.state_dict().items()}
+    same = module.gained_on(module.world.ground, stage)
+    assert same > -1e-6  # the very ground: it is fitted further
+    monkeypatch.setattr(Identification, "iterate", lambda self: (_ for _ in ()).throw(SimulationDiverged("it cannot")))
+    assert module.gained_on(Ground(0.0, "separate", 0.3), stage) == -math.inf
+    assert all(torch.equal(value, before[name]) for name, value in module.body.state_dict().items())
+
+
+def test_adam_takes_a_body_that_sticks_and_says_so():
+    module = fit_of(take_of(small_body(adapter=False), start(turn=0.5), FRAMES), newton_iterations=1)
+    stage = replace(module.stages[0], optimizer="adam")
+    with pytest.warns(UserWarning, match="scene.ground.mode: auto asks for fit.prior.optimizer=gauss_newton"):
+        module.begin(stage)
+    assert module.world.ground == Ground(0.0, "sticky") and module.config["world"]["ground"]["mode"] == "sticky"
+
+
+@pytest.mark.parametrize("ground, message", [
+    ({"height": 0.0, "mode": "auto", "friction": 0.0}, "world.ground.mode: expected sticky or slip or separate, found 'auto'"),
+    ({"height": 0.0, "mode": "separate", "friction": -1.0}, "world.ground.friction"),
+    ({"height": 0.0}, "mosa.config.world.ground: expected"),
+])  # fmt: skip
+def test_a_checkpoint_with_another_ground_is_refused(ground, message):
+    saved = {"stage": 0, "losses": [], "steps_done": 0, "particles": 1, "config": {"world": {"ground": ground}}}
+    parts = {name: [] for name in ("state_dict", "loops", "optimizer_states", "lr_schedulers", "callbacks", "global_step", "epoch")}
+    with pytest.raises(DataError, match=message):
+        check_resumed({**parts, "pytorch-lightning_version": "2", "state_dict": {}, "mosa": saved}, "a.ckpt")
+
+
+def test_frictions_are_within_two_of_each_other():
+    """So that the search reaches every coefficient between them to a quarter of a power of two."""
+    steps = [b / a for a, b in zip(ground_search.FRICTIONS, ground_search.FRICTIONS[1:])]
+    assert all(step == pytest.approx(ground_search.BETWEEN**2) for step in steps)
