@@ -228,3 +228,17 @@ def test_directions_are_found_from_a_true_motion(monkeypatch, tmp_path):
     assert (tmp_path / "results" / "directions_from_motion.png").stat().st_size > 10_000
     assert "| tiny " in page and "| tiny_twin " in page and "commit" in page and f"| {' '.join(settings)} |" in page
     assert directions.settings({"set": [*settings, "identification.threads=1"]}) == " ".join(settings)
+
+
+def test_the_planned_drop_is_compared_with_the_others(monkeypatch):
+    """Each fit of a problem has the training drop, the held-out ones and one candidate; the table says which was planned."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    planned = importlib.import_module("planned")
+    names = ("train", "test/test_60", "train/plan_1", "train/plan_10", "train/plan_2")
+    problem = {"sequences": {name: {} for name in names}, "config": 5}
+    assert list(planned.with_only(problem, None)["sequences"]) == ["train", "test/test_60"]
+    assert list(planned.with_only(problem, 1)["sequences"]) == ["train", "test/test_60", "train/plan_1"]
+    assert planned.with_only(problem, 2)["config"] == 5 and len(problem["sequences"]) == 5
+    record = {"problem": "rabbit", "prior_mm": 24.0, "one_drop_mm": 6.04, "gains": [0.5, None, 2.25], "errors_mm": [5.0, 6.0, 3.96],
+              "planned_mm": 3.96, "others_mm": 5.5, "seconds": 60.0}
+    assert planned.table([record]).splitlines()[-1] == "| rabbit | 24.0 | 6.0 | 4.0 | 5.5 | 0.50: 5.0, -: 6.0, 2.25: 4.0 | 60 |"
