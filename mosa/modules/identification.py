@@ -26,6 +26,8 @@ from mosa.modules.material import RIVALS
 from mosa.modules.stages import Stage
 from mosa.reconstruction.response import Response
 
+COUNTED_AT_FIRST = 100 / 30
+"""Of a calibration's data over a later stage's, frame by frame: it has few numbers, and no model of its own error in its noise."""
 NOISE_ITERATIONS = 3
 """Iterations in which the noise is found again; later its scale stays, so that costs can be compared."""
 EVIDENCE_ITERATIONS = 5
@@ -167,7 +169,7 @@ class Identification:
             return self._compared(self._fields(body), multiple)
 
     def _compared(self, found: list[residuals.Fields], multiple: float) -> Tensor:
-        share = self.settings.count / len(self.gains) * (100 / 30 if self.calibrating else 1)
+        share = self.settings.count / len(self.gains) * (COUNTED_AT_FIRST if self.calibrating else 1)
         counts = tuple(share * on for on in self.kinds)
         return residuals.whitened(self._along(found, multiple), self.noise, [counts] * len(self.pairs))
 
@@ -296,7 +298,7 @@ class Identification:
 
         What a free rollout leaves beyond the cues' own noise is what grid, contact and the law's form get wrong: a few smooth
         patterns in all the frames together (`residuals.patterns`), and not `count` independent errors in every one of them."""
-        each, cues = 100 / 30 * self.settings.count, 3 * residuals.floors(self.body.settings.dx, 0.0)[0] ** 2
+        each, cues = COUNTED_AT_FIRST * self.settings.count, 3 * residuals.floors(self.body.settings.dx, 0.0)[0] ** 2
         counted, wrong, late = 0.0, 0.0, []
         for take, scales, found in zip(self.takes, self.noise, self._fields(self.body)):
             frames = slice(min(take.first_contact, len(scales[0])) - 1, None)
