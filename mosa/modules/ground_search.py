@@ -54,11 +54,13 @@ def taken_of(distances: Mapping[str, float]) -> str:
 
 def rival_of(distances: Mapping[str, float]) -> float | None:
     """Friction of the contact that may explain the learned law's motion better than sticking, of distances [m] by `named`: the
-    nearest of those that leave the ground. None where a body that slides was taken, or no other can be simulated."""
-    sliding = {name: distance for name, distance in distances.items() if name != "sticky" and math.isfinite(distance)}
-    if taken_of(distances) != "sticky" or not sliding:
+    roughest of those that leave the ground and are about as near as the nearest of them, as no sliding is seen where more friction
+    changes nothing. None where a body that slides was taken, or no other can be simulated."""
+    sliding = {float(name.removeprefix("separate_")): distance for name, distance in distances.items() if name != "sticky"}
+    least = min(sliding.values(), default=math.inf)
+    if taken_of(distances) != "sticky" or not math.isfinite(least):
         return None
-    return float(min(sliding, key=sliding.get).removeprefix("separate_"))
+    return max(friction for friction, distance in sliding.items() if NEARER * distance <= least)
 
 
 def choose_ground(

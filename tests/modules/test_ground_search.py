@@ -13,7 +13,7 @@ from mosa.errors import DataError, SimulationDiverged
 from mosa.modules import ground_search
 from mosa.modules.body import World
 from mosa.modules.criteria import Criterion
-from mosa.modules.ground_search import choose_ground, named, taken_of
+from mosa.modules.ground_search import choose_ground, named, rival_of, taken_of
 from mosa.modules.identification import Identification
 from mosa.modules.identification_settings import IdentificationSettings
 from mosa.modules.lit_mosa import LitMosa
@@ -85,6 +85,13 @@ def test_a_body_sticks_unless_another_contact_is_clearly_nearer():
     assert taken_of({"sticky": 1.0, "separate_1.2": 0.88, "separate_0.15": 3.0}) == "separate_1.2"
 
 
+def test_the_rival_is_the_roughest_ground_on_which_no_sliding_is_seen():
+    assert rival_of({"sticky": 10.5, "separate_0.3": 13.5, "separate_0.6": 11.9, "separate_1.2": 11.91}) == 1.2
+    assert rival_of({"sticky": 10.5, "separate_0.15": 12.0, "separate_0.3": 14.0, "separate_1.2": math.inf}) == 0.15
+    assert rival_of({"sticky": 10.5, "separate_0.15": 8.0}) is None  # a body that slides was taken
+    assert rival_of({"sticky": 10.5, "separate_0.15": math.inf}) is None
+
+
 def test_a_report_says_how_the_ground_is_touched():
     text = ground_text({"sticky": 20e-3, "separate_0.3": 12e-3, "separate_0.6": 15.5e-3})
     assert text.startswith("Ground: the body leaves it freely, friction 0.3 (mean distance from the training motion")
@@ -145,8 +152,7 @@ def test_a_fit_begins_again_on_the_ground_that_explains_the_learned_law_better(m
     monkeypatch.setattr(module, "begin", lambda stage: begun.append((stage.name, module.world.ground)) or begin(stage))
     module.identify()
     sticks = Ground(0.0, "sticky")
-    rough = Ground(0.0, "separate", 0.6)  # whoever hardly slides is as near at 0.6 as at 1.2
-    again = [("prior", rough), ("joint", rough)] if truth.mode == "separate" else []
+    again = [("prior", truth), ("joint", truth)] if truth.mode == "separate" else []
     assert begun == [("prior", sticks), ("joint", sticks), *again]
     assert module.world.ground.mode == truth.mode and (module.ground_gain > ground_search.EXPLAINED) == (truth.mode == "separate")
     assert float(body.material.physical()["E"].detach()) == pytest.approx(E, rel=0.1) and module.posterior is not None
