@@ -22,7 +22,7 @@ from mosa.data.agreement import lines_of_sight, misses
 from mosa.errors import ConfigError, MosaError
 from mosa.limits import machine_memory
 from mosa.modules.body import Body, Start, World
-from mosa.modules.ground_search import FRICTIONS, TRIED
+from mosa.modules.ground_search import FRICTIONS, RIVAL_ITERATIONS, TRIED
 from mosa.modules.identification import Identification
 from mosa.modules.lit_mosa import LitMosa
 from mosa.modules.material import RIVALS
@@ -255,6 +255,7 @@ def newton_rollouts(module: LitMosa, stage: Stage) -> float:
     each = columns / together + 5  # the residuals, the noise, one or two steps that are tried, the distance
     begun = planned.calibrating and not stage.looks_again
     contacts = (3 + len(FRICTIONS)) * (TRIED * each + 3) if begun and module.ground_is_sought else 0
+    contacts += RIVAL_ITERATIONS * each if stage.learns_adapter and module.ground_is_sought else 0
     return len(planned.pairs) * (stage.iterations * each + contacts + (24 if begun else 0))
 
 

@@ -28,6 +28,10 @@ EXPLAINED = 5.0
 the fit to begin again on it."""
 TRIED = 3
 """Iterations of each calibration after the first, from that one's numbers on: how a body slides hardly moves its moduli."""
+RIVAL_ITERATIONS = 3
+"""In which a learned law is fitted to another contact, before the two are compared."""
+
+
 class Calibration(Protocol):
     """What is asked of the identification (`identification.py`) that calibrates a body on a ground."""
 

@@ -12,7 +12,7 @@ from typing import Any
 from mosa import parallel
 from mosa.errors import DataError, MosaError, SimulationDiverged
 from mosa.modules.backbone_search import choose_law
-from mosa.modules.ground_search import EXPLAINED, choose_ground, rival_of
+from mosa.modules.ground_search import EXPLAINED, RIVAL_ITERATIONS, choose_ground, rival_of
 from mosa.modules.identification import EVIDENCE_ITERATIONS, Identification
 from mosa.modules.residuals import SAMPLES
 from mosa.modules.stages import Stage
@@ -20,8 +20,6 @@ from mosa.progress import tqdm
 from mosa.types import Ground
 
 log = logging.getLogger(__name__)
-RIVAL_ITERATIONS = 3
-"""In which a learned law is fitted to another contact with the ground, before the two are compared."""
 
 
 class NewtonSteps:
