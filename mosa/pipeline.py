@@ -140,7 +140,7 @@ def train(cfg: DictConfig) -> float | None:
         figures |= start_figures(run.starts["train"]) | reconstruction.geometry
         figures |= {f"id_prior/compared/{law}_m": distance for law, distance in module.compared.items()}
         figures |= {f"id_prior/ground/{each}_m": distance for each, distance in module.grounds.items() if math.isfinite(distance)}
-        figures |= {"id_prior/ground_gain": module.ground_gain} if math.isfinite(module.ground_gain or math.inf) else {}
+        figures |= {"id_prior/ground/gain": module.ground_gain} if math.isfinite(module.ground_gain or math.inf) else {}
     if cfg.extrapolate:
         with clock.measure("extrapolation"):
             figures |= extrapolated(cfg, run, scene.known_parameters)

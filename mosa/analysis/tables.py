@@ -82,7 +82,7 @@ def determined_text(figures: Mapping[str, float]) -> str:
     touched = {k.removeprefix("id_prior/ground/").removesuffix("_m"): v for k, v in figures.items()
                if k.startswith("id_prior/ground/") and k.endswith("_m")}
     if touched:
-        lines += [ground_text(touched, figures.get("id_prior/ground_gain")), ""]
+        lines += [ground_text(touched, figures.get("id_prior/ground/gain")), ""]
     if "posterior/draws" not in figures:
         return "\n".join(lines[:-1])
     lines += ["What the data determine:", ""]

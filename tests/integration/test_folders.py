@@ -75,7 +75,8 @@ def run(tmp_path_factory, cache):
 def test_how_the_ground_is_touched_is_found_where_nobody_says_it(run):
     """And the twin of the run meets the same ground."""
     figures = json.loads((run / "metrics.json").read_text())
-    tried = {key.split("/")[-1].removesuffix("_m"): value for key, value in figures.items() if key.startswith("id_prior/ground/")}
+    tried = {key.split("/")[-1].removesuffix("_m"): value for key, value in figures.items()
+             if key.startswith("id_prior/ground/") and key.endswith("_m")}
     assert {"sticky", "separate_0.15", "separate_1.2"} <= set(tried) and all(0 < value < 0.1 for value in tried.values())
     ground = Twin.load(run / "checkpoints" / "last.ckpt").world.ground
     assert taken_of(tried) == named(ground) and "Ground: the body" in (run / "results.md").read_text()

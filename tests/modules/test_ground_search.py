@@ -7,7 +7,7 @@ import pytest
 import torch
 from small_bodies import NU, WORLD, E, small_body, start, take_of
 
-from mosa.analysis.tables import ground_text
+from mosa.analysis.tables import determined_text, ground_text, parameter_table
 from mosa.checkpoints import check_resumed
 from mosa.errors import DataError, SimulationDiverged
 from mosa.modules import ground_search
@@ -199,3 +199,10 @@ def test_frictions_are_within_two_of_each_other():
     """So that the search reaches every coefficient between them to a quarter of a power of two."""
     steps = [b / a for a, b in zip(ground_search.FRICTIONS, ground_search.FRICTIONS[1:])]
     assert all(step == pytest.approx(ground_search.BETWEEN**2) for step in steps)
+
+
+def test_the_table_of_parameters_has_no_row_for_it():
+    figures = {"id_prior/E": 1e5, "id/E": 1.1e5, "id_prior/ground/sticky_m": 0.02, "id_prior/ground/separate_1.2_m": 0.021,
+               "id_prior/ground/gain": 1.5}
+    assert "ground" not in parameter_table(figures) and "worse" not in determined_text(figures)
+    assert determined_text(figures).startswith("Ground: the body sticks to it") and "better by 1.5" in determined_text(figures)
