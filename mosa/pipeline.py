@@ -139,8 +139,9 @@ def train(cfg: DictConfig) -> float | None:
         figures, kept = figures_of(build_evaluation(plain(cfg)), body, evaluated, world, module.posterior, folder)
         figures |= start_figures(run.starts["train"]) | reconstruction.geometry
         figures |= {f"id_prior/compared/{law}_m": distance for law, distance in module.compared.items()}
-        figures |= {f"id_prior/ground/{each}_m": distance for each, distance in module.grounds.items() if math.isfinite(distance)}
-        figures |= {"id_prior/ground/gain": module.ground_gain} if math.isfinite(module.ground_gain or math.inf) else {}
+        touched = {f"{contact}_m": distance for contact, distance in module.grounds.items()}
+        touched |= {} if module.ground_gain is None else {"gain": module.ground_gain}
+        figures |= {f"id_prior/ground/{name}": value for name, value in touched.items() if math.isfinite(value)}
     if cfg.extrapolate:
         with clock.measure("extrapolation"):
             figures |= extrapolated(cfg, run, scene.known_parameters)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from mosa.metrics import IMAGE_METRICS, MOTION_METRICS
-from mosa.modules.ground_search import EXPLAINED, rival_of, taken_of
+from mosa.modules.ground_choice import EXPLAINED, rival_of, taken_of
 
 MODELS = (("floor", "floor/"), ("prior", "prior/"), ("prior + eta", "prior_eta/"), ("adapted", ""))
 UNITS = {"rms_m": ("rms [mm]", 1e3, 2),

@@ -89,17 +89,50 @@ class Found:
     trials: int
 
 
+class Looks:
+    """Looks at a policy that is being found, every so often on the same trials, which the search is not made on; the best it was.
+
+    check: the arena that the trials are played in; say: told a line of each look."""
+
+    def __init__(self, policy: LinearPolicy, check: Arena, search: Search, seed: int, say: Callable[[str], None]) -> None:
+        self.policy, self.check, self.search, self.say = policy, check, search, say
+        self.trials = check.task.draw(search.validation, torch.Generator().manual_seed(10**6 + seed))
+        self.history: list[dict[str, float]] = []
+        self.best = math.inf, self.numbers()
+        self.began, self.played = time.perf_counter(), 0
+
+    def last(self, iteration: int) -> bool:
+        """Looks where that is due before an iteration; whether the search is over."""
+        over = iteration == self.search.iterations
+        if over or iteration % self.search.every == 0:
+            loss, success = play_all(self.check, self.trials, self.policy)
+            self.played += len(self.trials)
+            entry = {"iteration": iteration, "loss": float(loss.mean()), "success": float(success.float().mean())}
+            self.history.append(entry)
+            self.say(f"iteration {iteration}: loss {entry['loss']:.3f}, success {entry['success']:.2f}")
+            if entry["loss"] < self.best[0]:
+                self.best = entry["loss"], self.numbers()
+        return over
+
+    def numbers(self) -> dict[str, Tensor]:
+        """Of the policy as it is now."""
+        return {name: value.clone() for name, value in self.policy.state_dict().items()}
+
+    def found(self) -> Found:
+        """The policy as it was at its best."""
+        self.policy.load_state_dict(self.best[1])
+        return Found(self.policy.requires_grad_(False), self.history, time.perf_counter() - self.began, self.played)
+
+
 def by_gradient(
     train: Arena, check: Arena, search: Search, seed: int, say: Callable[[str], None] = lambda line: None
 ) -> Found:
     """The mean loss descended through the simulator, contact and all. train, check: of the same simulator and task."""
-    began, task = time.perf_counter(), train.task
-    generator = torch.Generator().manual_seed(seed)
-    validation = task.draw(search.validation, torch.Generator().manual_seed(10**6 + seed))
-    policy, history, played = LinearPolicy(task), [], 0
+    task, generator = train.task, torch.Generator().manual_seed(seed)
+    policy = LinearPolicy(task)
+    looks = Looks(policy, check, search, seed, say)
     optimiser = torch.optim.Adam(policy.parameters(), lr=search.rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, search.iterations, 0.1 * search.rate)
-    best: tuple[float, dict] = (math.inf, {})
 
     def bounded(observation: Tensor) -> Tensor:
         action = policy(observation)
@@ -107,17 +140,10 @@ def by_gradient(
         return action
 
     for iteration in range(search.iterations + 1):
-        if iteration % search.every == 0 or iteration == search.iterations:
-            loss, success = play_all(check, validation, policy)
-            played += len(validation)
-            history.append({"iteration": iteration, "loss": float(loss.mean()), "success": float(success.float().mean())})
-            say(f"iteration {iteration}: loss {history[-1]['loss']:.3f}, success {history[-1]['success']:.2f}")
-            if history[-1]["loss"] < best[0]:
-                best = history[-1]["loss"], {name: value.clone() for name, value in policy.state_dict().items()}
-        if iteration == search.iterations:
+        if looks.last(iteration):
             break
         outcome = play(train, task.draw(train.count, generator), bounded, differentiable=True)
-        played += train.count
+        looks.played += train.count
         optimiser.zero_grad()
         kept = (~outcome.diverged).to(outcome.loss)
         if bool(kept.any()):
@@ -126,8 +152,7 @@ def by_gradient(
                 parameter.grad /= train.count
             optimiser.step()
         schedule.step()
-    policy.load_state_dict(best[1])
-    return Found(policy.requires_grad_(False), history, time.perf_counter() - began, played)
+    return looks.found()
 
 
 @torch.no_grad()
@@ -135,41 +160,30 @@ def by_evolution(train: Arena, check: Arena, search: Search, seed: int, say: Cal
     """The covariance matrix adaptation of the library cma, its matrix diagonal: candidates are compared on the same trials, and
     gradients are not used. train, check: of the same simulator and task, the former with `search.candidates` times `search.batch`
     worlds. Errors: ConfigError for another number of worlds, or where cma is not installed."""
-    began, task, count = time.perf_counter(), train.task, search.candidates
+    task, count = train.task, search.candidates
     if train.count != count * search.batch:
         raise ConfigError(f"search: expected {count} candidates times {search.batch} trials as worlds, found {train.count}")
     try:
         import cma
     except ImportError as error:
         raise ConfigError("policy: cma needs the package of that name: pip install '.[environments]'") from error
-    generator = torch.Generator().manual_seed(seed)
-    validation = task.draw(search.validation, torch.Generator().manual_seed(10**6 + seed))
-    policy, history, played = LinearPolicy(task), [], 0
+    generator, policy = torch.Generator().manual_seed(seed), LinearPolicy(task)
+    looks = Looks(policy, check, search, seed, say)
     start = torch.nn.utils.parameters_to_vector(policy.parameters())
-    best = (math.inf, start.clone())
     # a diagonal matrix adapts within tens of iterations, a full one of 30 numbers within hundreds; seed 0 is none to the library
     strategy = cma.CMAEvolutionStrategy(start.tolist(), search.spread, {
         "popsize": count, "seed": seed + 1, "CMA_diagonal": True, "verbose": -9, "verb_log": 0})  # fmt: skip
     for iteration in range(search.iterations + 1):
-        if iteration % search.every == 0 or iteration == search.iterations:
-            mean = torch.tensor(strategy.mean).to(start)
-            torch.nn.utils.vector_to_parameters(mean, policy.parameters())
-            loss, success = play_all(check, validation, policy)
-            played += len(validation)
-            history.append({"iteration": iteration, "loss": float(loss.mean()), "success": float(success.float().mean())})
-            say(f"iteration {iteration}: loss {history[-1]['loss']:.3f}, success {history[-1]['success']:.2f}")
-            if history[-1]["loss"] < best[0]:
-                best = history[-1]["loss"], mean.clone()
-        if iteration == search.iterations:
+        torch.nn.utils.vector_to_parameters(torch.tensor(strategy.mean).to(start), policy.parameters())
+        if looks.last(iteration):
             break
         drawn = strategy.ask()
         numbers = torch.tensor(np.array(drawn)).to(start)
         trials = task.draw(search.batch, generator)
         outcome = play(train, trials.select(torch.arange(search.batch).repeat(count)), _side_by_side(policy, numbers, search.batch))
-        played += train.count
+        looks.played += train.count
         strategy.tell(drawn, outcome.loss.cpu().view(count, search.batch).mean(1).tolist())
-    torch.nn.utils.vector_to_parameters(best[1], policy.parameters())
-    return Found(policy.requires_grad_(False), history, time.perf_counter() - began, played)
+    return looks.found()
 
 
 class OutcomeModel(nn.Module):
@@ -240,23 +254,14 @@ def by_model(train: Arena, check: Arena, search: Search, seed: int, say: Callabl
     more is tried about what that policy does. Bounces leave a rough slope for single trials, and the model a smooth one over many.
     train, check: of the same simulator and a task of one decision, the former with `search.candidates` times `search.batch` worlds.
     Errors: ConfigError for a task that decides in every step."""
-    began, task = time.perf_counter(), train.task
+    task = train.task
     if not task.once:
         raise ConfigError(f"policy: expected a task of one decision with policy=model, found task={task.name}")
-    generator = torch.Generator().manual_seed(seed)
-    validation = task.draw(search.validation, torch.Generator().manual_seed(10**6 + seed))
-    policy, history, played = LinearPolicy(task), [], 0
-    best: tuple[float, dict] = (math.inf, {})
+    generator, policy = torch.Generator().manual_seed(seed), LinearPolicy(task)
+    looks = Looks(policy, check, search, seed, say)
     tried: list[tuple[Tensor, Tensor, Tensor]] = []
     for iteration in range(search.iterations + 1):
-        if iteration % search.every == 0 or iteration == search.iterations:
-            loss, success = play_all(check, validation, policy)
-            played += len(validation)
-            history.append({"iteration": iteration, "loss": float(loss.mean()), "success": float(success.float().mean())})
-            say(f"iteration {iteration}: loss {history[-1]['loss']:.3f}, success {history[-1]['success']:.2f}")
-            if history[-1]["loss"] < best[0]:
-                best = history[-1]["loss"], {name: value.clone() for name, value in policy.state_dict().items()}
-        if iteration == search.iterations:
+        if looks.last(iteration):
             break
         trials = task.draw(train.count, generator)
         seen = policy.scaled(trials.observed)
@@ -264,14 +269,13 @@ def by_model(train: Arena, check: Arena, search: Search, seed: int, say: Callabl
         wide = search.spread / (1 + iteration)
         action = (about + wide * torch.randn(about.shape, generator=generator)).clamp(-1, 1)
         outcome = play(train, trials, lambda _, action=action: action)
-        played += train.count
+        looks.played += train.count
         whole = ~outcome.diverged
         tried.append((seen[whole], action[whole], _outcome(train.view)[whole]))
         seen, action, ends = (torch.cat(part) for part in zip(*tried))
         model = _fitted_model(torch.cat([seen, action], 1), ends, generator)
         _descend(policy, model, task, generator)
-    policy.load_state_dict(best[1])
-    return Found(policy.requires_grad_(False), history, time.perf_counter() - began, played)
+    return looks.found()
 
 
 @torch.enable_grad()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 import torch
@@ -109,6 +109,17 @@ def search(calibration: Calibration) -> float:
     return at(row)
 
 
+def calibrated(body: Body) -> dict[str, dict]:
+    """What a calibration learns of a body, as it is now."""
+    return {part: copy.deepcopy(getattr(body, part).state_dict()) for part in ("material", "contact")}
+
+
+def calibrate_as(body: Body, numbers: Mapping[str, dict]) -> None:
+    """Set the body to `calibrated` numbers."""
+    for part, state in numbers.items():
+        getattr(body, part).load_state_dict(state)
+
+
 TRIED = 4
 """Iterations after which candidates for the backbone are compared: from the best start of the grid they hardly move later."""
 
@@ -131,12 +142,11 @@ def choose_law(body: Body, candidates: Sequence[str], build: Callable[[], Calibr
             found[law] = math.inf
             continue
         if best is None or found[law] < best[0]:
-            best = (found[law], {part: copy.deepcopy(getattr(body, part).state_dict()) for part in ("material", "contact")}, law)
+            best = (found[law], calibrated(body), law)
     if best is None:
         raise SimulationDiverged(f"prior=auto: none of {', '.join(candidates)} can be calibrated; set prior.parameters nearer "
                                  "to the body's")
-    for part, state in best[1].items():
-        getattr(body, part).load_state_dict(state)
+    calibrate_as(body, best[1])
     for material in (body.material, *(variant["material"] for variant in body.frozen.values())):
         material.choose(best[2])
     return found

@@ -12,7 +12,8 @@ from typing import Any
 from mosa import parallel
 from mosa.errors import DataError, MosaError, SimulationDiverged
 from mosa.modules.backbone_search import choose_law
-from mosa.modules.ground_search import EXPLAINED, RIVAL_ITERATIONS, choose_ground, rival_of
+from mosa.modules.ground_choice import EXPLAINED, rival_of
+from mosa.modules.ground_search import RIVAL_ITERATIONS, choose_ground
 from mosa.modules.identification import EVIDENCE_ITERATIONS, Identification
 from mosa.modules.residuals import SAMPLES
 from mosa.modules.stages import Stage

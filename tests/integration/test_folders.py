@@ -15,7 +15,7 @@ from mosa import pipeline
 from mosa.data.export import export_particles, export_transforms
 from mosa.data.scene import load_scene
 from mosa.evaluation import run_sequences
-from mosa.modules.ground_search import named, taken_of
+from mosa.modules.ground_choice import named, taken_of
 from mosa.twin import Twin
 
 ROOT = Path(__file__).parents[2]

@@ -10,10 +10,11 @@ from small_bodies import NU, WORLD, E, small_body, start, take_of
 from mosa.analysis.tables import determined_text, ground_text, parameter_table
 from mosa.checkpoints import check_resumed
 from mosa.errors import DataError, SimulationDiverged
-from mosa.modules import ground_search
+from mosa.modules import ground_choice, ground_search
 from mosa.modules.body import World
 from mosa.modules.criteria import Criterion
-from mosa.modules.ground_search import choose_ground, named, rival_of, taken_of
+from mosa.modules.ground_choice import named, rival_of, taken_of
+from mosa.modules.ground_search import choose_ground
 from mosa.modules.identification import Identification
 from mosa.modules.identification_settings import IdentificationSettings
 from mosa.modules.lit_mosa import LitMosa
@@ -135,7 +136,7 @@ def test_a_run_goes_on_with_the_ground_that_it_found():
 def test_a_fit_begins_again_on_the_ground_that_explains_the_learned_law_better(monkeypatch, truth):
     """Where the isotropic law could not tell: here nothing is near enough to be taken but the body that sticks. The rival has the
     friction with which the isotropic law is nearest."""
-    monkeypatch.setattr(ground_search, "NEARER", 0.0)
+    monkeypatch.setattr(ground_choice, "NEARER", 0.0)
     begins = start(turn=0.5, speed=-2.0)
     begins.velocity[0] = 0.8
     numbers = torch.linspace(-0.02, 0.03, 19, dtype=torch.float64)
@@ -154,7 +155,7 @@ def test_a_fit_begins_again_on_the_ground_that_explains_the_learned_law_better(m
     sticks = Ground(0.0, "sticky")
     again = [("prior", truth), ("joint", truth)] if truth.mode == "separate" else []
     assert begun == [("prior", sticks), ("joint", sticks), *again]
-    assert module.world.ground.mode == truth.mode and (module.ground_gain > ground_search.EXPLAINED) == (truth.mode == "separate")
+    assert module.world.ground.mode == truth.mode and (module.ground_gain > ground_choice.EXPLAINED) == (truth.mode == "separate")
     assert float(body.material.physical()["E"].detach()) == pytest.approx(E, rel=0.1) and module.posterior is not None
     checkpoint: dict = {}
     module.on_save_checkpoint(checkpoint)

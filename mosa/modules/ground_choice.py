@@ -1,0 +1,36 @@
+"""Which contact with the ground is taken, of the distances that `ground_search` found. Reports read it too."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from mosa.types import Ground
+
+NEARER = 0.9
+"""Of the distance of the body that sticks, which another contact has to come below to be taken."""
+EXPLAINED = 5.0
+"""By so much of minus the logarithm of the posterior another contact has to explain the motion better, about the learned law, for
+the fit to begin again on it."""
+
+
+def named(ground: Ground) -> str:
+    """A contact in words, as figures have it: sticky, or separate_0.4 with its friction."""
+    return f"{ground.mode}_{ground.friction:.3g}" if ground.mode == "separate" else ground.mode
+
+
+def taken_of(distances: Mapping[str, float]) -> str:
+    """The contact that is taken, of distances [m] by `named`."""
+    nearest = min(distances, key=distances.get)
+    return nearest if distances[nearest] < NEARER * distances["sticky"] else "sticky"
+
+
+def rival_of(distances: Mapping[str, float]) -> float | None:
+    """Friction of the contact that may explain the learned law's motion better than sticking, of distances [m] by `named`: the
+    roughest of those that leave the ground and are about as near as the nearest of them, as no sliding is seen where more friction
+    changes nothing. None where a body that slides was taken, or no other can be simulated."""
+    sliding = {float(name.removeprefix("separate_")): distance for name, distance in distances.items() if name != "sticky"}
+    least = min(sliding.values(), default=math.inf)
+    if taken_of(distances) != "sticky" or not math.isfinite(least):
+        return None
+    return max(friction for friction, distance in sliding.items() if NEARER * distance <= least)
