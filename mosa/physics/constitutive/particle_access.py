@@ -51,6 +51,17 @@ ADD = """
         target[k] = piece;
     }}"""
 
+# of pieces of one number: a branch around each would have a thread wait for memory once for each of them
+ADD_WHOLE = """
+    if (!adj_field.data) return;
+    {scalar}* target = reinterpret_cast<{scalar}*>(adj_field.data + i);
+    const double* source = reinterpret_cast<const double*>(&adj_ret);
+    bool any = false;
+#pragma unroll
+    for (int k = 0; k < {pieces}; ++k) any = any || source[k] != 0.0;
+    if (!any) return;
+#pragma unroll
+    for (int k = 0; k < {pieces}; ++k) target[k] += static_cast<{scalar}>(source[k]);"""
 
 # of a 6 x 6 matrix and a vector, in the order of Warp's own product: neither the matrix nor its gradient is held in float64, for
 # which a GPU's thread has not enough registers. A CPU's compiler makes vectors of Warp's own
@@ -83,20 +94,29 @@ ADD_PRODUCT = f"""
 #if defined(__CUDA_ARCH__)
 {PIECE}
     const Piece* source = reinterpret_cast<const Piece*>(field.data + place);
-    Piece* target = reinterpret_cast<Piece*>(adj_field.data + i);
     wp::vec_t<6, double> sums;
 #pragma unroll
     for (int k = 0; k < {{pieces}}; ++k) {{{{
         const Piece piece = source[k];
-        Piece added = adj_field.data ? target[k] : piece;
 #pragma unroll
         for (int l = 0; l < {{width}}; ++l) {{{{
             const int row = ({{width}} * k + l) / 6, column = ({{width}} * k + l) % 6;
             const double term = static_cast<double>(piece.part[l]) * adj_ret[row];
             sums[column] = row == 0 ? term : sums[column] + term;
-            added.part[l] += static_cast<{{scalar}}>(adj_ret[row] * x[column]);
         }}}}
-        if (adj_field.data) target[k] = added;
+    }}}}
+    if (adj_field.data) {{{{
+        Piece* target = reinterpret_cast<Piece*>(adj_field.data + i);
+#pragma unroll
+        for (int k = 0; k < {{pieces}}; ++k) {{{{
+            Piece piece = target[k];
+#pragma unroll
+            for (int l = 0; l < {{width}}; ++l) {{{{
+                const int row = ({{width}} * k + l) / 6, column = ({{width}} * k + l) % 6;
+                piece.part[l] += static_cast<{{scalar}}>(adj_ret[row] * x[column]);
+            }}}}
+            target[k] = piece;
+        }}}}
     }}}}
     adj_x += sums;
 #else
@@ -121,7 +141,7 @@ def particle_access(scalar, slots: int) -> SimpleNamespace:
     def snippets(count: int, result: str, place: str = "i") -> tuple[str, str]:
         width = next(k for k in (BYTES // size, BYTES // 2 // size, 1) if count % k == 0)
         parts = {"scalar": name, "width": width, "pieces": count // width, "result": result, "place": place}
-        return (PIECE + LOAD).format(**parts), (PIECE + ADD).format(**parts)
+        return (PIECE + LOAD).format(**parts), (ADD_WHOLE if width == 1 else PIECE + ADD).format(**parts)
 
     field33, field66 = (wp.array(dtype=wp.types.matrix(shape=(k, k), dtype=scalar)) for k in (3, 6))
     field6, fields = (wp.array(dtype=wp.types.vector(length=k, dtype=scalar)) for k in (6, slots))
