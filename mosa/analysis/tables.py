@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from mosa.metrics import IMAGE_METRICS, MOTION_METRICS
-from mosa.modules.ground_choice import EXPLAINED, rival_of, taken_of
+from mosa.modules.ground_choice import EXPLAINED, NEARER, alike, rival_of, taken_of
 
 MODELS = (("floor", "floor/"), ("prior", "prior/"), ("prior + eta", "prior_eta/"), ("adapted", ""))
 UNITS = {"rms_m": ("rms [mm]", 1e3, 2),
@@ -55,19 +55,28 @@ NOTICEABLE = 1.1
 
 
 def ground_text(distances: Mapping[str, float], gain: float | None = None) -> str:
-    """How the body touches the ground, of distances [m] by contact (`mosa.modules.ground_search`), in sentences. gain: of the body
-    that leaves it freely over the one that sticks, about the learned law, where that was asked."""
+    """How the body touches the ground, of distances [m] by contact (`mosa.modules.ground_search`), in sentences, and what of it the
+    motion does not tell. gain: of the body that leaves it freely over the one that sticks, about the learned law, if asked."""
     words = {name: name.replace("separate_", "leaves it freely, friction ").replace("sticky", "sticks to it") for name in distances}
-    taken, rival = taken_of(distances), rival_of(distances)
+    taken, rival, frictions = taken_of(distances), rival_of(distances), alike(distances)
+    said = []
     if rival is not None and gain is not None:
         other = f"separate_{rival:.3g}"
-        said = (f" About the learned law, a body that {words[other]} explains the motion {'better' if gain > 0 else 'worse'} by "
-                f"{abs(gain):.1f} of the logarithm of the likelihood.")
+        said.append(f"About the learned law, a body that {words[other]} explains the motion {'better' if gain > 0 else 'worse'} by "
+                    f"{abs(gain):.1f} of the logarithm of the likelihood.")  # fmt: skip
         taken = other if gain > EXPLAINED else taken
-    else:
-        said = ""
+        if abs(gain) <= EXPLAINED:
+            said.append(f"Whether it sticks is *not* determined: that takes {EXPLAINED:g}.")
+    if taken != "sticky" and len(frictions) > 1:
+        said.append(f"Its friction is *not* determined: from {frictions[0]:.3g} to {frictions[-1]:.3g} the isotropic law comes "
+                    "within a tenth of the nearest, and it may lie outside of these, as that law is wrong itself.")
+    elif taken != "sticky":
+        said.append("Its friction is as good as the isotropic law, by which it was found.")
     listed = ", ".join(f"{words[name]} {distances[name] * 1e3:.2f} mm" for name in sorted(distances, key=distances.get))
-    return f"Ground: the body {words[taken]} (mean distance from the training motion after calibration: {listed}).{said}"
+    first = f"Ground: the body {words[taken]} (mean distance from the training motion after calibration: {listed})."
+    if len(distances) > 1 and NEARER * max(distances.values()) <= min(distances.values()):
+        first += " All of them are within a tenth: this film hardly shows how the body slides."
+    return " ".join([first, *said])
 
 
 def determined_text(figures: Mapping[str, float]) -> str:

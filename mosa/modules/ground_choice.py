@@ -25,12 +25,16 @@ def taken_of(distances: Mapping[str, float]) -> str:
     return nearest if distances[nearest] < NEARER * distances["sticky"] else "sticky"
 
 
+def alike(distances: Mapping[str, float]) -> list[float]:
+    """Frictions of a body that leaves the ground freely, of distances [m] by `named`, that come about as near (by `NEARER`) as the
+    nearest of them, in order: the isotropic law does not tell them apart. Empty where none can be simulated."""
+    sliding = {float(name.removeprefix("separate_")): distance for name, distance in distances.items() if name != "sticky"}
+    least = min(sliding.values(), default=math.inf)
+    return sorted(friction for friction, distance in sliding.items() if math.isfinite(least) and NEARER * distance <= least)
+
+
 def rival_of(distances: Mapping[str, float]) -> float | None:
     """Friction of the contact that may explain the learned law's motion better than sticking, of distances [m] by `named`: the
     roughest of those that leave the ground and are about as near as the nearest of them, as no sliding is seen where more friction
     changes nothing. None where a body that slides was taken, or no other can be simulated."""
-    sliding = {float(name.removeprefix("separate_")): distance for name, distance in distances.items() if name != "sticky"}
-    least = min(sliding.values(), default=math.inf)
-    if taken_of(distances) != "sticky" or not math.isfinite(least):
-        return None
-    return max(friction for friction, distance in sliding.items() if NEARER * distance <= least)
+    return max(alike(distances), default=None) if taken_of(distances) == "sticky" else None

@@ -96,12 +96,26 @@ def test_the_rival_is_the_roughest_ground_on_which_no_sliding_is_seen():
 def test_a_report_says_how_the_ground_is_touched():
     text = ground_text({"sticky": 20e-3, "separate_0.3": 12e-3, "separate_0.6": 15.5e-3})
     assert text.startswith("Ground: the body leaves it freely, friction 0.3 (mean distance from the training motion")
-    assert text.endswith("friction 0.3 12.00 mm, leaves it freely, friction 0.6 15.50 mm, sticks to it 20.00 mm).")
-    near = {"sticky": 20e-3, "separate_0.6": 19.5e-3}
+    assert "friction 0.3 12.00 mm, leaves it freely, friction 0.6 15.50 mm, sticks to it 20.00 mm)." in text
+    assert text.endswith("Its friction is as good as the isotropic law, by which it was found.")
+    near = {"sticky": 20e-3, "separate_0.6": 19.5e-3, "separate_0.15": 30e-3}
     assert ground_text(near, 7.5).startswith("Ground: the body leaves it freely, friction 0.6 (mean")
-    assert ground_text(near, 7.5).endswith("leaves it freely, friction 0.6 explains the motion better by 7.5 of the logarithm of "
-                                           "the likelihood.")  # fmt: skip
-    assert ground_text(near, -2.0).startswith("Ground: the body sticks to it (mean") and "worse by 2.0" in ground_text(near, -2.0)
+    assert ("leaves it freely, friction 0.6 explains the motion better by 7.5 of the logarithm of the likelihood."
+            in ground_text(near, 7.5))  # fmt: skip
+    assert ground_text(near, -8.0).startswith("Ground: the body sticks to it (mean") and "worse by 8.0" in ground_text(near, -8.0)
+    assert "determined" not in ground_text(near, -8.0) and "hardly" not in ground_text(near, -8.0)
+
+
+def test_a_report_says_what_of_the_contact_is_not_determined():
+    near = {"sticky": 20e-3, "separate_0.6": 19.5e-3, "separate_0.15": 30e-3}
+    for gain in (-2.0, 4.9):
+        assert ground_text(near, gain).startswith("Ground: the body sticks to it (mean")
+        assert ground_text(near, gain).endswith("Whether it sticks is *not* determined: that takes 5.")
+    alike = {"sticky": 2.24e-3, "separate_0.15": 2.29e-3, "separate_1.2": 2.25e-3}  # a film of five frames of a body that slides
+    assert "All of them are within a tenth" in ground_text(alike) and "All of them" not in ground_text({"sticky": 1e-3})
+    slides = {"sticky": 9.56e-3, "separate_0.15": 12.7e-3, "separate_0.424": 7.76e-3, "separate_0.6": 7.49e-3,
+              "separate_1.2": 7.68e-3}  # fmt: skip
+    assert "Its friction is *not* determined: from 0.424 to 1.2 the isotropic law" in ground_text(slides)
 
 
 def fit_of(take, **changed) -> LitMosa:
