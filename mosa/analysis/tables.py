@@ -54,29 +54,43 @@ NOTICEABLE = 1.1
 """Ratio of the largest to the smallest Young's modulus below which a law counts as isotropic."""
 
 
-def ground_text(distances: Mapping[str, float], gain: float | None = None) -> str:
+FREELY = "leaves it freely, friction "
+
+
+def ground_text(distances: Mapping[str, float], gain: float | None = None, friction: float = 0.0) -> str:
     """How the body touches the ground, of distances [m] by contact (`mosa.modules.ground_search`), in sentences, and what of it the
-    motion does not tell. gain: of the body that leaves it freely over the one that sticks, about the learned law, if asked."""
-    words = {name: name.replace("separate_", "leaves it freely, friction ").replace("sticky", "sticks to it") for name in distances}
-    taken, rival, frictions = taken_of(distances), rival_of(distances), alike(distances)
-    said = []
-    if rival is not None and gain is not None:
-        other = f"separate_{rival:.3g}"
-        said.append(f"About the learned law, a body that {words[other]} explains the motion {'better' if gain > 0 else 'worse'} by "
-                    f"{abs(gain):.1f} of the logarithm of the likelihood.")  # fmt: skip
-        taken = other if gain > EXPLAINED else taken
-        if abs(gain) <= EXPLAINED:
+    motion does not tell. gain: of another contact, about the learned law, where that was asked; friction: which the law has been
+    learned with."""
+    words = {name: name.replace("separate_", FREELY).replace("sticky", "sticks to it") for name in distances}
+    taken, rival = taken_of(distances), rival_of(distances)
+    touches, said, likely = words[taken], [], "of the logarithm of the likelihood"
+    if gain is not None and rival is not None:  # the isotropic law sticks
+        other = words[f"separate_{rival:.3g}"]
+        said.append(f"About the learned law, a body that {other} explains the motion {_better(gain)} {likely}.")
+        if gain > EXPLAINED:
+            touches = other
+        elif gain > -EXPLAINED:
             said.append(f"Whether it sticks is *not* determined: that takes {EXPLAINED:g}.")
-    if taken != "sticky" and len(frictions) > 1:
-        said.append(f"Its friction is *not* determined: from {frictions[0]:.3g} to {frictions[-1]:.3g} the isotropic law comes "
-                    "within a tenth of the nearest, and it may lie outside of these, as that law is wrong itself.")
-    elif taken != "sticky":
-        said.append("Its friction is as good as the isotropic law, by which it was found.")
+    elif gain is not None and gain > EXPLAINED:
+        touches = f"{FREELY}{friction:.3g}"
+        said.append(f"About the learned law, this friction explains the motion {_better(gain)} {likely} than {taken[9:]}.")
+    elif gain is not None:
+        said.append(f"About the learned law, the best of other frictions explains the motion {_better(gain)} {likely}.")
+        if gain > -EXPLAINED:
+            said.append(f"Its friction is *not* determined: that takes {EXPLAINED:g}.")
+    if touches != words["sticky"] and (gain is None or rival is not None):  # found by the isotropic law alone
+        near = [f"{each:.3g}" for each in alike(distances)]
+        said.append("Its friction is *not* determined: the isotropic law comes within a tenth of the nearest with "
+                    f"{', '.join(near)}, and is wrong itself.")
     listed = ", ".join(f"{words[name]} {distances[name] * 1e3:.2f} mm" for name in sorted(distances, key=distances.get))
-    first = f"Ground: the body {words[taken]} (mean distance from the training motion after calibration: {listed})."
+    first = f"Ground: the body {touches} (mean distance from the training motion after calibration: {listed})."
     if len(distances) > 1 and NEARER * max(distances.values()) <= min(distances.values()):
         first += " All of them are within a tenth: this film hardly shows how the body slides."
     return " ".join([first, *said])
+
+
+def _better(gain: float) -> str:
+    return f"{'better' if gain > 0 else 'worse'} by {abs(gain):.1f}"
 
 
 def determined_text(figures: Mapping[str, float]) -> str:
@@ -91,7 +105,7 @@ def determined_text(figures: Mapping[str, float]) -> str:
     touched = {k.removeprefix("id_prior/ground/").removesuffix("_m"): v for k, v in figures.items()
                if k.startswith("id_prior/ground/") and k.endswith("_m")}
     if touched:
-        lines += [ground_text(touched, figures.get("id_prior/ground/gain")), ""]
+        lines += [ground_text(touched, figures.get("id_prior/ground/gain"), figures.get("id_prior/ground/friction", 0.0)), ""]
     if "posterior/draws" not in figures:
         return "\n".join(lines[:-1])
     lines += ["What the data determine:", ""]

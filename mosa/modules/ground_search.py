@@ -1,8 +1,8 @@
 """How a body and its ground touch, where nobody knows: the contact with which a calibrated law comes nearest to the motion.
 
 Free rollouts tell a body that slides, as friction shows in where it goes afterwards. Whether one that hardly slides sticks, or
-leaves the ground freely, an isotropic law cannot tell: its own mistakes are as large. The learned law can, when the fit has ended
-(docs/identification.md#how-the-ground-is-touched).
+leaves the ground freely, an isotropic law cannot tell, nor with what friction it slides: its own mistakes are as large. The learned
+law can, when the fit has ended (docs/identification.md#how-the-ground-is-touched).
 """
 
 from __future__ import annotations
@@ -25,6 +25,30 @@ TRIED = 3
 """Iterations of each calibration after the first, from that one's numbers on: how a body slides hardly moves its moduli."""
 RIVAL_ITERATIONS = 3
 """In which a learned law is fitted to another contact, before the two are compared."""
+
+
+def better_friction(own: float, gain: Callable[[float], float]) -> tuple[float, float]:
+    """(friction other than `own`, its gain): the one that gains most of those that are tried, halves or doubles for as long as they
+    gain more, then once between (`BETWEEN`). gain: of a friction over `own`."""
+    gains = {own: 0.0}
+
+    def improves(friction: float) -> bool:
+        before = max(gains.values())
+        gains[friction] = gain(friction)
+        return gains[friction] > before
+
+    for factor in (0.5, 2.0):
+        friction = own * factor
+        while FRICTIONS[0] / 2 <= friction <= FRICTIONS[-1] * 2 and improves(friction):
+            friction *= factor
+        if max(gains.values()) > 0:
+            break
+    nearest = max(gains, key=gains.get)
+    if nearest != own and not improves(nearest / BETWEEN):
+        improves(nearest * BETWEEN)
+    del gains[own]
+    best = max(gains, key=gains.get)
+    return best, gains[best]
 
 
 def choose_ground(

@@ -12,8 +12,8 @@ from typing import Any
 from mosa import parallel
 from mosa.errors import DataError, MosaError, SimulationDiverged
 from mosa.modules.backbone_search import choose_law
-from mosa.modules.ground_choice import EXPLAINED, rival_of
-from mosa.modules.ground_search import RIVAL_ITERATIONS, choose_ground
+from mosa.modules.ground_choice import EXPLAINED, named, rival_of
+from mosa.modules.ground_search import RIVAL_ITERATIONS, better_friction, choose_ground
 from mosa.modules.identification import EVIDENCE_ITERATIONS, Identification
 from mosa.modules.residuals import SAMPLES
 from mosa.modules.stages import Stage
@@ -71,17 +71,25 @@ class NewtonSteps:
         self.settle_ground(ground)
 
     def better_ground(self, stage: Stage) -> Ground | None:
-        """Where the ground was sought and the law has been learned of a body that sticks to it: another contact that explains the
-        motion better, about that law. None where there is none, and once the fit has begun again."""
-        friction = rival_of(self.grounds) if stage.learns_adapter and self.grounds and self.ground_gain is None else None
-        if friction is None:
+        """Where the ground was sought and a law has been learned on what was found: another contact that explains the motion
+        better, about that law. None where there is none, and once the fit has begun again."""
+        if not stage.learns_adapter or not self.grounds or self.ground_gain is not None:
             return None
-        ground = Ground(self.world.ground.height, "separate", friction)
-        self.ground_gain = parallel.mean(self.gained_on(ground, stage))
-        log.info("ground: a body that leaves it freely, with friction %.3g, explains the motion %s than one that sticks (by %.1f "
-                 "of the logarithm of the likelihood)%s", friction, "better" if self.ground_gain > 0 else "worse",
+        found = self.world.ground
+
+        def gain(friction: float) -> float:
+            return parallel.mean(self.gained_on(replace(found, mode="separate", friction=friction), stage))
+
+        if found.mode == "separate":
+            friction, self.ground_gain = better_friction(found.friction, gain)
+        elif (friction := rival_of(self.grounds)) is None:
+            return None
+        else:
+            self.ground_gain = gain(friction)
+        log.info("ground: a body that leaves it freely, with friction %.3g, explains the motion %s than %s (by %.1f of the "
+                 "logarithm of the likelihood)%s", friction, "better" if self.ground_gain > 0 else "worse", named(found),
                  abs(self.ground_gain), "; the fit begins again" if self.ground_gain > EXPLAINED else "")  # fmt: skip
-        return ground if self.ground_gain > EXPLAINED else None
+        return replace(found, mode="separate", friction=friction) if self.ground_gain > EXPLAINED else None
 
     def gained_on(self, ground: Ground, stage: Stage) -> float:
         """By how much the running identification's cost falls on another ground, from the same numbers and under the same noise, in

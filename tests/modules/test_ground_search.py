@@ -14,7 +14,7 @@ from mosa.modules import ground_choice, ground_search
 from mosa.modules.body import World
 from mosa.modules.criteria import Criterion
 from mosa.modules.ground_choice import named, rival_of, taken_of
-from mosa.modules.ground_search import choose_ground
+from mosa.modules.ground_search import better_friction, choose_ground
 from mosa.modules.identification import Identification
 from mosa.modules.identification_settings import IdentificationSettings
 from mosa.modules.lit_mosa import LitMosa
@@ -94,10 +94,15 @@ def test_the_rival_is_the_roughest_ground_on_which_no_sliding_is_seen():
 
 
 def test_a_report_says_how_the_ground_is_touched():
-    text = ground_text({"sticky": 20e-3, "separate_0.3": 12e-3, "separate_0.6": 15.5e-3})
+    slides = {"sticky": 20e-3, "separate_0.3": 12e-3, "separate_0.6": 15.5e-3}
+    text = ground_text(slides)
     assert text.startswith("Ground: the body leaves it freely, friction 0.3 (mean distance from the training motion")
     assert "friction 0.3 12.00 mm, leaves it freely, friction 0.6 15.50 mm, sticks to it 20.00 mm)." in text
-    assert text.endswith("Its friction is as good as the isotropic law, by which it was found.")
+    again = ground_text(slides, 8.0, friction=0.15)  # of the law that was learned then
+    assert again.startswith("Ground: the body leaves it freely, friction 0.15 (mean") and "determined" not in again
+    assert again.endswith("this friction explains the motion better by 8.0 of the logarithm of the likelihood than 0.3.")
+    assert ground_text(slides, -8.0, friction=0.3).endswith("other frictions explains the motion worse by 8.0 of the logarithm of "
+                                                            "the likelihood.")  # fmt: skip
     near = {"sticky": 20e-3, "separate_0.6": 19.5e-3, "separate_0.15": 30e-3}
     assert ground_text(near, 7.5).startswith("Ground: the body leaves it freely, friction 0.6 (mean")
     assert ("leaves it freely, friction 0.6 explains the motion better by 7.5 of the logarithm of the likelihood."
@@ -115,7 +120,24 @@ def test_a_report_says_what_of_the_contact_is_not_determined():
     assert "All of them are within a tenth" in ground_text(alike) and "All of them" not in ground_text({"sticky": 1e-3})
     slides = {"sticky": 9.56e-3, "separate_0.15": 12.7e-3, "separate_0.424": 7.76e-3, "separate_0.6": 7.49e-3,
               "separate_1.2": 7.68e-3}  # fmt: skip
-    assert "Its friction is *not* determined: from 0.424 to 1.2 the isotropic law" in ground_text(slides)
+    assert "Its friction is *not* determined: the isotropic law comes within a tenth" in ground_text(slides)
+    assert ground_text(slides).endswith("of the nearest with 0.424, 0.6, 1.2, and is wrong itself.")
+    assert ground_text(near, 7.5).endswith("with 0.6, and is wrong itself.")  # what sticks less was not asked of the learned law
+    assert ground_text(slides, 1.0, friction=0.6).endswith("Its friction is *not* determined: that takes 5.")
+
+
+@pytest.mark.parametrize(("truth", "expected"), [(0.2, 0.212), (0.4, 0.424), (0.6, 0.3), (1.2, 1.2), (5.0, 3.39), (0.01, 0.053)])
+def test_another_friction_is_sought_downhill(truth, expected):
+    """By halves or doubles from the isotropic law's, then once between. The best of the others is said even where it is worse."""
+    asked = []
+
+    def gain(friction):
+        asked.append(friction)
+        return 10 * (math.log(0.6 / truth) ** 2 - math.log(friction / truth) ** 2)
+
+    friction, most = better_friction(0.6, gain)
+    assert friction == pytest.approx(expected, rel=0.01) and len(asked) <= 6 and len(set(asked)) == len(asked)
+    assert most == pytest.approx(gain(friction)) and (most > 0) == (truth != 0.6)
 
 
 def fit_of(take, **changed) -> LitMosa:
@@ -146,34 +168,57 @@ def test_a_run_goes_on_with_the_ground_that_it_found():
     assert again.world.ground == truth and again.config["world"]["ground"] == asdict(truth) and again.grounds == module.grounds
 
 
-@pytest.mark.parametrize("truth", [Ground(0.0, "separate", 1.2), Ground(0.0, "sticky")])
-def test_a_fit_begins_again_on_the_ground_that_explains_the_learned_law_better(monkeypatch, truth):
-    """Where the isotropic law could not tell: here nothing is near enough to be taken but the body that sticks. The rival has the
-    friction with which the isotropic law is nearest."""
-    monkeypatch.setattr(ground_choice, "NEARER", 0.0)
+def learning(truth: Ground) -> LitMosa:
+    """A fit of an anisotropic body that slides over a ground, as it is seen, by a body whose law and ground are sought."""
     begins = start(turn=0.5, speed=-2.0)
     begins.velocity[0] = 0.8
     numbers = torch.linspace(-0.02, 0.03, 19, dtype=torch.float64)
     take = take_of(small_body(numbers=numbers), begins, FRAMES, world(truth))
     take.again = None
-    body = small_body(E=1.2 * E, nu=0.3, on=False)
     config = {"world": {"ground": {"height": 0.0, "mode": AUTO, "friction": 0.0}}}
     stages = [replace(Stage(name, 8, 0.1), optimizer="gauss_newton") for name in ("prior", "joint")]
-    module = LitMosa(body, takes=[take], world=world(Ground(0.0, "sticky")), background=torch.ones(3), config=config,
-                     weights={"position": 1.0}, stages=stages, criterion=Criterion("corrected"),
-                     settings=IdentificationSettings(grid_error=0.0))  # fmt: skip
-    begun = []
-    begin = module.begin
+    return LitMosa(small_body(E=1.2 * E, nu=0.3, on=False), takes=[take], world=world(Ground(0.0, "sticky")),
+                   background=torch.ones(3), config=config, weights={"position": 1.0}, stages=stages,
+                   criterion=Criterion("corrected"), settings=IdentificationSettings(grid_error=0.0))  # fmt: skip
+
+
+def stages_begun(module: LitMosa, monkeypatch) -> list[tuple[str, Ground]]:
+    """(name, ground) of each stage, once the fit runs."""
+    begun, begin = [], module.begin
     monkeypatch.setattr(module, "begin", lambda stage: begun.append((stage.name, module.world.ground)) or begin(stage))
+    return begun
+
+
+@pytest.mark.parametrize("truth", [Ground(0.0, "separate", 1.2), Ground(0.0, "sticky")])
+def test_a_fit_begins_again_on_the_ground_that_explains_the_learned_law_better(monkeypatch, truth):
+    """Where the isotropic law could not tell: here nothing is near enough to be taken but the body that sticks. The rival has the
+    friction with which the isotropic law is nearest."""
+    monkeypatch.setattr(ground_choice, "NEARER", 0.0)
+    module = learning(truth)
+    begun = stages_begun(module, monkeypatch)
     module.identify()
     sticks = Ground(0.0, "sticky")
     again = [("prior", truth), ("joint", truth)] if truth.mode == "separate" else []
     assert begun == [("prior", sticks), ("joint", sticks), *again]
     assert module.world.ground.mode == truth.mode and (module.ground_gain > ground_choice.EXPLAINED) == (truth.mode == "separate")
-    assert float(body.material.physical()["E"].detach()) == pytest.approx(E, rel=0.1) and module.posterior is not None
+    assert float(module.body.material.physical()["E"].detach()) == pytest.approx(E, rel=0.1) and module.posterior is not None
     checkpoint: dict = {}
     module.on_save_checkpoint(checkpoint)
     assert checkpoint["mosa"]["ground_gain"] == module.ground_gain  # so that a fit that goes on does not begin again once more
+
+
+@pytest.mark.parametrize("truth", [0.3, 0.6])
+def test_a_fit_begins_again_with_the_friction_that_explains_the_learned_law_better(monkeypatch, truth):
+    """Where the isotropic law could not tell: here it has none but 0.6 to choose."""
+    monkeypatch.setattr(ground_search, "FRICTIONS", (0.6,))
+    monkeypatch.setattr(ground_search, "BETWEEN", 1.0)
+    module = learning(Ground(0.0, "separate", truth))
+    begun = stages_begun(module, monkeypatch)
+    module.identify()
+    slides, found = Ground(0.0, "separate", 0.6), Ground(0.0, "separate", 0.3)
+    again = [("prior", found), ("joint", found)] if truth == 0.3 else []
+    assert begun == [("prior", Ground(0.0, "sticky")), ("joint", slides), *again]
+    assert module.world.ground.friction == truth and (module.ground_gain > ground_choice.EXPLAINED) == (truth == 0.3)
 
 
 def test_a_contact_that_cannot_be_simulated_gains_nothing(monkeypatch):
