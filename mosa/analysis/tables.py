@@ -54,43 +54,63 @@ NOTICEABLE = 1.1
 """Ratio of the largest to the smallest Young's modulus below which a law counts as isotropic."""
 
 
-FREELY = "leaves it freely, friction "
+LIKELY = "of the logarithm of the likelihood"
 
 
 def ground_text(distances: Mapping[str, float], gain: float | None = None, friction: float = 0.0) -> str:
     """How the body touches the ground, of distances [m] by contact (`mosa.modules.ground_search`), in sentences, and what of it the
     motion does not tell. gain: of another contact, about the learned law, where that was asked; friction: which the law has been
     learned with."""
-    words = {name: name.replace("separate_", FREELY).replace("sticky", "sticks to it") for name in distances}
-    taken, rival = taken_of(distances), rival_of(distances)
-    touches, said, likely = words[taken], [], "of the logarithm of the likelihood"
-    if gain is not None and rival is not None:  # the isotropic law sticks
-        other = words[f"separate_{rival:.3g}"]
-        said.append(f"About the learned law, a body that {other} explains the motion {_better(gain)} {likely}.")
-        if gain > EXPLAINED:
-            touches = other
-        elif gain > -EXPLAINED:
-            said.append(f"Whether it sticks is *not* determined: that takes {EXPLAINED:g}.")
-    elif gain is not None and gain > EXPLAINED:
-        touches = f"{FREELY}{friction:.3g}"
-        said.append(f"About the learned law, this friction explains the motion {_better(gain)} {likely} than {taken[9:]}.")
-    elif gain is not None:
-        said.append(f"About the learned law, the best of other frictions explains the motion {_better(gain)} {likely}.")
-        if gain > -EXPLAINED:
-            said.append(f"Its friction is *not* determined: that takes {EXPLAINED:g}.")
-    if touches != words["sticky"] and (gain is None or rival is not None):  # found by the isotropic law alone
-        near = [f"{each:.3g}" for each in alike(distances)]
-        said.append("Its friction is *not* determined: the isotropic law comes within a tenth of the nearest with "
-                    f"{', '.join(near)}, and is wrong itself.")
-    listed = ", ".join(f"{words[name]} {distances[name] * 1e3:.2f} mm" for name in sorted(distances, key=distances.get))
+    sticks = taken_of(distances) == "sticky"
+    touches, said = _sticking(distances, gain) if sticks else _sliding(distances, gain, friction)
+    listed = ", ".join(f"{_words(name)} {distances[name] * 1e3:.2f} mm" for name in sorted(distances, key=distances.get))
     first = f"Ground: the body {touches} (mean distance from the training motion after calibration: {listed})."
     if len(distances) > 1 and NEARER * max(distances.values()) <= min(distances.values()):
         first += " All of them are within a tenth: this film hardly shows how the body slides."
     return " ".join([first, *said])
 
 
+def _sticking(distances: Mapping[str, float], gain: float | None) -> tuple[str, list[str]]:
+    """(how the body touches the ground, what else is said) where it sticks for the isotropic law."""
+    rival = rival_of(distances)
+    if gain is None or rival is None:
+        return _words("sticky"), []
+    free = _words(f"separate_{rival:.3g}")
+    said = f"About the learned law, a body that {free} explains the motion {_better(gain)} {LIKELY}."
+    if gain > EXPLAINED:
+        return free, [said, _guessed(distances)]
+    return _words("sticky"), [said] if gain <= -EXPLAINED else [said, f"Whether it sticks is {_open()}"]
+
+
+def _sliding(distances: Mapping[str, float], gain: float | None, friction: float) -> tuple[str, list[str]]:
+    """The same where it slides for the isotropic law."""
+    taken = taken_of(distances)
+    if gain is None:
+        return _words(taken), [_guessed(distances)]
+    if gain > EXPLAINED:
+        own = taken.removeprefix("separate_")
+        said = f"About the learned law, this friction explains the motion {_better(gain)} {LIKELY} than {own}."
+        return _words(f"separate_{friction:.3g}"), [said]
+    said = f"About the learned law, the best of other frictions explains the motion {_better(gain)} {LIKELY}."
+    return _words(taken), [said] if gain <= -EXPLAINED else [said, f"Its friction is {_open()}"]
+
+
+def _words(contact: str) -> str:
+    return contact.replace("separate_", "leaves it freely, friction ").replace("sticky", "sticks to it")
+
+
 def _better(gain: float) -> str:
     return f"{'better' if gain > 0 else 'worse'} by {abs(gain):.1f}"
+
+
+def _open() -> str:
+    return f"*not* determined: that takes {EXPLAINED:g}."
+
+
+def _guessed(distances: Mapping[str, float]) -> str:
+    near = ", ".join(f"{friction:.3g}" for friction in alike(distances))
+    return ("Its friction is *not* determined: the isotropic law comes within a tenth of the nearest with "
+            f"{near}, and is wrong itself.")
 
 
 def determined_text(figures: Mapping[str, float]) -> str:

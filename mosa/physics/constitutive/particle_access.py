@@ -64,7 +64,8 @@ ADD_WHOLE = """
     for (int k = 0; k < {pieces}; ++k) target[k] += static_cast<{scalar}>(source[k]);"""
 
 # of a 6 x 6 matrix and a vector, in the order of Warp's own product: neither the matrix nor its gradient is held in float64, for
-# which a GPU's thread has not enough registers. A CPU's compiler makes vectors of Warp's own
+# which a GPU's thread has not enough registers. All of it is read before its gradient is: a compiler keeps loads of one behind
+# stores to the other. A CPU's compiler makes vectors of Warp's own
 WHOLE = """
     const {scalar}* numbers = reinterpret_cast<const {scalar}*>(field.data + place);
     wp::mat_t<6, 6, double> matrix;
