@@ -25,27 +25,41 @@ def kernel_of(dtype):
         i = wp.tid()
         memory.store4(stored4, i, memory.load4(source, i))
         memory.store3(stored3, i, memory.load3(source, i))
-        memory.add4(added4, index[i], memory.load4(source, i))
-        memory.add3(added3, index[i], memory.load3(source, i))
+        if index[i] < 0:
+            return
+        together = memory.pair(index[i])
+        a = memory.load4(source, i)
+        b = memory.load3(source, i)
+        memory.add4(added4, index[i], a, scalar(2.0) * a, scalar(3.0) * a, together)
+        memory.add3(added3, index[i], b, scalar(2.0) * b, scalar(3.0) * b, together)
 
     return kernel
 
 
 @pytest.mark.parametrize("device", ["cpu", GPU])
 @pytest.mark.parametrize("dtype", KINDS)
-def test_loads_stores_and_sums_are_those_of_plain_indexing(dtype, device):
-    """Whole numbers, so that sums are exact in any order; some 16 threads meet at each target."""
+@pytest.mark.parametrize("longest", [1, 2, 5, 100])
+def test_loads_stores_and_sums_are_those_of_plain_indexing(longest, dtype, device):
+    """Whole numbers, so that sums are exact in any order; some 16 threads meet at each target, in runs of up to `longest`, over the
+    ends of warps and blocks too. Some threads take no part."""
     n, g = 1000, torch.Generator().manual_seed(0)
     source = torch.randint(-99, 99, (n, 4), generator=g).to(device=device, dtype=dtype)
-    index = torch.randint(0, 60, (n,), generator=g).to(device=device)
-    results = [torch.full((count, 4), 7.0, device=device, dtype=dtype) for count in (n, n, 60, 60)]
+    lengths = torch.randint(1, longest + 1, (n,), generator=g)
+    index = torch.randint(0, 60, (n,), generator=g).repeat_interleave(lengths)[:n].to(device=device)
+    index[torch.randint(0, n, (50,), generator=g).to(device)] = -1
+    results = [torch.full((count, 4), 7.0, device=device, dtype=dtype) for count in (n, n, 62, 62)]
     vec4 = KINDS[dtype][1]
     arrays = [wp.from_torch(source, dtype=vec4), wp.from_torch(index.int()), *(wp.from_torch(t, dtype=vec4) for t in results)]
     wp.launch(kernel_of(dtype), n, inputs=arrays, device=arrays[0].device)
     wp.synchronize_device(arrays[0].device)
     three = source.clone()
     three[:, 3] = 0
-    expected = [source, three, *(torch.full_like(results[2], 7.0).index_add_(0, index, values) for values in (source, three))]
+    part = index >= 0
+    expected = [source, three]
+    for values in (source, three):
+        expected.append(torch.full_like(results[2], 7.0))
+        for k in range(3):
+            expected[-1].index_add_(0, index[part] + k, (k + 1) * values[part])
     for found, value in zip(results, expected):
         assert torch.equal(found, value)
 

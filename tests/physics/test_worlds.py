@@ -43,23 +43,40 @@ def loss(rollout):
     return (rollout.x[1:] ** 2).sum() + (rollout.v[1:] ** 2).sum() + 1e-4 * (rollout.reactions**2).sum()
 
 
+ROUNDINGS = 1000
+"""Of a GPU where a node's sum has one: fused products of 27 nodes, functions of a law within two units in the last place."""
 LAWS = {"corotated": ({"lam": 5e4}, None), "von_mises": ({"lam": 5e4, "yield_stress": 300.0}, 0.05),
         "neo_hookean": ({"lam": 5e4}, 0.1)}  # fmt: skip
 
 
-def alone(world, start, law):
-    """(rollout, gradients of velocities, mu and first collider's velocity) of one world by itself."""
+def alone(world, start, law, order=slice(None)):
+    """(rollout, gradients of velocities, mu and first collider's velocity) of one world by itself. order: of the particles, which
+    `start` has already."""
     others, strength = LAWS[law]
     v, mu = start.v.clone().requires_grad_(), torch.tensor(4e4 + 4e3 * world, dtype=torch.float64).requires_grad_()
     push = torch.tensor([0.0, 0.5 * world, 0.1], dtype=torch.float64).requires_grad_()
     moving = motions(world)
     moving[0] = replace(moving[0], velocity=push)
-    answer = None if strength is None else AdapterOperator(*operator(world, strength))
+    answer = None if strength is None else AdapterOperator(*(t[order] for t in operator(world, strength)))
     found = simulator(law, GRAVITY[world]).rollout(
         replace(start, v=v), {"mu": mu, **others}, torch.full((64,), 8e-6).double(), 1000.0, FRAMES, motions=moving,
         adapter=None if answer is None else lambda _: answer, stride=None,
     )  # fmt: skip
     return found, torch.autograd.grad(loss(found), [v, mu, push])
+
+
+def noise_of_order(world, start, law):
+    """Largest changes of (positions [m], reactions, gradients of velocities and of mu) where the same particles come in other
+    orders: each node's sums are then rounded otherwise, and the motion goes on from that."""
+    own, (dv, dmu, _) = alone(world, start, law)
+    changes = []
+    for seed in range(4):
+        order = torch.randperm(64, generator=torch.Generator().manual_seed(seed))
+        names = ("x", "v", "C_affine", "F", "F_tot")
+        found, (of_v, of_mu, _) = alone(world, ParticleState(*(getattr(start, name)[order] for name in names)), law, order)
+        pairs = (found.x, own.x[:, order]), (found.reactions, own.reactions), (of_v, dv[order]), (of_mu, dmu)
+        changes.append([float((a - b).abs().max()) for a, b in pairs])
+    return [max(each) for each in zip(*changes)]
 
 
 def batched(starts, law, together, sim=None):
@@ -161,9 +178,11 @@ def test_errors_say_what_was_expected(change, message, make_block):
 @pytest.mark.gpu
 @pytest.mark.parametrize("law", LAWS)
 def test_on_cuda_each_world_is_its_own_rollout(law, make_block):
-    """Sums over particles have no order there: in float64 they differ by some 1e-16 of themselves, which 42 substeps enlarge."""
+    """Sums over particles have no order there. What another order changes is measured on the CPU; a GPU also fuses products with
+    sums, and rounds its functions otherwise."""
     starts = [make_block(seed=b, velocity=(0.2 * b, -1.0 - 0.4 * b, 0.1)) for b in range(WORLDS)]
     expected = [alone(b, starts[b], law) for b in range(WORLDS)]
+    noise = [noise_of_order(b, starts[b], law) for b in range(WORLDS)]
     others, strength = LAWS[law]
     states = ParticleState(*(getattr(ParticleState.stack(starts), name).cuda() for name in ("x", "v", "C_affine", "F", "F_tot")))
     sim = simulator(law, device="cuda")
@@ -178,10 +197,10 @@ def test_on_cuda_each_world_is_its_own_rollout(law, make_block):
         )  # fmt: skip
         dv, dmu = torch.autograd.grad(loss(found), [v, mu])
         for b, (own, (own_dv, own_dmu, _)) in enumerate(expected):
-            torch.testing.assert_close(found.x[:, b].cpu(), own.x, rtol=0, atol=1e-11)
-            torch.testing.assert_close(found.reactions[:, :, b].cpu(), own.reactions, rtol=1e-8, atol=1e-8)
-            torch.testing.assert_close(dv[b].cpu(), own_dv, rtol=0, atol=1e-7 * float(own_dv.abs().max()))
-            torch.testing.assert_close(dmu[b, 0].cpu(), own_dmu, rtol=1e-7, atol=0)
+            found_and_own = (found.x[:, b], own.x), (found.reactions[:, :, b], own.reactions), (dv[b], own_dv), (dmu[b, 0], own_dmu)
+            for (a, c), changed in zip(found_and_own, noise[b], strict=True):
+                allowed = ROUNDINGS * max(changed, 2e-16 * float(c.abs().max()))
+                assert (a.cpu() - c).abs().max() <= allowed, (law, b, float((a.cpu() - c).abs().max()), allowed)
 
 
 def test_a_stepper_goes_on_from_a_state_with_poses_from_outside(make_block):

@@ -38,7 +38,7 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
     memory, stencil, nodes_of = node_access(scalar), stencil_functions(scalar), node_functions(scalar).nodes_of
     load3, load4, clear_node = memory.load3, memory.load4, memory.clear
     adding = exact_node_access(scalar) if exact else memory
-    add3, add4, settle_node = adding.add3, adding.add4, exact_node_access(scalar).settle_node
+    pair, add3, add4, settle_node = adding.pair, adding.add3, adding.add4, exact_node_access(scalar).settle_node
     added_to = wp.array2d(dtype=wp.int64) if exact else wp.array(dtype=vec4)
     spline, spline_slope, cell, local_cell = stencil.spline, stencil.spline_slope, stencil.cell, stencil.local_cell
     window_row = stencil.window_row
@@ -62,6 +62,11 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
         for node in range(first + wp.tid() - world * threads, end, threads):
             settle_node(sums, grid, node)
 
+    @wp.func
+    def weighted(w: scalar, momentum: vec3, m: scalar):
+        q = w * momentum
+        return vec4(q[0], q[1], q[2], w * m)
+
     @wp.kernel(module=module, enable_backward=False)
     def p2g(
         x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), C: wp.array(dtype=mat33), F: wp.array(dtype=mat33),
@@ -81,6 +86,7 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
         if check_J == 1:
             if wp.determinant(F[p]) <= scalar(0.0):
                 wp.atomic_min(flags, _FLIPPED, wp.int64(substep) * wp.int64(x.shape[0]) + wp.int64(p))
+        together = pair(n)
         f = xp * inv_dx - base
         wx = spline(f[0])
         wy = spline(f[1])
@@ -99,10 +105,10 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
                 wij = wx[i] * wy[j]
                 row = n + (i * dims[1] + j) * dims[2]
                 qij = q0 + steps[i] * bx + steps[j] * by
-                for k in range(3):
-                    w = wij * wz[k]
-                    q = w * (qij + steps[k] * bz)
-                    add4(grid, row + k, vec4(q[0], q[1], q[2], w * m))
+                a = weighted(wij * wz[0], qij + steps[0] * bz, m)
+                b = weighted(wij * wz[1], qij + steps[1] * bz, m)
+                c = weighted(wij * wz[2], qij + steps[2] * bz, m)
+                add4(grid, row, a, b, c, together)
 
     @wp.kernel(module=module, enable_backward=False)
     def g2p(
@@ -185,6 +191,7 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
         n = local_cell(base, window, place)
         if n < 0:
             return
+        together = pair(n)
         f = xp * inv_dx - base
         wx = spline(f[0])
         wy = spline(f[1])
@@ -213,16 +220,22 @@ def transfer_kernels(scalar, exact: bool = False) -> SimpleNamespace:
                 row = n + (i * dims[1] + j) * dims[2]
                 rij = r0 + steps[i] * rx + steps[j] * ry
                 wij = wx[i] * wy[j]
-                flat = scalar(0.0)
-                for k in range(3):
-                    u = load3(velocity, row + k)
-                    r = rij + steps[k] * rz
-                    w = wij * wz[k]
-                    add3(adj_velocity, row + k, w * r)
-                    e = wp.dot(u, r)
-                    flat = flat + wz[k] * e
-                    gz = gz + wij * sz[k] * e
-                    v = v + w * u
+                a = load3(velocity, row)
+                b = load3(velocity, row + 1)
+                c = load3(velocity, row + 2)
+                ra = rij + steps[0] * rz
+                rb = rij + steps[1] * rz
+                rc = rij + steps[2] * rz
+                wa = wij * wz[0]
+                wb = wij * wz[1]
+                wc = wij * wz[2]
+                add3(adj_velocity, row, wa * ra, wb * rb, wc * rc, together)
+                ea = wp.dot(a, ra)
+                eb = wp.dot(b, rb)
+                ec = wp.dot(c, rc)
+                flat = wz[0] * ea + wz[1] * eb + wz[2] * ec
+                gz = gz + wij * sz[0] * ea + wij * sz[1] * eb + wij * sz[2] * ec
+                v = v + wa * a + wb * b + wc * c
                 gx = gx + sx[i] * wy[j] * flat
                 gy = gy + wx[i] * sy[j] * flat
         adj_x[p] = ax + inv_dx * (vec3(gx, gy, gz) - wp.transpose(ac) * v)
