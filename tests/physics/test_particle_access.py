@@ -121,8 +121,9 @@ def test_what_the_kernels_read_is_aligned():
 
 @pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="this Warp has no compiler for GPUs")
 @pytest.mark.parametrize("make", [stress_kernel, state_kernel])
-def test_the_adjoints_have_no_atomics(make, tmp_path):
-    """Of the stress with an operator and of the adapter's input, compiled for compute capability 9.0 without a GPU."""
+def test_the_adjoints_wait_for_no_sum(make, tmp_path):
+    """Of the stress with an operator and of the adapter's input, compiled for compute capability 9.0 without a GPU: sums leave no
+    result, and the operator's 36 numbers are added four at a time."""
     law = law_named("corotated")
     kernel = make(law.stress, law.uses_rotation, wp.float32, make is stress_kernel)
     wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=True)
@@ -130,6 +131,6 @@ def test_the_adjoints_have_no_atomics(make, tmp_path):
     bodies = re.split(r"\.entry ", ptx)[1:]
     backward = [body for body in bodies if "backward" in body.split("(")[0]]
     assert len(backward) == 1
-    assert not re.search(r"\b(atom|red)\.", backward[0])
+    assert not re.search(r"\batom\.", backward[0])
     if make is stress_kernel:
-        assert len(re.findall(r"st\.global(\.wt)?\.v4\.f32", backward[0])) >= 9  # the operator's 36 numbers
+        assert len(re.findall(r"red\.relaxed\.gpu\.global\.add\.v4\.f32", backward[0])) >= 9

@@ -1,10 +1,9 @@
 """A particle's own numbers, loaded into float64 by the one thread that works on it, as functions for Warp kernels.
 
-The adjoint that Warp generates for `field[i]` adds to the gradient one number at a time, atomically: 36 for a stress operator, each
-in a transaction of its own on a GPU. Here nobody else adds to particle i, so its gradient is read, added to and written back, 16
-bytes at a time where the size of a particle's part allows it; pieces to which nothing is added are left alone, which costs nothing
-where the compiler sees that a law does not read them. Arrays must be contiguous and begin at a multiple of 16 bytes, see
-`launching.aligned`.
+The adjoint that Warp generates for `field[i]` adds to the gradient one number at a time: 36 for a stress operator, each in a
+transaction of its own on a GPU. Here 16 bytes are added at a time where the size of a particle's part allows it, and no thread
+waits for that; pieces to which nothing is added are left alone, which costs nothing where the compiler sees that a law does not
+read them. Arrays must be contiguous and begin at a multiple of 16 bytes, see `launching.aligned`.
 
 An operator may be the same for many particles: it is read at a `place` that they share, and its gradient is added to each
 particle's own.
@@ -16,6 +15,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from mosa.physics.launching import BYTES
+from mosa.physics.memory_sums import added
 
 # a CPU's compiler would take the promise of alignment for faults rather than for speed
 PIECE = """
@@ -37,21 +37,27 @@ LOAD = """
     return value;"""
 ADD = """
     if (!adj_field.data) return;
-    Piece* target = reinterpret_cast<Piece*>(adj_field.data + i);
     const double* source = reinterpret_cast<const double*>(&adj_ret);
+    {scalar}* target = reinterpret_cast<{scalar}*>(adj_field.data + i);
 #pragma unroll
     for (int k = 0; k < {pieces}; ++k) {{
+        {scalar} part[{width}];
         bool any = false;
 #pragma unroll
-        for (int l = 0; l < {width}; ++l) any = any || source[{width} * k + l] != 0.0;
-        if (!any) continue;
-        Piece piece = target[k];
-#pragma unroll
-        for (int l = 0; l < {width}; ++l) piece.part[l] += static_cast<{scalar}>(source[{width} * k + l]);
-        target[k] = piece;
+        for (int l = 0; l < {width}; ++l) {{
+            part[l] = static_cast<{scalar}>(source[{width} * k + l]);
+            any = any || part[l] != 0;
+        }}
+#if defined(__CUDA_ARCH__)
+        const size_t address = __cvta_generic_to_global(target + {width} * k);
+        const int adds = any;{added}
+#else
+        if (any)
+            for (int l = 0; l < {width}; ++l) target[{width} * k + l] += part[l];
+#endif
     }}"""
 
-# of pieces of one number: a branch around each would have a thread wait for memory once for each of them
+# of pieces of one number, which are not worth an instruction of memory each: they are read, added to and written back at once
 ADD_WHOLE = """
     if (!adj_field.data) return;
     {scalar}* target = reinterpret_cast<{scalar}*>(adj_field.data + i);
@@ -64,8 +70,7 @@ ADD_WHOLE = """
     for (int k = 0; k < {pieces}; ++k) target[k] += static_cast<{scalar}>(source[k]);"""
 
 # of a 6 x 6 matrix and a vector, in the order of Warp's own product: neither the matrix nor its gradient is held in float64, for
-# which a GPU's thread has not enough registers. All of it is read before its gradient is: a compiler keeps loads of one behind
-# stores to the other. A CPU's compiler makes vectors of Warp's own
+# which a GPU's thread has not enough registers. A CPU's compiler makes vectors of Warp's own
 WHOLE = """
     const {scalar}* numbers = reinterpret_cast<const {scalar}*>(field.data + place);
     wp::mat_t<6, 6, double> matrix;
@@ -107,16 +112,17 @@ ADD_PRODUCT = f"""
         }}}}
     }}}}
     if (adj_field.data) {{{{
-        Piece* target = reinterpret_cast<Piece*>(adj_field.data + i);
+        {{scalar}}* target = reinterpret_cast<{{scalar}}*>(adj_field.data + i);
 #pragma unroll
         for (int k = 0; k < {{pieces}}; ++k) {{{{
-            Piece piece = target[k];
+            {{scalar}} part[{{width}}];
 #pragma unroll
             for (int l = 0; l < {{width}}; ++l) {{{{
                 const int row = ({{width}} * k + l) / 6, column = ({{width}} * k + l) % 6;
-                piece.part[l] += static_cast<{{scalar}}>(adj_ret[row] * x[column]);
+                part[l] = static_cast<{{scalar}}>(adj_ret[row] * x[column]);
             }}}}
-            target[k] = piece;
+            const size_t address = __cvta_generic_to_global(target + {{width}} * k);
+            const int adds = 1;{{added}}
         }}}}
     }}}}
     adj_x += sums;
@@ -139,10 +145,14 @@ def particle_access(scalar, slots: int) -> SimpleNamespace:
     scalar: of the fields, wp.float32 or wp.float64. No other thread may work on particle i, to whose gradients is added."""
     name, size = {wp.float32: ("float", 4), wp.float64: ("double", 8)}[scalar]
 
+    def pieces(count: int, width: int) -> dict:
+        numbers = added(scalar, [f"part[{k}]" for k in range(width)])
+        return {"scalar": name, "width": width, "pieces": count // width, "added": numbers}
+
     def snippets(count: int, result: str, place: str = "i") -> tuple[str, str]:
         width = next(k for k in (BYTES // size, BYTES // 2 // size, 1) if count % k == 0)
-        parts = {"scalar": name, "width": width, "pieces": count // width, "result": result, "place": place}
-        return (PIECE + LOAD).format(**parts), (ADD_WHOLE if width == 1 else PIECE + ADD).format(**parts)
+        parts = pieces(count, width) | {"result": result, "place": place}
+        return (PIECE + LOAD).format(**parts), (ADD_WHOLE if width == 1 else ADD).format(**parts)
 
     field33, field66 = (wp.array(dtype=wp.types.matrix(shape=(k, k), dtype=scalar)) for k in (3, 6))
     field6, fields = (wp.array(dtype=wp.types.vector(length=k, dtype=scalar)) for k in (6, slots))
@@ -154,8 +164,7 @@ def particle_access(scalar, slots: int) -> SimpleNamespace:
     @wp.func_native(*snippets(6, "wp::vec_t<6, double>", "place"))
     def vector6(field: field6, i: int, place: int) -> vec6: ...
 
-    width = BYTES // size
-    whole = {"scalar": name, "width": width, "pieces": 36 // width}
+    whole = pieces(36, BYTES // size)
 
     @wp.func_native(PRODUCT.format(**whole), ADD_PRODUCT.format(**whole))
     def times66(field: field66, i: int, place: int, x: vec6) -> vec6: ...

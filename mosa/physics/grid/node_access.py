@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from mosa.exact_sums import sum_functions
+from mosa.physics.memory_sums import added
 
 
 def _either(cuda: str, cpu: str) -> str:
@@ -36,30 +37,6 @@ STORE = {
     pairs[0] = make_double2(x, y);
     pairs[1] = make_double2(z, w);""",
 }
-
-# without a result (Warp's own atomic returns the old value, which costs float64 a branch for shared memory), and without a memory
-# clobber: the kernels do not read what they add to. A predicate in place of a branch, behind which the next nodes' loads would wait
-ADD_ONE = """
-    asm volatile("{{.reg .pred p; setp.ne.s32 p, %2, 0; @p red.relaxed.gpu.global.add.{kind} [%0], %1;}}"
-                 :: "l"(address + {offset}), "{letter}"({name}), "r"(adds));"""
-
-
-def _one_by_one(kind: str, letter: str, size: int, names: str) -> str:
-    return "".join(ADD_ONE.format(kind=kind, letter=letter, name=name, offset=size * k) for k, name in enumerate(names))
-
-
-def _add(scalar, names: str) -> str:
-    """`names` of x, y, z, w to a node's numbers, by the threads whose `adds` is not 0."""
-    address = "const size_t address = __cvta_generic_to_global(field.data + i + n);"
-    if scalar is wp.float64:
-        return address + _one_by_one("f64", "d", 8, names)
-    return address + f"""
-#if __CUDA_ARCH__ >= 900
-    asm volatile("{{.reg .pred p; setp.ne.s32 p, %5, 0; @p red.relaxed.gpu.global.add.v4.f32 [%0], {{%1, %2, %3, %4}};}}"
-                 :: "l"(address), "f"(x), "f"(y), "f"(z), "f"(w), "r"(adds));
-#else{_one_by_one("f32", "f", 4, names)}
-#endif"""
-
 
 # x: index of the lowest node; -> (threads that take part, 1 where this one adds to memory + 2 where it adds the next one's too).
 # Runs of threads with the same nodes are taken two by two; the thread after the last one has others, or takes no part
@@ -87,7 +64,7 @@ SHARED = """
 #pragma unroll
     for (int n = 0; n < 3; ++n) {
         const auto x = values[n].c[0], y = values[n].c[1], z = values[n].c[2], w = FOURTH;
-        ADD
+        const size_t address = __cvta_generic_to_global(field.data + i + n);ADD
     }"""
 PLAIN = """
     const decltype(a) values[3] = {a, b, c};
@@ -113,7 +90,7 @@ def node_access(scalar) -> SimpleNamespace:
 
     def add_row(names: str) -> str:
         fourth = "values[n].c[3]" if len(names) == 4 else "decltype(x)(0)"
-        cuda = SHARED.replace("FOURTH", fourth).replace("ADD", _add(scalar, names))
+        cuda = SHARED.replace("FOURTH", fourth).replace("ADD", added(scalar, names, filler=None if len(names) == 4 else "w"))
         return _either(cuda, PLAIN).replace("NUMBERS", str(len(names)))
 
     @wp.func_native(_either(PAIR, "return {0, 1};"))
