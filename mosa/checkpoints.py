@@ -70,7 +70,7 @@ START = {"rotation": TURNED, "center": THREE, "velocity": THREE, "angular_veloci
 STORED: dict[str, Kind] = {
     "density": number(0.1, 1e5), "dx": number(1e-6, 100), "frame_dt": number(1e-6, 100), "world.gravity": THREE, "world.box": BOX,
     "world.up": Kind("a direction", lambda v: THREE.fits(v) and any(v)),
-    "world.ground.height": Kind("a number", is_number), "world.ground.mode": one_of("sticky", "slip", "separate"),
+    "world.ground.height": Kind("a number", is_number), "world.ground.mode": one_of("sticky", "slip", "separate", "touch"),
     "world.ground.friction": WEIGHT,
     **{f"starts.*.{name}": kind for name, kind in START.items()},
 }  # fmt: skip

@@ -143,7 +143,7 @@ SPLATS: dict[str, Kind] = {
     "gravity": WEIGHT,
     "height": WEIGHT,
     "ground": SECTION,
-    "ground.mode": one_of("sticky", "slip", "separate"),
+    "ground.mode": one_of("sticky", "slip", "separate", "touch"),
     "ground.friction": WEIGHT,
     "rotation": or_null(TURN),
     "velocity": THREE,

@@ -40,9 +40,10 @@ AUTO = "auto"
 
 @dataclass(frozen=True)
 class Ground:
-    """The half space below `height` [m] along the up axis. mode: sticky | slip | separate; friction: Coulomb, separate only.
+    """The half space below `height` [m] along the up axis. mode: sticky | slip | separate | touch; friction: Coulomb, separate
+    and touch only.
 
-    In a scene the mode may be `AUTO`; a world that is simulated has one of the three."""
+    In a scene the mode may be `AUTO`; a world that is simulated has one of the four."""
 
     height: float
     mode: str = "sticky"

@@ -223,7 +223,7 @@ class Body(nn.Module):
                 float(material.max_viscosity(factor.detach())),
             )  # fmt: skip
             state = self.initial_state(start, frame_dt / substeps, gravity)
-        lift = model.contact() * up
+        lift = model.contact.lift(world.ground) * up
         simulator = None if adapter is None else adapter.simulator(self.density, world, frame_dt)
         if simulator is not None:  # no law on a grid: the adapter brings its dynamics
             lift, timing = torch.zeros_like(lift), None

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from mosa.types import Ground
+
 
 class ContactOffset(nn.Module):
     """Height [m] by which the grid's contact lies above the ground, learned in units of dx.
@@ -25,6 +27,12 @@ class ContactOffset(nn.Module):
 
     def forward(self) -> Tensor:
         return self.dx * self.cells
+
+    def lift(self, ground: Ground | None) -> Tensor:
+        """Height [m] by which a body is simulated above where it is. Particles that meet the ground themselves need none: there the
+        number, from its start on, is what is not known of the ground's height."""
+        touched = ground is not None and ground.mode == "touch" and self.enabled
+        return self.dx * (self.cells - self.START) if touched else self()
 
     @torch.no_grad()
     def project(self) -> None:

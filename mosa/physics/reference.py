@@ -10,8 +10,10 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
+from mosa.physics.constitutive.laws import law_named
 from mosa.physics.contact.planes import SLOW, THICKNESS, TOUCHING, Plane
 from mosa.physics.contact.reference import fade
+from mosa.physics.contact.touch import GRIP, springs
 from mosa.types import ParticleState
 
 EYE = torch.eye(3, dtype=torch.float64)
@@ -184,9 +186,27 @@ def stiffened_stress(law: str, measure: str, F: Tensor, p: dict[str, Tensor], S:
     return stress(law, F, p) + slope @ F.mT
 
 
+def meet(x: Tensor, v: Tensor, planes: Sequence[Plane], volume: Tensor, spring: Tensor, dt: float) -> Tensor:
+    """Particle velocities (N, 3) [m/s] after the planes of mode `touch`. x: (N, 3) [m]; volume [m^3] and spring [1/s^2]: (N,)."""
+    for plane in planes:
+        if plane.mode != "touch":
+            continue
+        n = torch.tensor(plane.normal, dtype=torch.float64)
+        n = n / n.norm()
+        depth = 0.5 * volume.pow(1 / 3) - (x - torch.tensor(plane.point, dtype=torch.float64)) @ n
+        push = dt * spring * depth.clamp_min(0)
+        sliding = v - (v @ n)[:, None] * n
+        length = sliding.norm(dim=1)
+        lost = (plane.friction * push / torch.where(length > 0, length, torch.ones_like(length))).clamp_max(GRIP)
+        v = v + push[:, None] * n - lost[:, None] * sliding
+    return v
+
+
 def collide(v: Tensor, y: Tensor, planes: Sequence[Plane], dx: float) -> Tensor:
     """Node velocities (M, 3) after contact; y: (M, 3) node positions [m]."""
     for plane in planes:
+        if plane.mode == "touch":
+            continue
         n = torch.tensor(plane.normal, dtype=torch.float64)
         n = n / n.norm()
         thickness = plane.thickness if plane.thickness is not None else THICKNESS * dx * (plane.friction > 0)
@@ -213,6 +233,7 @@ def substep(law: str, state: ParticleState, p: dict[str, Tensor], volume: Tensor
     x, v, C, F = state.x, state.v, state.C_affine, state.F
     tau = adapted_stress(law, F, p, operator, C)
     mass = density * volume
+    v = meet(x, v, planes, volume, springs(law_named(law).wave_modulus(p).detach(), mass, volume, dx), dt)
     base = torch.floor(x.detach() / dx - 0.5)
     f = x / dx - base
     weights = torch.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2])

@@ -121,7 +121,7 @@ def test_ground_is_below_its_height_along_up():
     [
         (Plane((0, 0, 0), UP, "bouncy"), "plane 0: mode.*'bouncy'"),
         (Plane((0, 0, 0), UP, "separate", -1.0), "friction"),
-        (Plane((0, 0, 0), UP, "slip", 0.5), "separate only"),
+        (Plane((0, 0, 0), UP, "slip", 0.5), "separate and touch only"),
         (Plane((0, 0, 0), (0, 0, 0)), "normal"),
         (Plane((0, 0, 0), UP, "separate", 0.1, -1.0), "thickness"),
     ],

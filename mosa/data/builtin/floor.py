@@ -62,7 +62,7 @@ def floor_rollout(body, scene: Scene, world) -> Tensor:
         options=hidden.options,
     )
     n, gravity, up = len(rest), world.gravity.float().cpu(), world.up.float().cpu()
-    lift = body.contact().detach().float().cpu() * up
+    lift = body.contact.lift(world.ground).detach().float().cpu() * up
     F = Q.expand(n, 3, 3).contiguous()
     velocity = (truth.velocity.float() - 0.5 * frame_dt / substeps * gravity).expand(n, 3).contiguous()
     F = F.to(device)

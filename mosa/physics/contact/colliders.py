@@ -19,7 +19,7 @@ from mosa.physics.contact import shapes as packing
 from mosa.physics.contact.keys import check_keys
 from mosa.physics.contact.mesh import SignedDistanceField, field_of_mesh
 from mosa.physics.contact.motion import Motion, Trajectory, exponential
-from mosa.physics.contact.planes import MODES, THICKNESS, Plane
+from mosa.physics.contact.planes import NODE_MODES, THICKNESS, Plane
 from mosa.schema import is_number
 
 
@@ -107,8 +107,8 @@ def pack_colliders(colliders: Sequence[Collider], dtype: torch.dtype, device: to
         where, shape = f"collider {collider.name or i}", collider.shape
         if type(shape) not in KINDS:
             raise ConfigError(f"{where}: shape: expected one of {', '.join(k.__name__ for k in KINDS)}, found {shape!r}")
-        if collider.mode not in MODES:
-            raise ConfigError(f"{where}: mode: expected one of {', '.join(MODES)}, found {collider.mode!r}")
+        if collider.mode not in NODE_MODES:
+            raise ConfigError(f"{where}: mode: expected one of {', '.join(NODE_MODES)}, found {collider.mode!r}")
         given = collider.thickness
         thickness = THICKNESS * dx if given is None else given
         for name, value in (("friction", collider.friction), ("thickness", thickness)):
@@ -121,7 +121,7 @@ def pack_colliders(colliders: Sequence[Collider], dtype: torch.dtype, device: to
                 raise ConfigError(f"{where}: {type(shape).__name__}: expected positive lengths [m], found {shape}")
             shapes[i, packing.SIZE + j] = value
         shapes[i, packing.THICKNESS], shapes[i, packing.FRICTION] = thickness, collider.friction
-        codes[i, packing.KIND], codes[i, packing.MODE] = KINDS[type(shape)], MODES[collider.mode]
+        codes[i, packing.KIND], codes[i, packing.MODE] = KINDS[type(shape)], NODE_MODES[collider.mode]
         if isinstance(shape, SignedDistanceField):
             if given is None:
                 shapes[i, packing.THICKNESS] = min(thickness, shape.margin)
@@ -162,8 +162,8 @@ def reach(shape: Shape) -> float:
 
 def domain_walls(box: Tensor, mode: str = "separate", friction: float = 0.0) -> list[Plane]:
     """Six planes that keep a body inside box (2, 3) [m]. Errors: ConfigError naming the key of `world.walls`."""
-    if not isinstance(mode, str) or mode not in MODES:
-        raise ConfigError(f"world.walls.mode: expected one of {', '.join(MODES)}, found {mode!r}")
+    if not isinstance(mode, str) or mode not in NODE_MODES:
+        raise ConfigError(f"world.walls.mode: expected one of {', '.join(NODE_MODES)}, found {mode!r}")
     if not is_number(friction) or friction < 0:
         raise ConfigError(f"world.walls.friction: expected a finite number >= 0, found {friction!r}")
     if friction > 0 and mode != "separate":

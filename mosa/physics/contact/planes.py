@@ -4,7 +4,7 @@ A node at or below a plane (tolerance 1e-6 m) gets: `sticky` zero velocity; `sli
 part, and the tangential part shrinks by Coulomb friction, |u_t| <- max(0, |u_t| - friction |u_n|).
 Above it, up to the plane's `thickness`, the change of velocity counts with a weight that fades to 0 (`make_fade`), and that is the
 smaller the faster a node comes or goes (`make_slowness`).
-Planes act in the order given, after gravity.
+Planes act in the order given, after gravity. One with mode `touch` is not met by nodes, but by particles (`touch`).
 
 Why friction needs a thickness: an elastic body without damping that is shaken, as a block is that is released suddenly on an
 incline, opens and closes its contact as it vibrates, and each time it slides a little. Such sliding feeds the vibration (a
@@ -22,9 +22,12 @@ import warp as wp
 from torch import Tensor
 
 from mosa.errors import ConfigError
+from mosa.physics.contact.touch import TOUCH
 from mosa.types import Ground
 
-MODES = {"sticky": 0, "slip": 1, "separate": 2}
+NODE_MODES = {"sticky": 0, "slip": 1, "separate": 2}
+"""How nodes of a grid meet a solid."""
+MODES = NODE_MODES | {"touch": TOUCH}
 THICKNESS = 1.4
 """Cells: of a contact whose thickness is not given. With it and `WHOLE` a body that is squeezed between plates answers to their
 stroke with the force of its own law, on coarse grids as on fine ones, and a shaken block stays (docs/verification.md)."""
@@ -42,8 +45,8 @@ TOUCHING = 1e-6
 class Plane:
     """A half space {y: (y - point).normal <= 0} that is solid. point: (3,) [m]; normal: (3,) outward, any length.
 
-    mode: sticky | slip | separate; friction: Coulomb coefficient, for `separate`; thickness [m]: over this distance above the
-    plane the contact with what is slow fades in; None: `THICKNESS` cells where there is friction, else 0.
+    mode: sticky | slip | separate | touch; friction: Coulomb coefficient, for separate and touch; thickness [m]: over this
+    distance above the plane the contact with what is slow fades in; None: `THICKNESS` cells where there is friction, else 0.
     """
 
     point: tuple[float, float, float]
@@ -71,11 +74,11 @@ def pack_planes(planes: list[Plane], dtype: torch.dtype, device: torch.device, d
             raise ConfigError(f"plane {i}: mode: expected one of {', '.join(MODES)}, found {plane.mode!r}")
         if isinstance(plane.friction, bool) or not 0 <= plane.friction < math.inf:
             raise ConfigError(f"plane {i}: friction: expected a finite number >= 0, found {plane.friction}")
-        if plane.friction > 0 and plane.mode != "separate":
-            raise ConfigError(f"plane {i}: friction acts on mode separate only, found mode {plane.mode!r}")
+        if plane.friction > 0 and plane.mode not in ("separate", "touch"):
+            raise ConfigError(f"plane {i}: friction acts on modes separate and touch only, found mode {plane.mode!r}")
         thickness = plane.thickness
         if thickness is None:
-            thickness = THICKNESS * dx if plane.friction > 0 else 0.0
+            thickness = THICKNESS * dx if plane.friction > 0 and plane.mode != "touch" else 0.0
         if isinstance(thickness, bool) or not 0 <= thickness < math.inf:
             raise ConfigError(f"plane {i}: thickness: expected a finite number >= 0 [m], found {thickness}")
         normal = torch.tensor(plane.normal, dtype=torch.float64)
@@ -131,6 +134,8 @@ def make_plane_functions(scalar):
         """Velocity of a node inside the plane after contact."""
         r = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
         un = wp.dot(u, normal)
+        if mode == TOUCH:
+            r = u
         if mode == 1:
             r = u - un * normal
         if mode == 2:
@@ -153,6 +158,8 @@ def make_plane_functions(scalar):
         r = zero
         un = wp.dot(u, normal)
         at = a - wp.dot(a, normal) * normal
+        if mode == TOUCH:
+            r = a
         if mode == 1:
             r = at
         if mode == 2:

@@ -127,14 +127,15 @@ def motions_of_worlds(
     return list(motions)
 
 
-def corners(box: Tensor | None) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """(low, high) [m] of the domain (2, 3) that particles may not leave, far away where there is none. Errors: ConfigError."""
+def corners(box: Tensor | None, margin: float = 0.0) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """(low, high) [m] of the domain (2, 3) that particles may not leave by more than `margin` [m], far away where there is none.
+    Errors: ConfigError."""
     if box is None:
         return (-UNBOUNDED,) * 3, (UNBOUNDED,) * 3
     low, high = (tuple(corner) for corner in torch.as_tensor(box).double().tolist())
     if not all(a < b for a, b in zip(low, high)):
         raise ConfigError(f"box: expected min < max on every axis, found {low} and {high}")
-    return low, high
+    return tuple(a - margin for a in low), tuple(b + margin for b in high)
 
 
 def polar_rotation(F: Tensor) -> Tensor:

@@ -46,7 +46,7 @@ class Numerics:
     """What is constant over a rollout and the same in all worlds, but for gravity where each has its own. dx [m], dt [s] where the
     step is fixed, gravity (3,) [m/s^2], planes (P, 6) and modes (P,) from `pack_planes`, low and high (3,) [m] corners of the
     admissible domain, norm_eps under the root of yield norms, colliders None where there are none, strain: measure of an operator
-    that is a stiffness (`stress_kernel`), None for one that acts on the stress."""
+    that is a stiffness (`stress_kernel`), None for one that acts on the stress; touching: whether a plane is met by particles."""
 
     law: Law
     dtype: torch.dtype
@@ -64,6 +64,7 @@ class Numerics:
     check_J: bool
     colliders: PackedColliders | None = None
     strain: str | None = None
+    touching: bool = False
 
 
 class Steps(NamedTuple):

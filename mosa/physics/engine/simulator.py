@@ -96,11 +96,14 @@ class Simulator:
         values, modes = pack_planes(all_planes, dtype, self.device, float(dx))
         self.colliders = tuple(colliders)
         packed_colliders = pack_colliders(self.colliders, dtype, self.device, float(dx)) if self.colliders else None
-        low, high = corners(box)
+        touching = any(plane.mode == "touch" for plane in all_planes)
+        # a ground that particles meet yields a little, and the box may end at it
+        low, high = corners(box, float(dx) if touching else 0.0)
         self.numerics = Numerics(
             law=self.law, dtype=dtype, device=self.device, dx=float(dx), dt=self.dt, gravity=tuple(gravity.tolist()),
-            planes=values, modes=modes, plane_count=len(all_planes), low=low, high=high, norm_eps=float(options.norm_eps),
-            rebuild=options.rebuild, check_J=self.law.needs_positive_J or options.on_inversion == "error",
+            planes=values, modes=modes, plane_count=len(all_planes), touching=touching, low=low, high=high,
+            norm_eps=float(options.norm_eps), rebuild=options.rebuild,
+            check_J=self.law.needs_positive_J or options.on_inversion == "error",
             colliders=packed_colliders, strain=strain,
         )  # fmt: skip
         self.buffers = Buffers()

@@ -18,6 +18,7 @@ from mosa.physics.constitutive.laws import SLOTS
 from mosa.physics.constitutive.material_kernels import kernels_of
 from mosa.physics.contact.collider_buffers import ColliderBuffers
 from mosa.physics.contact.grid_update import update_kernels
+from mosa.physics.contact.touch import springs, touch_kernels
 from mosa.physics.engine.capture import Graphs, WarpCapture
 from mosa.physics.engine.numerics import Numerics, State, Steps
 from mosa.physics.grid.transfer_kernels import NO_EVENT, transfer_kernels
@@ -99,6 +100,10 @@ class Workspace:
         self.impulses, self.impulses_wp = self._per_slot(2, (worlds, 3), self.kernels.vec3)
         self.planes_wp = wp.from_torch(numerics.planes, dtype=self.scalar)
         self.modes_wp = wp.from_torch(numerics.modes, dtype=wp.int32)
+        if numerics.touching:
+            self.touch = touch_kernels(self.scalar)
+            self.v_met, self.v_met_wp = self.array((n, 3), self.kernels.vec3)
+            self.springs, self.springs_wp = self.array((n,), self.scalar)
         self.colliders = None
         if numerics.colliders is not None:
             self.colliders = ColliderBuffers(numerics.colliders, self.scalar, substeps, self, with_adjoint)
@@ -212,12 +217,24 @@ class Workspace:
         if self._rows:  # a view of one row with a leading dimension has other strides than its target: each is then copied alone
             targets, given = self.held | self._rows, given | {name: given[name][0] for name in self._rows}
         torch._foreach_copy_([targets[name] for name in given], list(given.values()))
+        self._tighten(given.get("parameters"))
 
     def point(self, held: dict[str, Tensor | None]) -> None:
         """As `hold`, without a copy or a graph: the next launches read these tensors. The caller keeps them."""
         for name, value in held.items():
             if value is not None:
                 self.held_wp[name] = wp.from_torch(aligned(value.detach()), dtype=self.held_wp[name].dtype)
+        self._tighten(held.get("parameters"))
+
+    def _tighten(self, parameters: Tensor | None) -> None:
+        """Springs of the planes that particles meet, of packed parameters (N, SLOTS); the mass has to be there."""
+        if self.numerics.touching and parameters is not None:
+            law = self.numerics.law
+            values = {
+                name: parameters[:, law.offsets[name] : law.offsets[name] + size].detach().squeeze(-1)
+                for name, size in law.parameters.items()
+            }
+            self.springs.copy_(springs(law.wave_modulus(values), self.mass, self.volume, self.numerics.dx))
 
     def final(self) -> State:
         """Copies of the state after the segment."""
@@ -279,6 +296,19 @@ class Workspace:
             numerics.plane_count,
         ]  # fmt: skip
 
+    def _touch_arguments(self, state: int, step: int) -> list:
+        return [
+            self.x_wp[state], self.v_wp[state], self.volume_wp, self.springs_wp, self.planes_wp, self.modes_wp,
+            self.numerics.plane_count, self._kick(step),
+        ]  # fmt: skip
+
+    def _met(self, state: int, step: int) -> wp.array:
+        """Velocities of a state that go to the grid: after the planes that particles meet, where there are such."""
+        if not self.numerics.touching:
+            return self.v_wp[state]
+        self.run(self.touch.meet, self.particles, [*self._touch_arguments(state, step), self.v_met_wp])
+        return self.v_met_wp
+
     def _stress_arguments(self, state: int, slot: int) -> list:
         held = self.held_wp
         return [self.F_wp[state], self.C_affine_wp[state], held["parameters"], held["G"], held["h"], self.tau_wp[slot]]
@@ -305,7 +335,7 @@ class Workspace:
             cleared = self.grid_wp[(step + 1) % grids] if step + 1 < self.substeps and not self.exact else None
             self.run(self.stress, n, self._stress_arguments(a, s))
             self.run(kernels.p2g, n, [
-                self.x_wp[a], self.v_wp[a], self.C_affine_wp[a], self.F_wp[a], self.tau_wp[s], self.mass_wp, self.volume_wp,
+                self.x_wp[a], self._met(a, step), self.C_affine_wp[a], self.F_wp[a], self.tau_wp[s], self.mass_wp, self.volume_wp,
                 *(geometry if step else kicked), int(numerics.check_J), step, self.flags_wp, self._added_to(self.grid_wp[g]),
             ])  # fmt: skip
             self._settle(self.grid_wp[g])
@@ -358,10 +388,12 @@ class Workspace:
             if self.colliders is not None:
                 self.colliders.add_mass(self.adj_grid_wp)
             self.run(kernels.adj_p2g, n, [
-                self.x_wp[step], self.v_wp[step], self.C_affine_wp[step], self.tau_wp[step], self.mass_wp, self.volume_wp,
+                self.x_wp[step], self._met(step, step), self.C_affine_wp[step], self.tau_wp[step], self.mass_wp, self.volume_wp,
                 *(geometry if step else kicked), self.adj_grid_wp, self.adj_x_wp[a], self.adj_v_wp[a], self.adj_C_affine_wp[a],
                 self.adj_tau_wp,
             ])  # fmt: skip
+            if numerics.touching:
+                self.run(self.touch.adj_meet, n, [*self._touch_arguments(step, step), self.adj_x_wp[a], self.adj_v_wp[a]])
             self.run(self.stress, n, self._stress_arguments(step, step), [
                 self.adj_F_wp[a], self.adj_C_affine_wp[a], held["parameters"], held["G"], held["h"], self.adj_tau_wp,
             ])  # fmt: skip
