@@ -76,9 +76,11 @@ class NewtonSteps:
         if not stage.learns_adapter or not self.grounds or self.ground_gain is not None:
             return None
         found = self.world.ground
+        # a fit that was stopped gains by going on, wherever it goes on
+        own = self.identification.cost() if self.identification.converged else self.fitted_on(found, stage)
 
         def gain(friction: float) -> float:
-            return parallel.mean(self.gained_on(replace(found, mode="separate", friction=friction), stage))
+            return parallel.mean(own - self.fitted_on(replace(found, mode="separate", friction=friction), stage))
 
         if found.mode == "separate":
             friction, self.ground_gain = better_friction(found.friction, gain)
@@ -91,9 +93,9 @@ class NewtonSteps:
                  abs(self.ground_gain), "; the fit begins again" if self.ground_gain > EXPLAINED else "")  # fmt: skip
         return replace(found, mode="separate", friction=friction) if self.ground_gain > EXPLAINED else None
 
-    def gained_on(self, ground: Ground, stage: Stage) -> float:
-        """By how much the running identification's cost falls on another ground, from the same numbers and under the same noise, in
-        `RIVAL_ITERATIONS`; minus infinity where the body cannot be simulated there. The fit itself stays where it stands."""
+    def fitted_on(self, ground: Ground, stage: Stage) -> float:
+        """Cost of the running identification on a ground after `RIVAL_ITERATIONS`, from the same numbers and under the same noise;
+        infinite where the body cannot be simulated there. The fit itself stays where it stands."""
         own = self.identification
         other = Identification(copy.deepcopy(self.body), self.takes, replace(self.world, ground=ground), stage, self.criterion,
                                self.settings, own.kinds)
@@ -105,8 +107,8 @@ class NewtonSteps:
                 if other.converged:
                     break
         except SimulationDiverged:
-            return -math.inf
-        return own.cost() - cost
+            return math.inf
+        return cost
 
     def keep_posterior(self, stage: Stage) -> None:
         """Of the running identification, where it is the last one."""

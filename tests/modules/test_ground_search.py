@@ -228,11 +228,25 @@ def test_a_contact_that_cannot_be_simulated_gains_nothing(monkeypatch):
     module.identification = module.identifying(stage)
     module.identification.iterate()
     before = {name: value.clone() for name, value in module.body.state_dict().items()}
-    same = module.gained_on(module.world.ground, stage)
-    assert same > -1e-6  # the very ground: it is fitted further
+    assert module.fitted_on(module.world.ground, stage) < module.identification.cost() + 1e-6  # the very ground: it is fitted further
     monkeypatch.setattr(Identification, "iterate", lambda self: (_ for _ in ()).throw(SimulationDiverged("it cannot")))
-    assert module.gained_on(Ground(0.0, "separate", 0.3), stage) == -math.inf
+    assert module.fitted_on(Ground(0.0, "separate", 0.3), stage) == math.inf
     assert all(torch.equal(value, before[name]) for name, value in module.body.state_dict().items())
+
+
+@pytest.mark.parametrize("converged", [False, True])
+def test_a_fit_that_was_stopped_is_compared_with_itself_gone_on(monkeypatch, converged):
+    """It gains by going on, on any ground: by 7 here, on the ground it has and on a rougher one."""
+    module = fit_of(take_of(small_body(adapter=False), start(turn=0.5), FRAMES))
+    module.begin(module.stages[0])
+    module.identification = module.identifying(module.stages[0])
+    module.identification.iterate()
+    module.identification.converged = converged
+    module.world = replace(module.world, ground=Ground(0.0, "separate", 0.6))
+    module.grounds, cost = {"sticky": 2.0, "separate_0.6": 1.0}, module.identification.cost()
+    monkeypatch.setattr(module, "fitted_on", lambda ground, _: cost - 7.0)
+    found = module.better_ground(replace(module.stages[0], name="joint"))
+    assert module.ground_gain == (7.0 if converged else 0.0) and (found is None) == (not converged)
 
 
 def test_adam_takes_a_body_that_sticks_and_says_so():
