@@ -22,6 +22,7 @@ from mosa.data.images import composite, resize
 from mosa.data.scene import held_out_sequences, load_scene
 from mosa.errors import ConfigError
 from mosa.modules.body import World
+from mosa.modules.contact import ContactOffset
 from mosa.physics.contact.colliders import Collider, HalfSpace
 from mosa.physics.contact.motion import Motion
 from mosa.physics.contact.planes import Plane
@@ -259,8 +260,10 @@ def test_the_floor_is_the_truth_itself_on_the_truth_s_own_particles_and_grid(tra
     scene = held_out[0]
     world = World(scene.ground, scene.gravity, scene.up, scene.box)
     rest = training.truth.rest
+    contact = ContactOffset(2 * spacing)
+    torch.nn.init.constant_(contact.cells, CONTACT_CELLS)
     body = SimpleNamespace(
-        rest=rest, volume=torch.full((len(rest),), spacing**3), contact=lambda: torch.tensor(CONTACT_CELLS * 2 * spacing),
+        rest=rest, volume=torch.full((len(rest),), spacing**3), contact=contact,
         settings=SimpleNamespace(dx=2 * spacing, courant=COURANT),
     )  # fmt: skip
     found = floor_rollout(body, scene, world)

@@ -16,6 +16,7 @@ from mosa.data.builtin.surface import fill
 from mosa.data.scene import load_scene
 from mosa.errors import ConfigError
 from mosa.modules.body import World
+from mosa.modules.contact import ContactOffset
 
 SMALL = replace(OBJECTS["tiny"], footage=replace(OBJECTS["tiny"].footage, frames=9))
 
@@ -58,8 +59,10 @@ def test_it_is_a_scene_with_a_floor(tmp_path, monkeypatch):
         assert scene.known_parameters == {"E": 2e5, "nu": 0.3} | ({"yield_stress": 1.5e4} if kind == "isotropic" else {})
         world, truth = World(scene.ground, scene.gravity, scene.up, scene.box), scene.truth
         settings = SimpleNamespace(dx=2 * SMALL.spacing, courant=0.3)
-        body = SimpleNamespace(rest=truth.rest, volume=torch.full((len(truth.rest),), SMALL.spacing**3), settings=settings,
-                               contact=lambda: torch.tensor(0.4 * 2 * SMALL.spacing))  # fmt: skip
+        contact = ContactOffset(settings.dx)
+        torch.nn.init.constant_(contact.cells, 0.4)
+        volume = torch.full((len(truth.rest),), SMALL.spacing**3)
+        body = SimpleNamespace(rest=truth.rest, volume=volume, settings=settings, contact=contact)
         found = floor.floor_rollout(body, scene, world)
         assert float((found - truth.positions).norm(dim=-1).max()) < 1e-3
     assert held_out_names("rabbit_plastic") == ("test_60", "test_40")

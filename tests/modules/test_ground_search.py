@@ -12,6 +12,7 @@ from mosa.checkpoints import check_resumed
 from mosa.errors import DataError, SimulationDiverged
 from mosa.modules import ground_choice, ground_search
 from mosa.modules.body import World
+from mosa.modules.contact import ContactOffset
 from mosa.modules.criteria import Criterion
 from mosa.modules.ground_choice import named, rival_of, taken_of
 from mosa.modules.ground_search import better_friction, choose_ground
@@ -249,6 +250,16 @@ def test_a_fit_that_was_stopped_is_compared_with_itself_gone_on(monkeypatch, con
     assert module.ground_gain == (7.0 if converged else 0.0) and (found is None) == (not converged)
 
 
+def test_particles_that_meet_the_ground_themselves_need_no_lift():
+    """The number then is what is not known of the ground's height, from nothing on."""
+    offset, sticks, meets = ContactOffset(0.1), Ground(0.0, "sticky"), Ground(0.0, "touch")
+    assert float(offset.lift(sticks).detach()) == pytest.approx(0.1 * offset.START) == float(offset.lift(None).detach())
+    assert float(offset.lift(meets).detach()) == 0.0
+    torch.nn.init.constant_(offset.cells, offset.LIMITS[1])
+    assert float(offset.lift(meets).detach()) == pytest.approx(0.1 * (offset.LIMITS[1] - offset.START))
+    assert float(ContactOffset(0.1, enabled=False).lift(meets).detach()) == 0.0
+
+
 def test_adam_takes_a_body_that_sticks_and_says_so():
     module = fit_of(take_of(small_body(adapter=False), start(turn=0.5), FRAMES), newton_iterations=1)
     stage = replace(module.stages[0], optimizer="adam")
@@ -258,7 +269,7 @@ def test_adam_takes_a_body_that_sticks_and_says_so():
 
 
 @pytest.mark.parametrize("ground, message", [
-    ({"height": 0.0, "mode": "auto", "friction": 0.0}, "world.ground.mode: expected sticky or slip or separate, found 'auto'"),
+    ({"height": 0.0, "mode": "auto", "friction": 0.0}, "world.ground.mode: expected sticky or slip or separate or touch, found 'auto'"),
     ({"height": 0.0, "mode": "separate", "friction": -1.0}, "world.ground.friction"),
     ({"height": 0.0}, "mosa.config.world.ground: expected"),
 ])  # fmt: skip

@@ -106,8 +106,8 @@ def bottle(count: int) -> tuple[torch.Tensor, float]:
 
 def test_a_tilted_body_bounces_as_one_of_finite_elements():
     """A solid bottle, tilted by 70 degrees, comes down at 2.5 m/s and sticks while it touches. Tetrahedra of an own program
-    (linear, 14,000 to 87,000 of them within 1 %): 1.18 m/s along the ground after the bounce, 1.24 m/s up at 0.075 s after the first
-    contact. Nodes of a grid in place of particles: 0.93."""
+    (linear, 14,000 to 87,000 of them within 1 %): 1.18 m/s along the ground after the bounce, 1.24 m/s up at 0.075 s after the
+    first contact. Nodes of a grid in place of particles: 0.93."""
     x, volume = bottle(2000)
     n, s = len(x), volume ** (1 / 3)
     x = x @ turned((0.2, 1.0, 0.3), 70).T
