@@ -229,7 +229,8 @@ def test_a_contact_that_cannot_be_simulated_gains_nothing(monkeypatch):
     module.identification = module.identifying(stage)
     module.identification.iterate()
     before = {name: value.clone() for name, value in module.body.state_dict().items()}
-    assert module.fitted_on(module.world.ground, stage) < module.identification.cost() + 1e-6  # the very ground: it is fitted further
+    # the very ground: it is fitted further
+    assert module.fitted_on(module.world.ground, stage) < module.identification.cost() + 1e-6
     monkeypatch.setattr(Identification, "iterate", lambda self: (_ for _ in ()).throw(SimulationDiverged("it cannot")))
     assert module.fitted_on(Ground(0.0, "separate", 0.3), stage) == math.inf
     assert all(torch.equal(value, before[name]) for name, value in module.body.state_dict().items())
@@ -269,7 +270,8 @@ def test_adam_takes_a_body_that_sticks_and_says_so():
 
 
 @pytest.mark.parametrize("ground, message", [
-    ({"height": 0.0, "mode": "auto", "friction": 0.0}, "world.ground.mode: expected sticky or slip or separate or touch, found 'auto'"),
+    ({"height": 0.0, "mode": "auto", "friction": 0.0},
+     "world.ground.mode: expected sticky or slip or separate or touch, found 'auto'"),
     ({"height": 0.0, "mode": "separate", "friction": -1.0}, "world.ground.friction"),
     ({"height": 0.0}, "mosa.config.world.ground: expected"),
 ])  # fmt: skip
