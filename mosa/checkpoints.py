@@ -26,6 +26,7 @@ from mosa.physics.constitutive.laws import law_named
 from mosa.rendering.lighting import LIGHT
 from mosa.rendering.spherical_harmonics import DEGREES
 from mosa.schema import POSITIVE, THREE, WEIGHT, Kind, check, is_number, number, one_of, or_null, whole
+from mosa.types import GROUND_MODES
 
 TENSORS = {"rest": (3,), "volume": (), "colors": (3,), "opacities": (), "covariances": (3, 3)}
 """What a body is made of, with the shape for each particle."""
@@ -70,7 +71,7 @@ START = {"rotation": TURNED, "center": THREE, "velocity": THREE, "angular_veloci
 STORED: dict[str, Kind] = {
     "density": number(0.1, 1e5), "dx": number(1e-6, 100), "frame_dt": number(1e-6, 100), "world.gravity": THREE, "world.box": BOX,
     "world.up": Kind("a direction", lambda v: THREE.fits(v) and any(v)),
-    "world.ground.height": Kind("a number", is_number), "world.ground.mode": one_of("sticky", "slip", "separate", "touch"),
+    "world.ground.height": Kind("a number", is_number), "world.ground.mode": one_of(*GROUND_MODES),
     "world.ground.friction": WEIGHT,
     **{f"starts.*.{name}": kind for name, kind in START.items()},
 }  # fmt: skip

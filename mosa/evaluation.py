@@ -237,7 +237,7 @@ def identification(body: Body, scene: Scene) -> dict[str, float]:
             if name in scene.known_parameters:
                 errors = metrics.identification_errors(name, figures[f"{prefix}/{name}"], scene.known_parameters[name])
                 figures |= {f"{prefix}/{key}": value for key, value in errors.items()}
-        figures[f"{prefix}/contact_offset_m"] = float(model.contact().detach())
+        figures[f"{prefix}/contact_offset_m"] = float(model.contact.lift(scene.ground).detach())
     return figures
 
 

@@ -43,6 +43,7 @@ from mosa.schema import (
     or_null,
     whole,
 )
+from mosa.types import GROUND_MODES
 
 SECTIONS = ("scene", "prior", "adapter", "reconstruction", "simulation", "fit", "rendering", "trainer", "logger", "evaluation",
             "heterogeneity", "losses", "world", "criterion", "identification",
@@ -143,7 +144,7 @@ SPLATS: dict[str, Kind] = {
     "gravity": WEIGHT,
     "height": WEIGHT,
     "ground": SECTION,
-    "ground.mode": one_of("sticky", "slip", "separate", "touch"),
+    "ground.mode": one_of(*GROUND_MODES),
     "ground.friction": WEIGHT,
     "rotation": or_null(TURN),
     "velocity": THREE,

@@ -36,6 +36,9 @@ class Cameras:
 
 AUTO = "auto"
 """Mode of a ground of which only the height is known: how it is touched is found with the law."""
+GROUND_MODES = ("sticky", "slip", "separate", "touch")
+RUBBING = ("separate", "touch")
+"""Of these modes, those with friction."""
 
 
 @dataclass(frozen=True)

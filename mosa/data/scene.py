@@ -12,7 +12,7 @@ from mosa.data.scene_from_footage import check_fps, scene_from_footage
 from mosa.data.validation import validate
 from mosa.errors import ConfigError
 from mosa.schema import is_number
-from mosa.types import AUTO, Ground, Scene
+from mosa.types import AUTO, GROUND_MODES, RUBBING, Ground, Scene
 
 FORMATS = {
     "pacnerf": "mosa.data.pacnerf:load_pacnerf",
@@ -136,12 +136,13 @@ def ground_from(keys) -> Ground | None:
     if unknown:
         raise ConfigError(f"scene.ground.{min(unknown)}: expected the keys height, mode and friction only")
     mode, friction = keys.get("mode", "sticky"), keys.get("friction") or 0.0
-    if not isinstance(mode, str) or mode not in (AUTO, "sticky", "slip", "separate", "touch"):
-        raise ConfigError(f"scene.ground.mode: expected sticky, slip, separate, touch or auto, found {mode!r}")
+    if not isinstance(mode, str) or mode not in (AUTO, *GROUND_MODES):
+        raise ConfigError(f"scene.ground.mode: expected {', '.join(GROUND_MODES)} or {AUTO}, found {mode!r}")
     if not is_number(keys.get("height")):
         raise ConfigError(f"scene.ground.height: expected a height in metres, found {keys.get('height')!r}")
     if not is_number(friction) or friction < 0:
         raise ConfigError(f"scene.ground.friction: expected a finite number >= 0, found {friction!r}")
-    if friction > 0 and mode not in ("separate", "touch"):
-        raise ConfigError(f"scene.ground.friction: acts with modes separate and touch only, found {friction} with mode {mode!r}")
+    if friction > 0 and mode not in RUBBING:
+        modes = " and ".join(RUBBING)
+        raise ConfigError(f"scene.ground.friction: acts with modes {modes} only, found {friction} with mode {mode!r}")
     return Ground(float(keys["height"]), mode, float(friction))

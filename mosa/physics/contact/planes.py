@@ -23,7 +23,7 @@ from torch import Tensor
 
 from mosa.errors import ConfigError
 from mosa.physics.contact.touch import TOUCH
-from mosa.types import Ground
+from mosa.types import RUBBING, Ground
 
 NODE_MODES = {"sticky": 0, "slip": 1, "separate": 2}
 """How nodes of a grid meet a solid."""
@@ -74,8 +74,8 @@ def pack_planes(planes: list[Plane], dtype: torch.dtype, device: torch.device, d
             raise ConfigError(f"plane {i}: mode: expected one of {', '.join(MODES)}, found {plane.mode!r}")
         if isinstance(plane.friction, bool) or not 0 <= plane.friction < math.inf:
             raise ConfigError(f"plane {i}: friction: expected a finite number >= 0, found {plane.friction}")
-        if plane.friction > 0 and plane.mode not in ("separate", "touch"):
-            raise ConfigError(f"plane {i}: friction acts on modes separate and touch only, found mode {plane.mode!r}")
+        if plane.friction > 0 and plane.mode not in RUBBING:
+            raise ConfigError(f"plane {i}: friction acts on modes {' and '.join(RUBBING)} only, found mode {plane.mode!r}")
         thickness = plane.thickness
         if thickness is None:
             thickness = THICKNESS * dx if plane.friction > 0 and plane.mode != "touch" else 0.0
