@@ -50,9 +50,9 @@ GOING_ON: dict[str, Kind] = {
     "stage": whole(0), "steps_done": whole(0), "particles": whole(1), "misfit": POSITIVE,
     "losses": Kind("numbers", lambda v: isinstance(v, list) and all(is_number(x) for x in v)),
     "compared": or_null(Kind("distances by law", lambda v: isinstance(v, Mapping) and all(map(is_number, v.values())))),
-    "ground_gain": or_null(Kind("a number", lambda v: isinstance(v, float) and not math.isnan(v))),
-    "grounds": or_null(Kind("distances by contact", lambda v: isinstance(v, Mapping) and all(
-        isinstance(x, float) and not math.isnan(x) for x in v.values()))),
+    **{name: or_null(Kind(f"{what} by contact", lambda v: isinstance(v, Mapping) and all(
+        isinstance(x, float) and not math.isnan(x) for x in v.values())))
+       for name, what in (("grounds", "distances"), ("ground_gains", "gains"))},
 }  # fmt: skip
 """Of `mosa`, what a fit goes on from."""
 NODES, DEPTH = 2_000_000, 40

@@ -22,7 +22,7 @@ from mosa.data.agreement import lines_of_sight, misses
 from mosa.errors import ConfigError, MosaError
 from mosa.limits import machine_memory
 from mosa.modules.body import Body, Start, World
-from mosa.modules.ground_search import FRICTIONS, RIVAL_ITERATIONS, TRIED
+from mosa.modules.ground_search import ASKED, FRICTIONS, RIVAL_ITERATIONS, TRIED
 from mosa.modules.identification import Identification
 from mosa.modules.lit_mosa import LitMosa
 from mosa.modules.material import RIVALS
@@ -33,7 +33,7 @@ from mosa.reconstruction.observed import object_windows
 from mosa.reconstruction.resolution import grid_spacing
 from mosa.reconstruction.response import MODES
 from mosa.rendering.rasterizer import rasterize
-from mosa.types import Cameras, Scene
+from mosa.types import RUBBING, Cameras, Scene
 
 BASE = 1.15e9
 """Bytes of a process on a CPU with its libraries and kernels, without data."""
@@ -254,8 +254,8 @@ def newton_rollouts(module: LitMosa, stage: Stage) -> float:
     together = SIDE_BY_SIDE if module.body.rest.is_cuda else planned.threads(columns)
     each = columns / together + 5  # the residuals, the noise, one or two steps that are tried, the distance
     begun = planned.calibrating and not stage.looks_again
-    contacts = (3 + len(FRICTIONS)) * (TRIED * each + 3) if begun and module.ground_is_sought else 0
-    contacts += RIVAL_ITERATIONS * each if stage.learns_adapter and module.ground_is_sought else 0
+    contacts = (3 + len(RUBBING) * len(FRICTIONS)) * (TRIED * each + 3) if begun and module.ground_is_sought else 0
+    contacts += ASKED * RIVAL_ITERATIONS * each if stage.learns_adapter and module.ground_is_sought else 0
     return len(planned.pairs) * (stage.iterations * each + contacts + (24 if begun else 0))
 
 

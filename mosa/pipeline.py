@@ -140,7 +140,7 @@ def train(cfg: DictConfig) -> float | None:
         figures |= start_figures(run.starts["train"]) | reconstruction.geometry
         figures |= {f"id_prior/compared/{law}_m": distance for law, distance in module.compared.items()}
         touched = {f"{contact}_m": distance for contact, distance in module.grounds.items()}
-        touched |= {} if module.ground_gain is None else {"gain": module.ground_gain, "friction": world.ground.friction}
+        touched |= {f"{contact}_gain": gain for contact, gain in module.ground_gains.items()}
         figures |= {f"id_prior/ground/{name}": value for name, value in touched.items() if math.isfinite(value)}
     if cfg.extrapolate:
         with clock.measure("extrapolation"):

@@ -38,7 +38,7 @@ AUTO = "auto"
 """Mode of a ground of which only the height is known: how it is touched is found with the law."""
 GROUND_MODES = ("sticky", "slip", "separate", "touch")
 RUBBING = ("separate", "touch")
-"""Of these modes, those with friction."""
+"""Of these modes, those with friction: the body leaves the ground freely, and is met at nodes or at its own particles."""
 
 
 @dataclass(frozen=True)

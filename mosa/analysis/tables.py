@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from mosa.metrics import IMAGE_METRICS, MOTION_METRICS
-from mosa.modules.ground_choice import EXPLAINED, NEARER, alike, rival_of, taken_of
+from mosa.modules.ground_choice import EXPLAINED, NEARER, alike, contact, taken_of
+from mosa.types import RUBBING
 
 MODELS = (("floor", "floor/"), ("prior", "prior/"), ("prior + eta", "prior_eta/"), ("adapted", ""))
 UNITS = {"rms_m": ("rms [mm]", 1e3, 2),
@@ -54,61 +55,42 @@ NOTICEABLE = 1.1
 """Ratio of the largest to the smallest Young's modulus below which a law counts as isotropic."""
 
 
-LIKELY = "of the logarithm of the likelihood"
-
-
-def ground_text(distances: Mapping[str, float], gain: float | None = None, friction: float = 0.0) -> str:
+def ground_text(distances: Mapping[str, float], gains: Mapping[str, float] | None = None) -> str:
     """How the body touches the ground, of distances [m] by contact (`mosa.modules.ground_search`), in sentences, and what of it the
-    motion does not tell. gain: of another contact, about the learned law, where that was asked; friction: which the law has been
-    learned with."""
-    sticks = taken_of(distances) == "sticky"
-    touches, said = _sticking(distances, gain) if sticks else _sliding(distances, gain, friction)
+    motion does not tell. gains: of other contacts, about the learned law, where those were asked."""
+    taken, said = taken_of(distances), []
+    touches = taken
+    if gains:
+        best = max(gains, key=gains.get)
+        if gains[best] > EXPLAINED:
+            touches = best
+        said = [_asked(taken, best, gains[best])]
+    if touches != "sticky" and (taken == "sticky" or not gains):  # only the isotropic law was asked for its friction
+        said.append(_guessed(distances, contact(touches)[0]))
     listed = ", ".join(f"{_words(name)} {distances[name] * 1e3:.2f} mm" for name in sorted(distances, key=distances.get))
-    first = f"Ground: the body {touches} (mean distance from the training motion after calibration: {listed})."
+    first = f"Ground: the body {_words(touches)} (mean distance from the training motion after calibration: {listed})."
     if len(distances) > 1 and NEARER * max(distances.values()) <= min(distances.values()):
         first += " All of them are within a tenth: this film hardly shows how the body slides."
     return " ".join([first, *said])
 
 
-def _sticking(distances: Mapping[str, float], gain: float | None) -> tuple[str, list[str]]:
-    """(how the body touches the ground, what else is said) where it sticks for the isotropic law."""
-    rival = rival_of(distances)
-    if gain is None or rival is None:
-        return _words("sticky"), []
-    free = _words(f"separate_{rival:.3g}")
-    said = f"About the learned law, a body that {free} explains the motion {_better(gain)} {LIKELY}."
-    if gain > EXPLAINED:
-        return free, [said, _guessed(distances)]
-    return _words("sticky"), [said] if gain <= -EXPLAINED else [said, f"Whether it sticks is {_open()}"]
+def _asked(taken: str, best: str, gain: float) -> str:
+    """What the learned law says of the contact that was `taken`: the best of the others, and what is left open."""
+    better = f"{'better' if gain > 0 else 'worse'} by {abs(gain):.1f} of the logarithm of the likelihood"
+    said = f"About the learned law, a body that {_words(best)} explains the motion {better}."
+    if -EXPLAINED < gain <= EXPLAINED:
+        said += f" Which of the two it is, is *not* determined: that takes {EXPLAINED:g}."
+    return said
 
 
-def _sliding(distances: Mapping[str, float], gain: float | None, friction: float) -> tuple[str, list[str]]:
-    """The same where it slides for the isotropic law."""
-    taken = taken_of(distances)
-    if gain is None:
-        return _words(taken), [_guessed(distances)]
-    if gain > EXPLAINED:
-        own = taken.removeprefix("separate_")
-        said = f"About the learned law, this friction explains the motion {_better(gain)} {LIKELY} than {own}."
-        return _words(f"separate_{friction:.3g}"), [said]
-    said = f"About the learned law, the best of other frictions explains the motion {_better(gain)} {LIKELY}."
-    return _words(taken), [said] if gain <= -EXPLAINED else [said, f"Its friction is {_open()}"]
+def _words(name: str) -> str:
+    """A contact by `named` in words; both modes with friction leave the ground freely, so the mode is said as well."""
+    mode, friction = contact(name)
+    return f"leaves it freely, friction {friction:.3g} ({mode})" if mode in RUBBING else "sticks to it"
 
 
-def _words(contact: str) -> str:
-    return contact.replace("separate_", "leaves it freely, friction ").replace("sticky", "sticks to it")
-
-
-def _better(gain: float) -> str:
-    return f"{'better' if gain > 0 else 'worse'} by {abs(gain):.1f}"
-
-
-def _open() -> str:
-    return f"*not* determined: that takes {EXPLAINED:g}."
-
-
-def _guessed(distances: Mapping[str, float]) -> str:
-    near = ", ".join(f"{friction:.3g}" for friction in alike(distances))
+def _guessed(distances: Mapping[str, float], mode: str) -> str:
+    near = ", ".join(f"{friction:.3g}" for friction in alike(distances, mode))
     return ("Its friction is *not* determined: the isotropic law comes within a tenth of the nearest with "
             f"{near}, and is wrong itself.")
 
@@ -122,10 +104,10 @@ def determined_text(figures: Mapping[str, float]) -> str:
         taken = min(compared, key=compared.get)
         listed = ", ".join(f"{law} {distance * 1e3:.2f} mm" for law, distance in sorted(compared.items(), key=lambda each: each[1]))
         lines = [f"Backbone: {taken}, which is nearest to the training motion (mean distance after calibration: {listed}).", ""]
-    touched = {k.removeprefix("id_prior/ground/").removesuffix("_m"): v for k, v in figures.items()
-               if k.startswith("id_prior/ground/") and k.endswith("_m")}
+    touched, gains = ({k.removeprefix("id_prior/ground/").removesuffix(end): v for k, v in figures.items()
+                       if k.startswith("id_prior/ground/") and k.endswith(end)} for end in ("_m", "_gain"))  # fmt: skip
     if touched:
-        lines += [ground_text(touched, figures.get("id_prior/ground/gain"), figures.get("id_prior/ground/friction", 0.0)), ""]
+        lines += [ground_text(touched, gains), ""]
     if "posterior/draws" not in figures:
         return "\n".join(lines[:-1])
     lines += ["What the data determine:", ""]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from mosa.types import Ground
+from mosa.types import RUBBING, Ground
 
 NEARER = 0.9
 """Of the distance of the body that sticks, which another contact has to come below to be taken."""
@@ -15,8 +15,14 @@ the fit to begin again on it."""
 
 
 def named(ground: Ground) -> str:
-    """A contact in words, as figures have it: sticky, or separate_0.4 with its friction."""
-    return f"{ground.mode}_{ground.friction:.3g}" if ground.mode == "separate" else ground.mode
+    """A contact in words, as figures have it: sticky, or separate_0.4 and touch_0.4 with its friction."""
+    return f"{ground.mode}_{ground.friction:.3g}" if ground.mode in RUBBING else ground.mode
+
+
+def contact(name: str) -> tuple[str, float]:
+    """(mode, friction) of a contact by `named`."""
+    mode, _, friction = name.partition("_")
+    return mode, float(friction or 0.0)
 
 
 def taken_of(distances: Mapping[str, float]) -> str:
@@ -25,16 +31,18 @@ def taken_of(distances: Mapping[str, float]) -> str:
     return nearest if distances[nearest] < NEARER * distances["sticky"] else "sticky"
 
 
-def alike(distances: Mapping[str, float]) -> list[float]:
-    """Frictions of a body that leaves the ground freely, of distances [m] by `named`, that come about as near (by `NEARER`) as the
-    nearest of them, in order: the isotropic law does not tell them apart. Empty where none can be simulated."""
-    sliding = {float(name.removeprefix("separate_")): distance for name, distance in distances.items() if name != "sticky"}
+def alike(distances: Mapping[str, float], mode: str) -> list[float]:
+    """Frictions of a mode, of distances [m] by `named`, that come about as near (by `NEARER`) as the nearest of them, in order: the
+    isotropic law does not tell them apart. Empty where none can be simulated."""
+    sliding = {friction: distances[name] for name in distances for of, friction in [contact(name)] if of == mode}
     least = min(sliding.values(), default=math.inf)
     return sorted(friction for friction, distance in sliding.items() if math.isfinite(least) and NEARER * distance <= least)
 
 
-def rival_of(distances: Mapping[str, float]) -> float | None:
-    """Friction of the contact that may explain the learned law's motion better than sticking, of distances [m] by `named`: the
-    roughest of those that leave the ground and are about as near as the nearest of them, as no sliding is seen where more friction
-    changes nothing. None where a body that slides was taken, or no other can be simulated."""
-    return max(alike(distances), default=None) if taken_of(distances) == "sticky" else None
+def rivals_of(distances: Mapping[str, float]) -> list[tuple[str, float]]:
+    """(mode, friction) of the contacts that may explain the learned law's motion better than sticking, of distances [m] by `named`:
+    of each mode with friction the roughest of those that are about as near as the nearest of them, as no sliding is seen where more
+    friction changes nothing. Empty where a body that slides was taken, or no other can be simulated."""
+    if taken_of(distances) != "sticky":
+        return []
+    return [(mode, max(frictions)) for mode in RUBBING if (frictions := alike(distances, mode))]

@@ -2,20 +2,23 @@
 
 Free rollouts tell a body that slides, as friction shows in where it goes afterwards. Whether one that hardly slides sticks, or
 leaves the ground freely, an isotropic law cannot tell, nor with what friction it slides: its own mistakes are as large. The learned
-law can, when the fit has ended (docs/identification.md#how-the-ground-is-touched).
+law can, when the fit has ended (docs/identification.md#how-the-ground-is-touched). Nor is it known whether a body
+meets it at its surface (`touch`), as one of finite elements, or at a grid's nodes (`separate`): both are tried.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 from mosa.errors import SimulationDiverged
 from mosa.modules.backbone_search import Calibration, calibrate_as, calibrated
 from mosa.modules.body import Body
 from mosa.modules.ground_choice import named, taken_of
 from mosa.progress import tqdm
-from mosa.types import Ground
+from mosa.types import RUBBING, Ground
 
 FRICTIONS = (0.15, 0.3, 0.6, 1.2)
 """Coulomb's coefficients of bodies that leave the ground freely, each twice the one before: cloth on steel to rubber on a table."""
@@ -25,6 +28,8 @@ TRIED = 3
 """Iterations of each calibration after the first, from that one's numbers on: how a body slides hardly moves its moduli."""
 RIVAL_ITERATIONS = 3
 """In which a learned law is fitted to another contact, before the two are compared."""
+ASKED = 4
+"""Contacts that a learned law is usually asked for: two where the body sticks, up to seven where it slides."""
 
 
 def better_friction(own: float, gain: Callable[[float], float]) -> tuple[float, float]:
@@ -74,19 +79,19 @@ def choose_ground(
             running.iterate()
         distances[name], numbers[name] = running.distance(), calibrated(body)
 
-    def slide(friction: float) -> None:
+    def slide(ground: Ground) -> None:
         calibrate_as(body, numbers["sticky"])
         try:
-            attempt(Ground(height, "separate", friction))
+            attempt(ground)
         except SimulationDiverged:
             pass  # its distance says so
 
     attempt(Ground(height, "sticky"), searching=True)
-    for friction in tqdm(FRICTIONS, "contact with the ground", leave=False):
-        slide(friction)
+    for mode, friction in tqdm(list(itertools.product(RUBBING, FRICTIONS)), "contact with the ground", leave=False):
+        slide(Ground(height, mode, friction))
     if (nearest := taken_of(distances)) != "sticky":
         for factor in (1 / BETWEEN, BETWEEN):
-            slide(grounds[nearest].friction * factor)
+            slide(replace(grounds[nearest], friction=grounds[nearest].friction * factor))
     best = taken_of(distances)
     calibrate_as(body, numbers[best])
     return grounds[best], distances

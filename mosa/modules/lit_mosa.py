@@ -74,7 +74,7 @@ class LitMosa(NewtonSteps, GradientSteps, Restorable, L.LightningModule):
         self.retreat, self.saved_retreat = Retreat(), None  # of the running stage, where it is Adam's
         self.informed = False  # whether the takes have the cues about the calibrated backbone
         self.compared: dict[str, float] = {}  # mean distance [m] of the calibrated candidates for the backbone
-        self.ground_gain: float | None = None  # of another contact about the learned law, once it has been looked for
+        self.ground_gains: dict[str, float] = {}  # of other contacts about the learned law, once it has been asked
         self.untouched = copy.deepcopy(body.state_dict()) if self.ground_is_sought else None  # what a fit begins again from
         self.grounds: dict[str, float] = {}  # mean distance [m] of the contacts with the ground that were tried
 
@@ -101,7 +101,7 @@ class LitMosa(NewtonSteps, GradientSteps, Restorable, L.LightningModule):
                               "steps_done": self.steps_done, "particles": len(self.body.rest), "misfit": self.misfit,
                               "start": self.takes[0].start.written(),
                               "identification": self.identification.state() if self.identification else None,
-                              "compared": self.compared, "grounds": self.grounds, "ground_gain": self.ground_gain,
+                              "compared": self.compared, "grounds": self.grounds, "ground_gains": self.ground_gains,
                               "retreat": self.retreat.written(),
                               "cues": [take.cues.positions.cpu() for take in self.takes] if self.informed else None,
                               "responses": [take.response and take.response.written() for take in self.takes]
@@ -128,7 +128,7 @@ class LitMosa(NewtonSteps, GradientSteps, Restorable, L.LightningModule):
             for material in (self.body.material, *(variant["material"] for variant in self.body.frozen.values())):
                 material.choose(law)
             self.settle_law()
-        self.grounds, self.ground_gain = dict(saved.get("grounds") or {}), saved.get("ground_gain")
+        self.grounds, self.ground_gains = dict(saved.get("grounds") or {}), dict(saved.get("ground_gains") or {})
         if self.ground_is_sought and (written := saved["config"]["world"]["ground"]) is not None:
             self.settle_ground(Ground(**written))
         self.posterior = Posterior.read(saved["posterior"]) if saved.get("posterior") else None
@@ -181,7 +181,7 @@ class LitMosa(NewtonSteps, GradientSteps, Restorable, L.LightningModule):
             self.body.thaw(stage.start)
         if self.ground_is_sought and not stage.newton:
             warnings.warn(f"scene.ground.mode: auto asks for fit.{stage.name}.optimizer=gauss_newton, which compares contacts; "
-                          "found adam, and the body sticks to the ground: say sticky, slip or separate", stacklevel=1)
+                          "found adam, and the body sticks to the ground: say sticky, slip, separate or touch", stacklevel=1)
             self.settle_ground(self.world.ground)
         if stage.looks_again or not (stage.calibrates or self.informed):
             self.inform(response=stage.newton and not stage.calibrates)

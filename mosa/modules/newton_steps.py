@@ -7,18 +7,19 @@ import logging
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from mosa import parallel
 from mosa.errors import DataError, MosaError, SimulationDiverged
 from mosa.modules.backbone_search import choose_law
-from mosa.modules.ground_choice import EXPLAINED, named, rival_of
+from mosa.modules.ground_choice import EXPLAINED, named, rivals_of
 from mosa.modules.ground_search import RIVAL_ITERATIONS, better_friction, choose_ground
 from mosa.modules.identification import EVIDENCE_ITERATIONS, Identification
 from mosa.modules.residuals import SAMPLES
 from mosa.modules.stages import Stage
 from mosa.progress import tqdm
-from mosa.types import Ground
+from mosa.types import RUBBING, Ground
 
 log = logging.getLogger(__name__)
 
@@ -73,25 +74,34 @@ class NewtonSteps:
     def better_ground(self, stage: Stage) -> Ground | None:
         """Where the ground was sought and a law has been learned on what was found: another contact that explains the motion
         better, about that law. None where there is none, and once the fit has begun again."""
-        if not stage.learns_adapter or not self.grounds or self.ground_gain is not None:
+        if not stage.learns_adapter or not self.grounds or self.ground_gains:
             return None
         found = self.world.ground
         # a fit that was stopped gains by going on, wherever it goes on
         own = self.identification.cost() if self.identification.converged else self.fitted_on(found, stage)
+        asked: dict[Ground, float] = {}
 
-        def gain(friction: float) -> float:
-            return parallel.mean(own - self.fitted_on(replace(found, mode="separate", friction=friction), stage))
+        def gain(mode: str, friction: float) -> float:
+            ground = replace(found, mode=mode, friction=friction)
+            asked[ground] = parallel.mean(own - self.fitted_on(ground, stage))
+            return asked[ground]
 
-        if found.mode == "separate":
-            friction, self.ground_gain = better_friction(found.friction, gain)
-        elif (friction := rival_of(self.grounds)) is None:
-            return None
+        if found.mode in RUBBING:
+            friction, most = better_friction(found.friction, partial(gain, found.mode))
+            for mode in RUBBING:
+                if mode != found.mode:
+                    gain(mode, friction if most > 0 else found.friction)
         else:
-            self.ground_gain = gain(friction)
-        log.info("ground: a body that leaves it freely, with friction %.3g, explains the motion %s than %s (by %.1f of the "
-                 "logarithm of the likelihood)%s", friction, "better" if self.ground_gain > 0 else "worse", named(found),
-                 abs(self.ground_gain), "; the fit begins again" if self.ground_gain > EXPLAINED else "")  # fmt: skip
-        return replace(found, mode="separate", friction=friction) if self.ground_gain > EXPLAINED else None
+            for mode, friction in rivals_of(self.grounds):
+                gain(mode, friction)
+        if not asked:
+            return None
+        self.ground_gains = {named(ground): each for ground, each in asked.items()}
+        best = max(asked, key=asked.get)
+        log.info("ground: %s explains the motion %s than %s (by %.1f of the logarithm of the likelihood)%s", named(best),
+                 "better" if asked[best] > 0 else "worse", named(found), abs(asked[best]),
+                 "; the fit begins again" if asked[best] > EXPLAINED else "")  # fmt: skip
+        return best if asked[best] > EXPLAINED else None
 
     def fitted_on(self, ground: Ground, stage: Stage) -> float:
         """Cost of the running identification on a ground after `RIVAL_ITERATIONS`, from the same numbers and under the same noise;

@@ -14,7 +14,7 @@ from mosa.modules import ground_choice, ground_search
 from mosa.modules.body import World
 from mosa.modules.contact import ContactOffset
 from mosa.modules.criteria import Criterion
-from mosa.modules.ground_choice import named, rival_of, taken_of
+from mosa.modules.ground_choice import contact, named, rivals_of, taken_of
 from mosa.modules.ground_search import better_friction, choose_ground
 from mosa.modules.identification import Identification
 from mosa.modules.identification_settings import IdentificationSettings
@@ -35,7 +35,8 @@ def search(body, take):
     return choose_ground(body, 0.0, lambda g: Identification(body, [take], world(g), stage, criterion, settings, seats=1))
 
 
-@pytest.mark.parametrize("truth", [Ground(0.0, "sticky"), Ground(0.0, "separate", 0.2), Ground(0.0, "separate", 0.6)])
+@pytest.mark.parametrize("truth", [Ground(0.0, "sticky"), Ground(0.0, "separate", 0.2), Ground(0.0, "separate", 0.6),
+                                   Ground(0.0, "touch", 0.3)])
 def test_contact_and_friction_are_found_with_the_law(truth):
     """A turned block that moves along the ground. The friction is known to within the steps of the search."""
     begins = start(turn=0.5, speed=-2.0)
@@ -44,8 +45,8 @@ def test_contact_and_friction_are_found_with_the_law(truth):
     body = small_body(adapter=False, E=1.7 * E, nu=0.3)
     found, distances = search(body, take)
     assert found.mode == truth.mode and found.height == 0.0
-    assert distances[named(found)] == min(distances.values()) and len(distances) == 5 + 2 * (truth.mode == "separate")
-    if truth.mode == "separate":
+    assert distances[named(found)] == min(distances.values()) and len(distances) == 9 + 2 * (truth.mode != "sticky")
+    if truth.mode != "sticky":
         assert truth.friction / 2**0.25 * 0.99 < found.friction < truth.friction * 2**0.25 * 1.01
     values = {name: float(value.detach()) for name, value in body.material.physical().items()}
     assert values["E"] == pytest.approx(E, rel=0.05) and values["nu"] == pytest.approx(NU, abs=0.03)
@@ -69,7 +70,7 @@ def test_a_contact_that_cannot_be_simulated_is_left_out(monkeypatch):
                 body.material.raw["E"].fill_(self.ground.friction)
 
         def distance(self):
-            return (1 + self.ground.friction) * (self.ground.mode == "separate") + 2 * (self.ground.mode == "sticky")
+            return 1 + self.ground.friction if self.ground.mode == "separate" else 2.0
 
     found, costs = choose_ground(body, 0.1, Calibration)
     assert found.height == 0.1 and found.mode == "separate" and found.friction == pytest.approx(0.15 / math.sqrt(2))
@@ -87,44 +88,56 @@ def test_a_body_sticks_unless_another_contact_is_clearly_nearer():
     assert taken_of({"sticky": 1.0, "separate_1.2": 0.88, "separate_0.15": 3.0}) == "separate_1.2"
 
 
-def test_the_rival_is_the_roughest_ground_on_which_no_sliding_is_seen():
-    assert rival_of({"sticky": 10.5, "separate_0.3": 13.5, "separate_0.6": 11.9, "separate_1.2": 11.91}) == 1.2
-    assert rival_of({"sticky": 10.5, "separate_0.15": 12.0, "separate_0.3": 14.0, "separate_1.2": math.inf}) == 0.15
-    assert rival_of({"sticky": 10.5, "separate_0.15": 8.0}) is None  # a body that slides was taken
-    assert rival_of({"sticky": 10.5, "separate_0.15": math.inf}) is None
+def test_the_rivals_are_the_roughest_grounds_on_which_no_sliding_is_seen():
+    slides = {"separate_0.3": 13.5, "separate_0.6": 11.9, "separate_1.2": 11.91}
+    assert rivals_of({"sticky": 10.5} | slides) == [("separate", 1.2)]
+    assert rivals_of({"sticky": 10.5, "touch_0.3": 9.9, "touch_0.6": 9.6, "touch_1.2": 11.0} | slides) == [("separate", 1.2),
+                                                                                                      ("touch", 0.6)]
+    assert rivals_of({"sticky": 10.5, "separate_0.15": 12.0, "separate_0.3": 14.0, "touch_1.2": math.inf}) == [("separate", 0.15)]
+    assert rivals_of({"sticky": 10.5, "separate_0.15": 8.0}) == []  # a body that slides was taken
+    assert rivals_of({"sticky": 10.5, "separate_0.15": math.inf}) == []
+
+
+@pytest.mark.parametrize("ground", [Ground(0.1, "sticky"), Ground(0.1, "separate", 0.424), Ground(0.1, "touch", 1.2)])
+def test_a_contact_is_read_from_its_name(ground):
+    assert contact(named(ground)) == (ground.mode, ground.friction)
 
 
 def test_a_report_says_how_the_ground_is_touched():
     slides = {"sticky": 20e-3, "separate_0.3": 12e-3, "separate_0.6": 15.5e-3}
     text = ground_text(slides)
-    assert text.startswith("Ground: the body leaves it freely, friction 0.3 (mean distance from the training motion")
-    assert "friction 0.3 12.00 mm, leaves it freely, friction 0.6 15.50 mm, sticks to it 20.00 mm)." in text
-    again = ground_text(slides, 8.0, friction=0.15)  # of the law that was learned then
-    assert again.startswith("Ground: the body leaves it freely, friction 0.15 (mean") and "determined" not in again
-    assert again.endswith("this friction explains the motion better by 8.0 of the logarithm of the likelihood than 0.3.")
-    assert ground_text(slides, -8.0, friction=0.3).endswith("other frictions explains the motion worse by 8.0 of the logarithm of "
-                                                            "the likelihood.")  # fmt: skip
-    near = {"sticky": 20e-3, "separate_0.6": 19.5e-3, "separate_0.15": 30e-3}
-    assert ground_text(near, 7.5).startswith("Ground: the body leaves it freely, friction 0.6 (mean")
-    assert ("leaves it freely, friction 0.6 explains the motion better by 7.5 of the logarithm of the likelihood."
-            in ground_text(near, 7.5))  # fmt: skip
-    assert ground_text(near, -8.0).startswith("Ground: the body sticks to it (mean") and "worse by 8.0" in ground_text(near, -8.0)
-    assert "determined" not in ground_text(near, -8.0) and "hardly" not in ground_text(near, -8.0)
+    assert text.startswith("Ground: the body leaves it freely, friction 0.3 (separate) (mean distance from the training motion")
+    assert "friction 0.3 (separate) 12.00 mm, leaves it freely, friction 0.6 (separate) 15.50 mm, sticks to it 20.00 mm)." in text
+    again = ground_text(slides, {"separate_0.6": -9.0, "separate_0.15": 6.0, "touch_0.15": 8.0})  # of the law that was learned then
+    assert again.startswith("Ground: the body leaves it freely, friction 0.15 (touch) (mean") and "determined" not in again
+    assert again.endswith("friction 0.15 (touch) explains the motion better by 8.0 of the logarithm of the likelihood.")
+    worse = ground_text(slides, {"separate_0.6": -9.0, "touch_0.3": -8.0})
+    assert worse.startswith("Ground: the body leaves it freely, friction 0.3 (separate) (mean") and "determined" not in worse
+    assert worse.endswith("friction 0.3 (touch) explains the motion worse by 8.0 of the logarithm of the likelihood.")
+    near = {"sticky": 20e-3, "touch_0.6": 19.5e-3, "touch_0.15": 30e-3}
+    assert ground_text(near, {"touch_0.6": 7.5}).startswith("Ground: the body leaves it freely, friction 0.6 (touch) (mean")
+    assert ("leaves it freely, friction 0.6 (touch) explains the motion better by 7.5 of the logarithm of the likelihood."
+            in ground_text(near, {"touch_0.6": 7.5}))  # fmt: skip
+    sticks = ground_text(near, {"touch_0.6": -8.0})
+    assert sticks.startswith("Ground: the body sticks to it (mean") and "worse by 8.0" in sticks
+    assert "determined" not in sticks and "hardly" not in sticks
 
 
 def test_a_report_says_what_of_the_contact_is_not_determined():
     near = {"sticky": 20e-3, "separate_0.6": 19.5e-3, "separate_0.15": 30e-3}
     for gain in (-2.0, 4.9):
-        assert ground_text(near, gain).startswith("Ground: the body sticks to it (mean")
-        assert ground_text(near, gain).endswith("Whether it sticks is *not* determined: that takes 5.")
+        open_ = ground_text(near, {"separate_0.6": gain, "touch_0.6": -6.0})
+        assert open_.startswith("Ground: the body sticks to it (mean")
+        assert open_.endswith("Which of the two it is, is *not* determined: that takes 5.")
     alike = {"sticky": 2.24e-3, "separate_0.15": 2.29e-3, "separate_1.2": 2.25e-3}  # a film of five frames of a body that slides
     assert "All of them are within a tenth" in ground_text(alike) and "All of them" not in ground_text({"sticky": 1e-3})
     slides = {"sticky": 9.56e-3, "separate_0.15": 12.7e-3, "separate_0.424": 7.76e-3, "separate_0.6": 7.49e-3,
-              "separate_1.2": 7.68e-3}  # fmt: skip
+              "separate_1.2": 7.68e-3, "touch_0.3": 7.6e-3}  # fmt: skip
     assert "Its friction is *not* determined: the isotropic law comes within a tenth" in ground_text(slides)
     assert ground_text(slides).endswith("of the nearest with 0.424, 0.6, 1.2, and is wrong itself.")
-    assert ground_text(near, 7.5).endswith("with 0.6, and is wrong itself.")  # what sticks less was not asked of the learned law
-    assert ground_text(slides, 1.0, friction=0.6).endswith("Its friction is *not* determined: that takes 5.")
+    # what sticks less was not asked of the learned law
+    assert ground_text(near, {"separate_0.6": 7.5}).endswith("with 0.6, and is wrong itself.")
+    assert ground_text(slides, {"separate_0.3": 1.0}).endswith("is *not* determined: that takes 5.")
 
 
 @pytest.mark.parametrize(("truth", "expected"), [(0.2, 0.212), (0.4, 0.424), (0.6, 0.3), (1.2, 1.2), (5.0, 3.39), (0.01, 0.053)])
@@ -190,7 +203,7 @@ def stages_begun(module: LitMosa, monkeypatch) -> list[tuple[str, Ground]]:
     return begun
 
 
-@pytest.mark.parametrize("truth", [Ground(0.0, "separate", 1.2), Ground(0.0, "sticky")])
+@pytest.mark.parametrize("truth", [Ground(0.0, "separate", 1.2), Ground(0.0, "touch", 1.2), Ground(0.0, "sticky")])
 def test_a_fit_begins_again_on_the_ground_that_explains_the_learned_law_better(monkeypatch, truth):
     """Where the isotropic law could not tell: here nothing is near enough to be taken but the body that sticks. The rival has the
     friction with which the isotropic law is nearest."""
@@ -199,13 +212,16 @@ def test_a_fit_begins_again_on_the_ground_that_explains_the_learned_law_better(m
     begun = stages_begun(module, monkeypatch)
     module.identify()
     sticks = Ground(0.0, "sticky")
-    again = [("prior", truth), ("joint", truth)] if truth.mode == "separate" else []
+    again = [("prior", truth), ("joint", truth)] if truth.mode != "sticky" else []
     assert begun == [("prior", sticks), ("joint", sticks), *again]
-    assert module.world.ground.mode == truth.mode and (module.ground_gain > ground_choice.EXPLAINED) == (truth.mode == "separate")
+    gains = module.ground_gains
+    assert set(gains) == {"separate_1.2", "touch_1.2"} and module.world.ground.mode == truth.mode
+    assert (max(gains.values()) > ground_choice.EXPLAINED) == bool(again)
+    assert gains.get(named(truth), 0.0) == max(0.0, *gains.values())
     assert float(module.body.material.physical()["E"].detach()) == pytest.approx(E, rel=0.1) and module.posterior is not None
     checkpoint: dict = {}
     module.on_save_checkpoint(checkpoint)
-    assert checkpoint["mosa"]["ground_gain"] == module.ground_gain  # so that a fit that goes on does not begin again once more
+    assert checkpoint["mosa"]["ground_gains"] == gains  # so that a fit that goes on does not begin again once more
 
 
 @pytest.mark.parametrize("truth", [0.3, 0.6])
@@ -219,7 +235,9 @@ def test_a_fit_begins_again_with_the_friction_that_explains_the_learned_law_bett
     slides, found = Ground(0.0, "separate", 0.6), Ground(0.0, "separate", 0.3)
     again = [("prior", found), ("joint", found)] if truth == 0.3 else []
     assert begun == [("prior", Ground(0.0, "sticky")), ("joint", slides), *again]
-    assert module.world.ground.friction == truth and (module.ground_gain > ground_choice.EXPLAINED) == (truth == 0.3)
+    gains, asked = module.ground_gains, {"separate_0.3", "touch_0.3"} if truth == 0.3 else {"touch_0.6"}
+    assert asked <= set(gains) and module.world.ground == Ground(0.0, "separate", truth)
+    assert (max(gains.values()) > ground_choice.EXPLAINED) == (truth == 0.3)
 
 
 def test_a_contact_that_cannot_be_simulated_gains_nothing(monkeypatch):
@@ -248,7 +266,8 @@ def test_a_fit_that_was_stopped_is_compared_with_itself_gone_on(monkeypatch, con
     module.grounds, cost = {"sticky": 2.0, "separate_0.6": 1.0}, module.identification.cost()
     monkeypatch.setattr(module, "fitted_on", lambda ground, _: cost - 7.0)
     found = module.better_ground(replace(module.stages[0], name="joint"))
-    assert module.ground_gain == (7.0 if converged else 0.0) and (found is None) == (not converged)
+    assert set(module.ground_gains.values()) == {7.0 if converged else 0.0} and (found is None) == (not converged)
+    assert {contact(name)[0] for name in module.ground_gains} == {"separate", "touch"}
 
 
 def test_particles_that_meet_the_ground_themselves_need_no_lift():
@@ -290,6 +309,6 @@ def test_frictions_are_within_two_of_each_other():
 
 def test_the_table_of_parameters_has_no_row_for_it():
     figures = {"id_prior/E": 1e5, "id/E": 1.1e5, "id_prior/ground/sticky_m": 0.02, "id_prior/ground/separate_1.2_m": 0.021,
-               "id_prior/ground/gain": 1.5}
+               "id_prior/ground/separate_1.2_gain": 1.5}
     assert "ground" not in parameter_table(figures) and "worse" not in determined_text(figures)
     assert determined_text(figures).startswith("Ground: the body sticks to it") and "better by 1.5" in determined_text(figures)
