@@ -32,17 +32,18 @@ def taken_of(distances: Mapping[str, float]) -> str:
 
 
 def alike(distances: Mapping[str, float], mode: str) -> list[float]:
-    """Frictions of a mode, of distances [m] by `named`, that come about as near (by `NEARER`) as the nearest of them, in order: the
-    isotropic law does not tell them apart. Empty where none can be simulated."""
-    sliding = {friction: distances[name] for name in distances for of, friction in [contact(name)] if of == mode}
+    """Frictions of a mode, of distances [m] by `named`, that come about as near (by `NEARER`) as the nearest of all contacts with
+    friction, in order: the isotropic law does not tell them apart. Empty where none does."""
+    sliding = {name: distance for name, distance in distances.items() if contact(name)[0] in RUBBING and math.isfinite(distance)}
     least = min(sliding.values(), default=math.inf)
-    return sorted(friction for friction, distance in sliding.items() if math.isfinite(least) and NEARER * distance <= least)
+    return sorted(friction for name, distance in sliding.items() for of, friction in [contact(name)]
+                  if of == mode and NEARER * distance <= least)  # fmt: skip
 
 
 def rivals_of(distances: Mapping[str, float]) -> list[tuple[str, float]]:
     """(mode, friction) of the contacts that may explain the learned law's motion better than sticking, of distances [m] by `named`:
-    of each mode with friction the roughest of those that are about as near as the nearest of them, as no sliding is seen where more
-    friction changes nothing. Empty where a body that slides was taken, or no other can be simulated."""
+    of each mode the roughest of those that are `alike`, as no sliding is seen where more friction changes nothing. Empty where a
+    body that slides was taken, or no other can be simulated."""
     if taken_of(distances) != "sticky":
         return []
     return [(mode, max(frictions)) for mode in RUBBING if (frictions := alike(distances, mode))]

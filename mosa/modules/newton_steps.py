@@ -13,7 +13,7 @@ from typing import Any
 from mosa import parallel
 from mosa.errors import DataError, MosaError, SimulationDiverged
 from mosa.modules.backbone_search import choose_law
-from mosa.modules.ground_choice import EXPLAINED, named, rivals_of
+from mosa.modules.ground_choice import EXPLAINED, alike, named, rivals_of
 from mosa.modules.ground_search import RIVAL_ITERATIONS, better_friction, choose_ground
 from mosa.modules.identification import EVIDENCE_ITERATIONS, Identification
 from mosa.modules.residuals import SAMPLES
@@ -89,7 +89,7 @@ class NewtonSteps:
         if found.mode in RUBBING:
             friction, most = better_friction(found.friction, partial(gain, found.mode))
             for mode in RUBBING:
-                if mode != found.mode:
+                if mode != found.mode and alike(self.grounds, mode):
                     gain(mode, friction if most > 0 else found.friction)
         else:
             for mode, friction in rivals_of(self.grounds):
