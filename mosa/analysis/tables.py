@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from mosa.metrics import IMAGE_METRICS, MOTION_METRICS
-from mosa.modules.ground_choice import EXPLAINED, NEARER, alike, contact, taken_of
+from mosa.modules.ground_choice import EXPLAINED, NEARER, alike, contact, is_gradual, taken_of
 from mosa.types import RUBBING
 
 MODELS = (("floor", "floor/"), ("prior", "prior/"), ("prior + eta", "prior_eta/"), ("adapted", ""))
@@ -62,7 +62,7 @@ def ground_text(distances: Mapping[str, float], gains: Mapping[str, float] | Non
     touches = taken
     if gains:
         best = max(gains, key=gains.get)
-        if gains[best] > EXPLAINED:
+        if gains[best] > EXPLAINED or is_gradual(taken, gains):
             touches = best
         said = [_asked(taken, best, gains[best])]
     if touches != "sticky" and (taken == "sticky" or not gains):  # only the isotropic law was asked for its friction

@@ -47,3 +47,10 @@ def rivals_of(distances: Mapping[str, float]) -> list[tuple[str, float]]:
     if taken_of(distances) != "sticky":
         return []
     return [(mode, max(frictions)) for mode in RUBBING if (frictions := alike(distances, mode))]
+
+
+def is_gradual(taken: str, gains: Mapping[str, float]) -> bool:
+    """Whether the best of the contacts that the learned law was asked for is another friction of the one that was taken, by
+    `named`, and better by less than what the fit begins again for. It is taken as well: how a body slides hardly moves its law."""
+    best = max(gains, key=gains.get)
+    return 0 < gains[best] <= EXPLAINED and contact(taken)[0] == contact(best)[0]

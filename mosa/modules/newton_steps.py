@@ -13,7 +13,7 @@ from typing import Any
 from mosa import parallel
 from mosa.errors import DataError, MosaError, SimulationDiverged
 from mosa.modules.backbone_search import choose_law
-from mosa.modules.ground_choice import EXPLAINED, alike, named, rivals_of
+from mosa.modules.ground_choice import EXPLAINED, alike, is_gradual, named, rivals_of
 from mosa.modules.ground_search import RIVAL_ITERATIONS, better_friction, choose_ground
 from mosa.modules.identification import EVIDENCE_ITERATIONS, Identification
 from mosa.modules.residuals import SAMPLES
@@ -73,18 +73,24 @@ class NewtonSteps:
 
     def better_ground(self, stage: Stage) -> Ground | None:
         """Where the ground was sought and a law has been learned on what was found: another contact that explains the motion
-        better, about that law. None where there is none, and once the fit has begun again."""
+        better, about that law. None where there is none, and once the fit has begun again. Of frictions that differ by less than
+        that the fit takes the best, and stays where it was fitted to it."""
         if not stage.learns_adapter or not self.grounds or self.ground_gains:
             return None
         found = self.world.ground
         # a fit that was stopped gains by going on, wherever it goes on
-        own = self.identification.cost() if self.identification.converged else self.fitted_on(found, stage)
-        asked: dict[Ground, float] = {}
+        own = self.identification.cost() if self.identification.converged else self.fitted_on(found, stage)[0]
+        gains: dict[Ground, float] = {}
+        fits: dict[Ground, Identification] = {}
 
         def gain(mode: str, friction: float) -> float:
             ground = replace(found, mode=mode, friction=friction)
-            asked[ground] = parallel.mean(own - self.fitted_on(ground, stage))
-            return asked[ground]
+            cost, fit = self.fitted_on(ground, stage)
+            gains[ground] = parallel.mean(own - cost)
+            if gains[ground] >= max(gains.values()):
+                fits.clear()
+                fits[ground] = fit  # one is kept, as each has a body
+            return gains[ground]
 
         if found.mode in RUBBING:
             friction, most = better_friction(found.friction, partial(gain, found.mode))
@@ -94,18 +100,28 @@ class NewtonSteps:
         else:
             for mode, friction in rivals_of(self.grounds):
                 gain(mode, friction)
-        if not asked:
+        if not gains:
             return None
-        self.ground_gains = {named(ground): each for ground, each in asked.items()}
-        best = max(asked, key=asked.get)
+        self.ground_gains = {named(ground): each for ground, each in gains.items()}
+        best = max(gains, key=gains.get)
+        begins_again, moves = gains[best] > EXPLAINED, is_gradual(named(found), self.ground_gains)
         log.info("ground: %s explains the motion %s than %s (by %.1f of the logarithm of the likelihood)%s", named(best),
-                 "better" if asked[best] > 0 else "worse", named(found), abs(asked[best]),
-                 "; the fit begins again" if asked[best] > EXPLAINED else "")  # fmt: skip
-        return best if asked[best] > EXPLAINED else None
+                 "better" if gains[best] > 0 else "worse", named(found), abs(gains[best]),
+                 "; the fit begins again" if begins_again else "; the fit goes there" if moves else "")  # fmt: skip
+        if moves:
+            self.go_to(best, fits[best])
+        return best if begins_again else None
 
-    def fitted_on(self, ground: Ground, stage: Stage) -> float:
-        """Cost of the running identification on a ground after `RIVAL_ITERATIONS`, from the same numbers and under the same noise;
-        infinite where the body cannot be simulated there. The fit itself stays where it stands."""
+    def go_to(self, ground: Ground, fit: Identification) -> None:
+        """From now on the fit is another one, which was made on this ground; `body` has its numbers."""
+        self.settle_ground(ground)
+        self.body.load_state_dict(fit.body.state_dict())
+        parallel.synchronise(self.body)
+        self.identification = fit
+
+    def fitted_on(self, ground: Ground, stage: Stage) -> tuple[float, Identification]:
+        """(cost, fit) of the running identification on a ground after `RIVAL_ITERATIONS`, from the same numbers and under the same
+        noise; infinite where the body cannot be simulated there. The fit itself stays where it stands."""
         own = self.identification
         other = Identification(copy.deepcopy(self.body), self.takes, replace(self.world, ground=ground), stage, self.criterion,
                                self.settings, own.kinds)
@@ -117,8 +133,8 @@ class NewtonSteps:
                 if other.converged:
                     break
         except SimulationDiverged:
-            return math.inf
-        return cost
+            return math.inf, other
+        return cost, other
 
     def keep_posterior(self, stage: Stage) -> None:
         """Of the running identification, where it is the last one."""
