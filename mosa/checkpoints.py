@@ -46,13 +46,13 @@ BESIDE = ("ckpt_path", "resume", "optimized_metric", "logger", "trainer", "evalu
           "scene.root", "identification.threads", "extensions")  # fmt: skip
 """Keys of a run that do not say what is learned, or say where things lie on this machine. A capture may have been moved: of
 `scene.path` the last part counts."""
+BY_CONTACT = or_null(Kind("numbers by contact", lambda v: isinstance(v, Mapping) and all(
+    isinstance(x, float) and not math.isnan(x) for x in v.values())))  # fmt: skip
 GOING_ON: dict[str, Kind] = {
     "stage": whole(0), "steps_done": whole(0), "particles": whole(1), "misfit": POSITIVE,
     "losses": Kind("numbers", lambda v: isinstance(v, list) and all(is_number(x) for x in v)),
     "compared": or_null(Kind("distances by law", lambda v: isinstance(v, Mapping) and all(map(is_number, v.values())))),
-    **{name: or_null(Kind(f"{what} by contact", lambda v: isinstance(v, Mapping) and all(
-        isinstance(x, float) and not math.isnan(x) for x in v.values())))
-       for name, what in (("grounds", "distances"), ("ground_gains", "gains"))},
+    "grounds": BY_CONTACT, "ground_gains": BY_CONTACT,
 }  # fmt: skip
 """Of `mosa`, what a fit goes on from."""
 NODES, DEPTH = 2_000_000, 40

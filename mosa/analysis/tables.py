@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from mosa.metrics import IMAGE_METRICS, MOTION_METRICS
-from mosa.modules.ground_choice import EXPLAINED, NEARER, alike, contact, is_gradual, taken_of
+from mosa.modules.ground_choice import EXPLAINED, NEARER, alike, contact, learned_on, taken_of
 from mosa.types import RUBBING
 
 MODELS = (("floor", "floor/"), ("prior", "prior/"), ("prior + eta", "prior_eta/"), ("adapted", ""))
@@ -58,13 +58,8 @@ NOTICEABLE = 1.1
 def ground_text(distances: Mapping[str, float], gains: Mapping[str, float] | None = None) -> str:
     """How the body touches the ground, of distances [m] by contact (`mosa.modules.ground_search`), in sentences, and what of it the
     motion does not tell. gains: of other contacts, about the learned law, where those were asked."""
-    taken, said = taken_of(distances), []
-    touches = taken
-    if gains:
-        best = max(gains, key=gains.get)
-        if gains[best] > EXPLAINED or is_gradual(taken, gains):
-            touches = best
-        said = [_asked(taken, best, gains[best])]
+    taken = taken_of(distances)
+    touches, said = (learned_on(taken, gains), [_asked(gains)]) if gains else (taken, [])
     if touches != "sticky" and (taken == "sticky" or not gains):  # only the isotropic law was asked for its friction
         said.append(_guessed(distances, contact(touches)[0]))
     listed = ", ".join(f"{_words(name)} {distances[name] * 1e3:.2f} mm" for name in sorted(distances, key=distances.get))
@@ -74,8 +69,10 @@ def ground_text(distances: Mapping[str, float], gains: Mapping[str, float] | Non
     return " ".join([first, *said])
 
 
-def _asked(taken: str, best: str, gain: float) -> str:
-    """What the learned law says of the contact that was `taken`: the best of the others, and what is left open."""
+def _asked(gains: Mapping[str, float]) -> str:
+    """What the learned law says of the best of the contacts that it was asked for, and what is left open."""
+    best = max(gains, key=gains.get)
+    gain = gains[best]
     better = f"{'better' if gain > 0 else 'worse'} by {abs(gain):.1f} of the logarithm of the likelihood"
     said = f"About the learned law, a body that {_words(best)} explains the motion {better}."
     if -EXPLAINED < gain <= EXPLAINED:

@@ -49,8 +49,10 @@ def rivals_of(distances: Mapping[str, float]) -> list[tuple[str, float]]:
     return [(mode, max(frictions)) for mode in RUBBING if (frictions := alike(distances, mode))]
 
 
-def is_gradual(taken: str, gains: Mapping[str, float]) -> bool:
-    """Whether the best of the contacts that the learned law was asked for is another friction of the one that was taken, by
-    `named`, and better by less than what the fit begins again for. It is taken as well: how a body slides hardly moves its law."""
+def learned_on(taken: str, gains: Mapping[str, float]) -> str:
+    """The contact that a law is learned on in the end, by `named`: the best of those that the learned law was asked for where it
+    explains the motion better than the one that was taken, by `EXPLAINED` at least, or by less where it is another friction of the
+    same mode, as how a body slides hardly moves its law."""
     best = max(gains, key=gains.get)
-    return 0 < gains[best] <= EXPLAINED and contact(taken)[0] == contact(best)[0]
+    needed = 0.0 if contact(best)[0] == contact(taken)[0] else EXPLAINED
+    return best if gains[best] > needed else taken

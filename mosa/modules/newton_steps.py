@@ -13,7 +13,7 @@ from typing import Any
 from mosa import parallel
 from mosa.errors import DataError, MosaError, SimulationDiverged
 from mosa.modules.backbone_search import choose_law
-from mosa.modules.ground_choice import EXPLAINED, alike, is_gradual, named, rivals_of
+from mosa.modules.ground_choice import EXPLAINED, alike, learned_on, named, rivals_of
 from mosa.modules.ground_search import RIVAL_ITERATIONS, better_friction, choose_ground
 from mosa.modules.identification import EVIDENCE_ITERATIONS, Identification
 from mosa.modules.residuals import SAMPLES
@@ -86,11 +86,12 @@ class NewtonSteps:
         def gain(mode: str, friction: float) -> float:
             ground = replace(found, mode=mode, friction=friction)
             cost, fit = self.fitted_on(ground, stage)
-            gains[ground] = parallel.mean(own - cost)
-            if gains[ground] >= max(gains.values()):
+            better = parallel.mean(own - cost)
+            if better > max(gains.values(), default=-math.inf):  # of equals the first, as max() has it below
                 fits.clear()
                 fits[ground] = fit  # one is kept, as each has a body
-            return gains[ground]
+            gains[ground] = better
+            return better
 
         if found.mode in RUBBING:
             friction, most = better_friction(found.friction, partial(gain, found.mode))
@@ -104,7 +105,8 @@ class NewtonSteps:
             return None
         self.ground_gains = {named(ground): each for ground, each in gains.items()}
         best = max(gains, key=gains.get)
-        begins_again, moves = gains[best] > EXPLAINED, is_gradual(named(found), self.ground_gains)
+        begins_again = gains[best] > EXPLAINED
+        moves = not begins_again and learned_on(named(found), self.ground_gains) == named(best)
         log.info("ground: %s explains the motion %s than %s (by %.1f of the logarithm of the likelihood)%s", named(best),
                  "better" if gains[best] > 0 else "worse", named(found), abs(gains[best]),
                  "; the fit begins again" if begins_again else "; the fit goes there" if moves else "")  # fmt: skip

@@ -252,6 +252,22 @@ def test_a_fit_goes_to_a_friction_that_is_a_little_better(monkeypatch):
     assert torch.allclose(module.posterior.mean.to(numbers), numbers)
 
 
+def test_of_frictions_that_explain_the_motion_alike_the_first_is_taken(monkeypatch):
+    """Where a body does not slide, more friction changes nothing, not in the last bit: here all of them gain 1."""
+    module = fit_of(take_of(small_body(adapter=False), start(turn=0.5), FRAMES))
+    module.begin(module.stages[0])
+    module.identification = module.identifying(module.stages[0])
+    module.identification.iterate()
+    module.identification.converged = True
+    module.world = replace(module.world, ground=Ground(0.0, "separate", 0.6))
+    module.grounds, cost = {"sticky": 2.0, "separate_0.6": 1.0}, module.identification.cost()
+    fitted = module.identification
+    monkeypatch.setattr(module, "fitted_on", lambda ground, _: (cost - 1.0, fitted))
+    assert module.better_ground(replace(module.stages[0], name="joint")) is None
+    assert len(module.ground_gains) > 1 and len(set(module.ground_gains.values())) == 1
+    assert named(module.world.ground) == next(iter(module.ground_gains))
+
+
 @pytest.mark.parametrize("truth", [0.3, 0.6])
 def test_a_fit_begins_again_with_the_friction_that_explains_the_learned_law_better(monkeypatch, truth):
     """Where the isotropic law could not tell: here it has none but 0.6 to choose."""
