@@ -245,7 +245,8 @@ def killed_sweep(sets: list[list[str]], numbers: list[int], folder: Path, common
         except subprocess.TimeoutExpired:
             done = len(list((folder / "sweep").glob("*/metrics.json")))
             # as when the machine goes down: submitit's jobs are no children of the process that launched them
-            ended({process.pid, *processes_with(str(folder))})
+            os.killpg(process.pid, signal.SIGKILL)  # joblib's workers, which name no folder and would end their jobs first
+            ended(processes_with(str(folder)))
             process.wait()
             time.sleep(0.5)
             if time.perf_counter() > until:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import logging
 import os
 import shutil
 import signal
@@ -30,6 +31,8 @@ from mosa.errors import ConfigError, MosaError
 from mosa.refused import explained, let_go
 from mosa.screen import outlived
 from mosa.threads import settle_threads
+
+log = logging.getLogger(__name__)
 
 FAILED = "failed"
 """Folder in that of a sweep: one file for each job that ended in an error, named after its number, with the message."""
@@ -204,24 +207,27 @@ def terminated(number: int, *_) -> None:
 
 
 @contextmanager
-def held(folder: str | Path) -> Iterator[None]:
+def held(folder: str | Path, wait: bool = False) -> Iterator[None]:
     """A run's folder as this process's own. The system's lock on it ends with the process, however that ends, and leaves no file.
 
-    Errors: ConfigError where another process has it."""
+    wait: until the process that has it has ended, as a worker that outlives the sweep that launched it. Errors: without it,
+    ConfigError where another process has it."""
     try:
         number = os.open(folder, os.O_RDONLY)
     except OSError:  # said where the folder is written to
         yield
         return
     try:
-        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(number)
-        raise ConfigError(f"hydra.run.dir: another process is at work in {folder}; wait until it has ended, or give this run a "
-                          "folder of its own") from None
-    except OSError:  # a file system that knows no locks
-        pass
-    try:
+        try:
+            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if not wait:
+                raise ConfigError(f"hydra.run.dir: another process is at work in {folder}; wait until it has ended, or give this "
+                                  "run a folder of its own") from None
+            log.info("another process is at work in %s: waiting until it has ended (resume=auto)", folder)
+            fcntl.flock(number, fcntl.LOCK_EX)
+        except OSError:  # a file system that knows no locks
+            pass
         yield
     finally:
         os.close(number)
@@ -268,7 +274,7 @@ def attempted(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> flo
         signal.signal(signal.SIGTERM, terminated)
     folder = OmegaConf.select(HydraConfig.get(), "runtime.output_dir") if HydraConfig.initialized() else None
     try:
-        with held(folder) if first and folder is not None else nullcontext():
+        with held(folder, wait=(cfg or {}).get("resume") == "auto") if first and folder is not None else nullcontext():
             return job(cfg)
     except KeyboardInterrupt:
         if first:

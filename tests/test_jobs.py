@@ -7,6 +7,8 @@ import shlex
 import subprocess
 import sys
 import textwrap
+import threading
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -72,6 +74,27 @@ def test_a_run_folder_is_one_process_own_until_that_ends(tmp_path):
         with held(tmp_path):
             pass
     assert not list(tmp_path.iterdir())
+
+
+def test_a_run_that_is_to_go_on_waits_for_the_process_that_is_at_work_in_its_folder(tmp_path, caplog):
+    """A worker that outlived its killed sweep made the job of the sweep that was given again fail."""
+    code = (f"import sys; from mosa.jobs import held\nwith held({str(tmp_path)!r}):\n    print('held', flush=True)\n"
+            "    sys.stdin.read()\n    print('ended', flush=True)")
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", code], **pipes, text=True, cwd=ROOT) as other:
+        assert other.stdout.readline() == "held\n"
+        timer = threading.Timer(0.3, other.stdin.close)
+        timer.start()
+        with caplog.at_level("INFO"), held(tmp_path, wait=True):
+            assert other.stdout.readline() == "ended\n"
+        assert "another process is at work in" in caplog.text
+
+
+def test_runs_that_begin_in_the_same_second_have_a_folder_each():
+    """Of two commands given in one line the second was refused: another process was at work in its folder."""
+    folder = (ROOT / "conf" / "hydra" / "default.yaml").read_text().split("${now:", 2)[2].split("}")[0]
+    began = datetime(2026, 1, 2, 3, 4, 5, 6)
+    assert began.strftime(folder) != (began + timedelta(milliseconds=1)).strftime(folder)
 
 
 def test_a_folder_that_was_removed_meanwhile_is_one_message(sweep, tmp_path, capsys):
