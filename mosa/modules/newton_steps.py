@@ -78,8 +78,7 @@ class NewtonSteps:
         if not stage.learns_adapter or not self.grounds or self.ground_gains:
             return None
         found = self.world.ground
-        # a fit that was stopped gains by going on, wherever it goes on
-        own = self.identification.cost() if self.identification.converged else self.fitted_on(found, stage)[0]
+        own = self.fitted_on(found, stage)[0]  # gone on for as long, as a fit gains by that wherever it goes on
         gains: dict[Ground, float] = {}
         fits: dict[Ground, Identification] = {}
 
