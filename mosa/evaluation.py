@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from warnings import warn
 
@@ -124,7 +123,7 @@ def motion_metrics(
     each = list(threaded(lambda pair: metrics.chamfer_distances(*pair, samples=settings.samples), pairs))
     result |= {name: float(np.mean([found[name] for found in each])) for name in each[0]}
     last = pairs[:: max(1, len(pairs) // 3)]
-    result["emd_m"] = float(np.mean(metrics.emds(last, samples=settings.assignment)))
+    result["emd_m"] = float(np.mean(list(threaded(lambda pair: metrics.emd(*pair, samples=settings.assignment), last))))
     return result
 
 
@@ -168,10 +167,11 @@ def sequence_metrics(
     training = sequence.prefix.startswith("train")
     frames = scene.training_frames if training else list(range(scene.frames))
     cameras = scene.training_cameras if training else list(range(len(scene.cameras)))
-    with ThreadPoolExecutor(1) as beside:  # distances between clouds take other cores, and as long as the images
-        motion = beside.submit(motion_metrics, x, body, sequence, frames, settings, target)
-        images = render(body, rollout, scene, cameras)
-        figures: Mapping[str, float] = {**image_metrics(images, scene, cameras, frames), **motion.result()}
+    images = render(body, rollout, scene, cameras)
+    figures: Mapping[str, float] = {
+        **motion_metrics(x, body, sequence, frames, settings, target),
+        **image_metrics(images, scene, cameras, frames),
+    }
     result = {f"{model}{sequence.prefix}/{k}": v for k, v in figures.items()}
     if sequence.prefix == "train" and scene.holdout_frames:
         held = list(scene.holdout_frames)

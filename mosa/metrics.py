@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 import torch
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
-from mosa.assignment import mean_distances
 from mosa.errors import ConfigError
 
 CHAMFER_SAMPLES, ASSIGNMENT_SAMPLES = 8192, 2048
@@ -118,13 +119,10 @@ def chamfer(a: Tensor, b: Tensor, *, samples: int = CHAMFER_SAMPLES, seed: int =
 
 def emd(a: Tensor, b: Tensor, *, samples: int = ASSIGNMENT_SAMPLES, seed: int = 0) -> float:
     """`emd_m`: mean distance [m] of the exact assignment between equally many random points of (N, 3) and (M, 3) [m]."""
-    return emds([(a, b)], samples=samples, seed=seed)[0]
-
-
-def emds(pairs: Sequence[tuple[Tensor, Tensor]], *, samples: int = ASSIGNMENT_SAMPLES, seed: int = 0) -> list[float]:
-    """`emd_m` of several pairs of clouds, at the same time where there are cores."""
-    counts = [min(samples, len(a), len(b)) for a, b in pairs]
-    return mean_distances([(subsample(a, n, seed), subsample(b, n, seed + 1)) for (a, b), n in zip(pairs, counts)])
+    count = min(samples, len(a), len(b))
+    cost = cdist(subsample(a, count, seed), subsample(b, count, seed + 1))
+    rows, columns = linear_sum_assignment(cost)
+    return float(cost[rows, columns].mean())
 
 
 def resample_shape(cloud: Tensor, count: int, seed: int) -> Tensor:

@@ -2,13 +2,12 @@
 
 import itertools
 import math
-import subprocess
 
 import numpy as np
 import pytest
 import torch
 
-from mosa import assignment, metrics
+from mosa import metrics
 
 
 def drawn(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -135,33 +134,6 @@ def test_floor_of_a_random_cloud():
     assert metrics.sampling_floors(cloud, 2000, 3000, assignment=100)["cd_sq_m2"] == pytest.approx(
         metrics.chamfer_distances(0.2 * drawn(2000, 3, seed=6), 0.2 * drawn(3000, 3, seed=7))["cd_sq_m2"], rel=0.12
     )
-
-
-def test_several_assignments_in_processes_are_those_of_this_one(monkeypatch):
-    monkeypatch.setattr(assignment, "WORTH", 50)
-    monkeypatch.setattr(assignment, "cores", lambda: 2)
-    pairs = [(drawn(60 + k, 3, seed=k), drawn(80, 3, seed=9 + k)) for k in range(3)]
-    one_by_one = [metrics.emd(*pair) for pair in pairs]
-    started, run = [], subprocess.run
-    monkeypatch.setattr(subprocess, "run", lambda *words, **keys: started.append(words) or run(*words, **keys))
-    assert metrics.emds(pairs) == one_by_one
-    assert len(started) == 2 and len(set(one_by_one)) == 3
-    assert metrics.emds([(a, a) for a, _ in pairs], samples=40) != [0, 0, 0] and len(started) == 2  # small ones stay here
-
-
-@pytest.mark.parametrize("ends", [OSError("no process"), subprocess.CalledProcessError(1, "python"), "not a list"])
-def test_an_assignment_is_made_here_where_no_process_makes_it(monkeypatch, ends):
-    def run(*words, **keys):
-        if isinstance(ends, str):
-            return subprocess.CompletedProcess(words, 0, stdout=ends.encode())
-        raise ends
-
-    monkeypatch.setattr(assignment, "WORTH", 50)
-    monkeypatch.setattr(assignment, "cores", lambda: 2)
-    pairs = [(drawn(60, 3, seed=k), drawn(60, 3, seed=9 + k)) for k in range(2)]
-    one_by_one = [metrics.emd(*pair) for pair in pairs]
-    monkeypatch.setattr(subprocess, "run", run)
-    assert metrics.emds(pairs) == one_by_one
 
 
 # --- images ---------------------------------------------------------------------------------------------------------
