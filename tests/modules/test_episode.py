@@ -230,7 +230,8 @@ def test_gradients_of_worlds_are_those_of_their_twins():
     alone = [pushed(made, push.clone().requires_grad_(), None) for push in pushes]
     assert torch.equal(of_each, torch.stack([own for own, _ in alone])) and (of_each.abs().amax(1) > 1e-3).all()
     expected = sum(law for _, law in alone)
-    torch.testing.assert_close(of_all, expected, rtol=0, atol=1e-11 * float(expected.abs().max()))  # sums in another order
+    # sums in another order: 1.2e-11 of the largest on a processor with AVX-512, less without
+    torch.testing.assert_close(of_all, expected, rtol=0, atol=3e-11 * float(expected.abs().max()))
 
 
 def _with(body, numbers):
