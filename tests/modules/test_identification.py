@@ -356,8 +356,8 @@ def test_what_cues_keep_of_a_prediction_is_not_taken_for_the_law(criterion):
 
 @pytest.mark.parametrize("criterion", ["free", "both"])
 def test_columns_as_worlds_are_those_one_by_one(criterion):
-    """On a CPU every world has the bits of its own rollout. What corrects a prediction goes through torch, whose vector instructions
-    round the ends of a longer tensor otherwise on some processors: last bits of residuals, over the columns' steps."""
+    """On a CPU every world has the bits of its own rollout. What corrects a prediction goes through torch, whose vectors round the
+    ends of a longer tensor otherwise on some processors: last bits of residuals, over the columns' steps."""
     truth = small_body(numbers=fibres(0.3), contact=True)
     body = small_body(contact=True, modes=True)
     takes = [seen_about_a_prediction(truth, small_body(contact=True), 0.5), take_and_turn(truth, 1.5)]
