@@ -28,8 +28,9 @@ TRIED = 3
 """Iterations of each calibration after the first, from that one's numbers on: how a body slides hardly moves its moduli."""
 RIVAL_ITERATIONS = 3
 """In which a learned law is fitted to another contact, before the two are compared."""
-ASKED = 3
-"""Contacts that a learned law is usually asked for: one or two where the body sticks, up to seven where it slides."""
+ASKED = 4
+"""Contacts that a learned law is usually fitted further on: its own, and one or two others where the body sticks, up to seven where
+it slides."""
 
 
 def better_friction(own: float, gain: Callable[[float], float]) -> tuple[float, float]:

@@ -78,7 +78,11 @@ class NewtonSteps:
         if not stage.learns_adapter or not self.grounds or self.ground_gains:
             return None
         found = self.world.ground
-        own = self.fitted_on(found, stage)[0]  # gone on for as long, as a fit gains by that wherever it goes on
+        slides, rivals = found.mode in RUBBING, rivals_of(self.grounds)
+        if not slides and not rivals:
+            return None
+        # gone on for as long, as a fit gains by that wherever it goes on; as it stands where it cannot go on
+        own = min(self.identification.cost(), self.fitted_on(found, stage)[0])
         gains: dict[Ground, float] = {}
         fits: dict[Ground, Identification] = {}
 
@@ -92,16 +96,14 @@ class NewtonSteps:
             gains[ground] = better
             return better
 
-        if found.mode in RUBBING:
+        if slides:
             friction, most = better_friction(found.friction, partial(gain, found.mode))
             for mode in RUBBING:
                 if mode != found.mode and alike(self.grounds, mode):
                     gain(mode, friction if most > 0 else found.friction)
         else:
-            for mode, friction in rivals_of(self.grounds):
+            for mode, friction in rivals:
                 gain(mode, friction)
-        if not gains:
-            return None
         self.ground_gains = {named(ground): each for ground, each in gains.items()}
         best = max(gains, key=gains.get)
         begins_again = gains[best] > EXPLAINED

@@ -259,8 +259,8 @@ def test_of_frictions_that_explain_the_motion_alike_the_first_is_taken(monkeypat
     module.identification = module.identifying(module.stages[0])
     module.identification.iterate()
     module.world = replace(module.world, ground=Ground(0.0, "separate", 0.6))
-    module.grounds, fitted = {"sticky": 2.0, "separate_0.6": 1.0}, module.identification
-    monkeypatch.setattr(module, "fitted_on", lambda ground, _: (9.0 - (ground != module.world.ground), fitted))
+    module.grounds, fitted, cost = {"sticky": 2.0, "separate_0.6": 1.0}, module.identification, module.identification.cost()
+    monkeypatch.setattr(module, "fitted_on", lambda ground, _: (cost - 1.0 - (ground != module.world.ground), fitted))
     assert module.better_ground(replace(module.stages[0], name="joint")) is None
     assert len(module.ground_gains) > 1 and len(set(module.ground_gains.values())) == 1
     assert named(module.world.ground) == next(iter(module.ground_gains))
@@ -311,6 +311,20 @@ def test_a_fit_is_compared_with_itself_gone_on(monkeypatch, near):
     assert module.better_ground(replace(module.stages[0], name="joint")) is None
     assert set(module.ground_gains.values()) == {0.0} and named(module.world.ground) == "separate_0.6"
     assert {contact(name)[0] for name in module.ground_gains} == ({"separate", "touch"} if near < 1.1 else {"separate"})
+
+
+def test_a_fit_that_cannot_go_on_is_compared_as_it_stands(monkeypatch):
+    """It began again on whatever ground it was asked for, where the body could not be simulated once more on its own."""
+    module = fit_of(take_of(small_body(adapter=False), start(turn=0.5), FRAMES))
+    module.begin(module.stages[0])
+    module.identification = module.identifying(module.stages[0])
+    module.identification.iterate()
+    module.world = replace(module.world, ground=Ground(0.0, "separate", 0.6))
+    module.grounds, cost = {"sticky": 2.0, "separate_0.6": 1.0}, module.identification.cost()
+    monkeypatch.setattr(module, "fitted_on", lambda ground, _: (
+        math.inf if ground == module.world.ground else cost + 2.0, module.identification))
+    assert module.better_ground(replace(module.stages[0], name="joint")) is None
+    assert set(module.ground_gains.values()) == {-2.0} and named(module.world.ground) == "separate_0.6"
 
 
 def test_particles_that_meet_the_ground_themselves_need_no_lift():
