@@ -34,8 +34,9 @@ SPLATS = {"means": (3,), "scales": (3,), "rotations": (4,), "opacities": (), "co
           "normals": (3,)}  # fmt: skip
 BOUND_BYTES = 4000
 """Of a splat while it is bound to its neighbours."""
-VERSION = 1
-"""Of what a run keeps under `mosa` in its checkpoint; grows when a program that knows the one before could not read it."""
+VERSION = 2
+"""Of what a run keeps under `mosa` in its checkpoint; grows when a program that knows the one before could not read it. Before 2, the
+numbers of the default adapter were coordinates in a basis that each processor found for itself."""
 RESUMED = ("epoch", "global_step", "pytorch-lightning_version", "loops", "callbacks", "optimizer_states", "lr_schedulers")
 """What Lightning reads where a fit goes on."""
 NAMED = {"collections OrderedDict", "torch Size", "torch._utils _rebuild_tensor_v2", "torch._utils _rebuild_parameter",
@@ -109,6 +110,12 @@ def read_checkpoint(path: str | Path) -> dict:
     if not whole(0).fits(version) or version > VERSION:
         raise DataError(f"ckpt_path: {path}: mosa.version: expected at most {VERSION}, found {version!r}: it is of a newer "
                         "version of this program")
+    weights = checkpoint.get("state_dict")
+    learned = [value for name, value in weights.items() if str(name).endswith("adapter.numbers")] if isinstance(weights, dict) else []
+    if version < 2 and any(isinstance(value, torch.Tensor) and bool((value != 0).any()) for value in learned):
+        raise DataError(f"ckpt_path: {path}: mosa.version: expected {VERSION} for a law learned by the default adapter, found "
+                        f"{version}: its numbers are coordinates in a basis that depended on the processor it was learned on, and "
+                        "would be another law here; learn it again")
     return checkpoint
 
 

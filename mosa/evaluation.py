@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from mosa.analysis.anisotropy import stiffest_axis
 from mosa.analysis.stiffness import angle_between, stiffest
 from mosa.analysis.vibration import GROWTH_LIMIT, vibration_growth
 from mosa.data.sequences import load_sequences
-from mosa.errors import SimulationDiverged
+from mosa.errors import ConfigError, SimulationDiverged
 from mosa.evaluation_settings import EvaluationSettings
 from mosa.modules.body import VARIANTS, Body, Start, World
 from mosa.modules.carried_splats import seen
@@ -28,6 +29,7 @@ from mosa.threads import threaded
 from mosa.types import Rollout, Scene
 
 PREFIX = {"adapted": "", "prior": "prior/", "prior_eta": "prior_eta/"}
+NAMES = {"adapted": "the learned law", "prior": "the prior", "prior_eta": "the prior with eta"}
 
 
 @dataclass(frozen=True)
@@ -55,15 +57,24 @@ def run_sequences(config: Mapping, body: Body) -> list[Sequence]:
 @torch.no_grad()
 def rollouts(body: Body, sequence: Sequence, world: World) -> tuple[dict[str, Rollout], float | None, float]:
     """Every variant's rollout over all frames of `sequence`, mean |C| of the adapted one (None without an adapter), and the
-    particle substeps per second of the last."""
+    particle substeps per second of the last. A variant that cannot be simulated on a held-out sequence is left out, with a warning.
+
+    Errors: SimulationDiverged, ConfigError (time step) on a training sequence, which the fit could simulate."""
     scene = sequence.scene
     frame_dt = float(scene.times[1] - scene.times[0])
     sizes: list[float] = []
     result, rate = {}, 0.0
     for v in VARIANTS:
-        began = time.perf_counter()
-        result[v] = body.simulate(sequence.start, world, scene.frames, frame_dt, model=body.model(v),
-                                  collect=lambda found: sizes.append(float(found.mean_abs_C)))
+        began, counted = time.perf_counter(), len(sizes)
+        try:
+            result[v] = body.simulate(sequence.start, world, scene.frames, frame_dt, model=body.model(v),
+                                      collect=lambda found: sizes.append(float(found.mean_abs_C)))
+        except (SimulationDiverged, ConfigError) as error:
+            if sequence.prefix.startswith("train"):
+                raise
+            del sizes[counted:]
+            warn(f"{sequence.prefix}: {NAMES[v]} cannot be simulated there, its errors count as infinite ({error})", stacklevel=2)
+            continue
         if body.rest.is_cuda:
             torch.cuda.synchronize()
         rate = len(body.rest) * sum(result[v].counts) / (time.perf_counter() - began)
@@ -137,11 +148,13 @@ def true_motion(body: Body, scene: Scene) -> Tensor | None:
 def evaluate(
     body: Body, sequences: list[Sequence], world: World, settings: EvaluationSettings
 ) -> tuple[dict[str, float], dict[str, dict[str, Rollout]]]:
-    """All figures, flat, named as in docs/figures.md, and the rollouts: result[sequence prefix][variant]."""
+    """All figures, flat, named as in docs/figures.md, and the rollouts that could be simulated: result[sequence prefix][variant].
+
+    Errors: those of `rollouts`; SimulationDiverged where none of them could be."""
     figures: dict[str, float] = {}
     kept: dict[str, dict[str, Rollout]] = {}
     bar = tqdm(total=len(sequences) * len(VARIANTS), desc="evaluate", unit="rollout", dynamic_ncols=True)
-    rates = []
+    rates, measured, missing = [], set[str](), list[str]()
     for sequence in sequences:
         kept[sequence.prefix] = {}
         simulated, size, rate = rollouts(body, sequence, world)
@@ -149,14 +162,30 @@ def evaluate(
         if size is not None:
             figures[f"{sequence.prefix}/mean_abs_C"] = size
         target = true_motion(body, sequence.scene)
-        for variant, rollout in simulated.items():
-            kept[sequence.prefix][variant] = rollout
-            figures |= sequence_metrics(body, sequence, rollout, PREFIX[variant], settings, target)
+        for variant in VARIANTS:
+            model = PREFIX[variant]
+            if variant in simulated:
+                kept[sequence.prefix][variant] = simulated[variant]
+                figures |= sequence_metrics(body, sequence, simulated[variant], model, settings, target)
+                measured |= {key.rpartition("/")[2] for key in figures if key.startswith(f"{model}{sequence.prefix}/")}
+            else:
+                missing.append(f"{model}{sequence.prefix}")
             bar.update()
     bar.close()
+    if not measured:
+        raise SimulationDiverged("evaluation: neither the law nor its prior can be simulated on any of these sequences: "
+                                 f"{', '.join(s.prefix for s in sequences)}; the warnings above say why")
+    figures |= {f"{part}/{name}": worst(name) for part in missing for name in measured - {"mean_abs_C"}}
     figures |= test_means(figures)
     figures["time/particle_substeps_per_s"] = max(rates)  # the first rollouts also load kernels
     return figures, kept
+
+
+def worst(name: str) -> float:
+    """The figure of a rollout that there is not: no error so large and no picture so bad; of pictures compared by a metric that was
+    registered, no number."""
+    kind = name.split("_")[0]
+    return -math.inf if kind in ("psnr", "ssim") else math.nan if name.rsplit("_", 1)[0] in metrics.IMAGE_METRICS else math.inf
 
 
 def sequence_metrics(

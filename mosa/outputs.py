@@ -7,7 +7,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from mosa.analysis.comparison import compare, write_comparisons
+from mosa.analysis.comparison import TITLES, compare, write_comparisons
 from mosa.analysis.tables import continued_text, determined_text, geometry_lines, parameter_table, results_table
 from mosa.data.builtin.true_geometry import geometry_figures
 from mosa.data.splats import save_ply
@@ -76,14 +76,16 @@ def write_outputs(
     """rollout.npz and prior.npz, truth.npz where it is known; splats.ply; video.mp4 of the last held-out sequence, strip.png of
     all; tables in results.md; metrics.json."""
     for variant, name in (("adapted", "rollout.npz"), ("prior", "prior.npz")):
-        save_rollout(folder / name, {prefix: variants[variant] for prefix, variants in kept.items()}, world.colliders)
+        motions = {prefix: variants[variant] for prefix, variants in kept.items() if variant in variants}
+        save_rollout(folder / name, motions, world.colliders)
     if known := {s.prefix: true_motion(body, s.scene) for s in evaluated if s.scene.truth is not None}:
         save_truth(folder / "truth.npz", known)
     if body.splats is not None:
         known = body.splats.appearance
         save_ply(folder / "splats.ply", known.splats.to("cpu"), known.harmonics.cpu())
     if cfg.evaluation.video:
-        shown = [s for s in evaluated if s.prefix.startswith("test")] or evaluated[-1:]
+        shown = [s for s in evaluated if s.prefix.startswith("test") and TITLES.keys() & kept[s.prefix].keys()]
+        shown = shown or evaluated[:1]
         write_comparisons(folder, {s.prefix: compare(body, s, kept[s.prefix]) for s in shown})
     parts = (results_table(figures), parameter_table(figures), continued_text(figures), determined_text(figures),
              geometry_lines(figures))  # fmt: skip

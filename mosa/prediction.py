@@ -43,16 +43,23 @@ def predicted_spread(
     The variance of a position, summed over its three components, is that of the draws (times `DRAWN`^2), that among the forms of
     the law (`Posterior.rivals`, times `FORMS`^2), and the square of what the model gets wrong on the training sequence itself
     (`Posterior.model_error`), which is `ELSEWHERE` times as much on a sequence that was not learned from. Draws and rivals that
-    cannot be simulated are left out and counted. Figures: posterior/draws, posterior/rivals, posterior/<prefix>/sd_m and, after
-    first contact and where the true motion is known, posterior/<prefix>/coverage: the share of the particles' errors within two
-    standard deviations.
+    cannot be simulated are left out and counted; sequences on which the law itself cannot are left out. Figures: posterior/draws,
+    posterior/rivals, posterior/<prefix>/sd_m and, after first contact and where the true motion is known,
+    posterior/<prefix>/coverage: the share of the particles' errors within two standard deviations.
     """
     generator = torch.Generator().manual_seed(seed)
+
+    base: dict[str, Tensor] = {}
+    for s in sequences:
+        try:
+            base[s.prefix] = _positions(body, s, world)
+        except MosaError:  # `evaluate` has said so
+            continue
+    sequences = [s for s in sequences if s.prefix in base]
 
     def positions() -> dict[str, Tensor]:
         return {s.prefix: _positions(body, s, world) for s in sequences}
 
-    base = positions()
     drawn = drawn_motions(body, posterior.draws(draws, generator), positions)
     others = rival_motions(body, posterior, positions)
     figures: dict[str, float] = {"posterior/draws": float(len(drawn)), "posterior/rivals": float(len(others)),

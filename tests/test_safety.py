@@ -88,8 +88,8 @@ DAMAGED = {
     "interpolation in the world": (at(*CFG, "world", "walls", value={"mode": "${oc.env:HOME}"}), "not resolved"),
     "no state": (at("state_dict", value=None), "expected the part state_dict"),
     "no start": (at("mosa", "start", value=None), "mosa: expected the parts config, start, found none called start"),
-    "newer": (at("mosa", "version", value=2), "mosa.version: expected at most 1, found 2: it is of a newer version"),
-    "no number": (at("mosa", "version", value="1"), "mosa.version: expected at most 1, found '1'"),
+    "newer": (at("mosa", "version", value=3), "mosa.version: expected at most 2, found 3: it is of a newer version"),
+    "no number": (at("mosa", "version", value="1"), "mosa.version: expected at most 2, found '1'"),
     "simulation": (at("mosa", "config", "cfg", "simulation", "speed", value=1), "simulation.speed: unknown key"),
     "courant": (at("mosa", "config", "cfg", "simulation", "courant", value=7), "simulation.courant: expected a number above 0"),
     "no world": (at("mosa", "config", "world", value=None), "mosa.config: .* found none called world"),
@@ -122,6 +122,20 @@ def test_a_damaged_checkpoint_is_named_part_by_part(tmp_path, name):
     with pytest.raises(DataError, match=message) as caught:
         Twin.load(checkpoint(tmp_path / "bad.ckpt", change=change))
     assert "bad.ckpt" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_law_of_the_default_adapter_from_before_its_basis_was_written_out_is_refused(tmp_path):
+    """Its numbers were coordinates in a basis of the processor it was learned on. Where nothing was learned there is no law to
+    mistake."""
+
+    def older(stored, numbers):
+        assert stored["state_dict"]["body.adapter.numbers"].shape == (19,)  # the name by which they are found
+        stored["mosa"]["version"] = 1
+        stored["state_dict"]["body.adapter.numbers"] = torch.full((19,), numbers)
+
+    with pytest.raises(DataError, match=r"bad\.ckpt: mosa\.version: expected 2 for a law .* learn it again"):
+        Twin.load(checkpoint(tmp_path / "bad.ckpt", change=lambda stored: older(stored, 0.1)))
+    Twin.load(checkpoint(tmp_path / "prior.ckpt", change=lambda stored: older(stored, 0.0)))
 
 
 def test_a_pickle_in_a_checkpoint_runs_nothing(tmp_path):

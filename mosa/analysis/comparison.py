@@ -47,7 +47,7 @@ class Comparison:
 
 @torch.no_grad()
 def compare(body: Body, shown: Sequence, variants: Mapping[str, Rollout], *, width: int = 320) -> Comparison:
-    """What the first camera sees of a sequence and of the models' rollouts, about `width` px wide.
+    """What the first camera sees of a sequence and of the models' rollouts (those that there are), about `width` px wide.
 
     The error is each particle's distance to the true motion where that is known, else the difference of the images.
     """
@@ -58,7 +58,8 @@ def compare(body: Body, shown: Sequence, variants: Mapping[str, Rollout], *, wid
     times = max(1, round(width / max(w, h)))
     lines = ground_lines(scene, cameras, body.size)
     real = crop_images(scene.images[[camera]], x0, y0, w, h, axis=2)[0]
-    seen = {variant: drawn(body, variants[variant], cameras, scene) for variant in TITLES}
+    known = [variant for variant in TITLES if variant in variants]
+    seen = {variant: drawn(body, variants[variant], cameras, scene) for variant in known}
 
     def finished(images: Tensor) -> np.ndarray:
         return np.stack([on_ground(enlarge(to_uint8(image), times), lines, times, scene.background) for image in images])
@@ -68,7 +69,7 @@ def compare(body: Body, shown: Sequence, variants: Mapping[str, Rollout], *, wid
         label, high, colors = "difference of the images", f"{DIFFERENCE:g}", "Reds"
         errors = {v: paint((images - real).abs().mean(-1) / DIFFERENCE, colors) for v, images in seen.items()}
     else:
-        far = {v: (variants[v].x.cpu() - target.cpu()).norm(dim=-1) for v in TITLES}
+        far = {v: (variants[v].x.cpu() - target.cpu()).norm(dim=-1) for v in known}
         limit = round_up(max(float(torch.quantile(d.flatten()[: 2**24], 0.99)) for d in far.values()))
         label, high, colors = "distance to the true motion", f"{1e3 * limit:g} mm", "viridis"
         errors = {v: drawn(body, variants[v], cameras, scene, paint(d / limit, colors)) for v, d in far.items()}

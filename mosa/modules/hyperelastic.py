@@ -32,23 +32,31 @@ NUMBERS = 19
 """Symmetric 6 x 6 matrices have 21 numbers, of which two are isotropic: the prior's own."""
 
 
+CONTRASTS = ((math.sqrt(1 / 2), -math.sqrt(1 / 2), 0.0), (math.sqrt(1 / 6), math.sqrt(1 / 6), -math.sqrt(2 / 3)))
+"""What parts three numbers from their mean."""
+
+
 @lru_cache(maxsize=8)
 @torch.inference_mode(False)  # who asks first may not want gradients, and others do
 def anisotropic_basis(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """(19, 6, 6) orthonormal symmetric matrices in Mandel scaling, orthogonal to I and to 1x1: no sum of them is isotropic."""
-    basis = []
-    for i in range(6):
-        for j in range(i, 6):
-            E = torch.zeros(6, 6, dtype=torch.float64)
-            E[i, j] = E[j, i] = 1.0 if i == j else math.sqrt(0.5)
-            basis.append(E.flatten())
-    one = torch.tensor([1.0, 1, 1, 0, 0, 0], dtype=torch.float64)
-    isotropic = torch.linalg.qr(torch.stack([torch.eye(6, dtype=torch.float64).flatten(), torch.outer(one, one).flatten()], 1)).Q
-    symmetric = torch.stack(basis, 1)
-    rest = symmetric - isotropic @ (isotropic.T @ symmetric)
-    U, values, _ = torch.linalg.svd(rest, full_matrices=False)
-    assert int((values > 0.5).sum()) == NUMBERS
-    return U[:, :NUMBERS].T.unflatten(-1, (6, 6)).to(device, dtype).contiguous()
+    """(19, 6, 6) orthonormal symmetric matrices in Mandel scaling, orthogonal to I and to 1x1: no sum of them is isotropic.
+
+    Written out, as a decomposition (of the projector onto them, say) gives another basis on another processor, and the numbers of a
+    checkpoint would be another law there."""
+    half = math.sqrt(1 / 2)
+
+    def matrix(entries: dict[tuple[int, int], float]) -> Tensor:
+        E = torch.zeros(6, 6, dtype=torch.float64)
+        for (i, j), value in entries.items():
+            E[i, j] = E[j, i] = value if i == j else half * value
+        return E
+
+    normal, shear, coupled = [(0, 0), (1, 1), (2, 2)], [(3, 3), (4, 4), (5, 5)], [(1, 2), (0, 2), (0, 1)]
+    parts = [dict(zip(three, weights)) for three in (normal, shear, coupled) for weights in CONTRASTS]
+    means = {**dict.fromkeys(normal, math.sqrt(2 / 15)), **dict.fromkeys(shear, -math.sqrt(2 / 15)),
+             **dict.fromkeys(coupled, -math.sqrt(1 / 15))}  # fmt: skip
+    others = [{(i, j): 1.0} for i in range(6) for j in range(max(i + 1, 3), 6)]
+    return torch.stack([matrix(entries) for entries in (*parts, means, *others)]).to(device, dtype)
 
 
 def root_stiffness(poisson: Tensor) -> Tensor:

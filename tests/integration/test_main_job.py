@@ -19,10 +19,12 @@ import torch
 from hydra import compose, initialize_config_dir
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from mosa import __version__, pipeline
+from mosa import __version__, evaluation, pipeline
 from mosa.clips import read_run
-from mosa.modules.body import ContactOffset, Start
+from mosa.errors import SimulationDiverged
+from mosa.modules.body import Body, ContactOffset, Start
 from mosa.modules.lit_mosa import LitMosa
+from mosa.run import read_figures
 from mosa.twin import Twin
 from mosa.types import Ground
 
@@ -282,6 +284,42 @@ def test_eval_renders_as_the_run_did(run, tmp_path, monkeypatch):
     monkeypatch.setattr(pipeline, "use_backend", lambda name, required: used.append((name, required)))
     evaluated(run, tmp_path, monkeypatch)
     assert used == [("warp", False)]
+
+
+@pytest.mark.parametrize("variant, motion", [("prior", "prior.npz"), ("adapted", "rollout.npz")])
+def test_a_law_that_cannot_be_simulated_on_a_held_out_drop_has_infinite_errors_there(run, tmp_path, monkeypatch, variant, motion):
+    """The fit was lost with it, and all other figures."""
+    simulate, failing = Body.simulate, [False]
+
+    def diverges(self, start, world, frames, frame_dt, **more):
+        asked, wanted = more.get("model") or self.model(), self.model(variant)
+        if failing[0] and asked.material is wanted.material and asked.heterogeneity is wanted.heterogeneity:
+            raise SimulationDiverged("substep 7, particle 3: gone")
+        return simulate(self, start, world, frames, frame_dt, **more)
+
+    def rollouts(body, sequence, world):
+        failing[0] = sequence.prefix.startswith("test")
+        return evaluation_rollouts(body, sequence, world)
+
+    evaluation_rollouts = evaluation.rollouts
+    monkeypatch.setattr(Body, "simulate", diverges)
+    monkeypatch.setattr(evaluation, "rollouts", rollouts)
+    monkeypatch.setattr(pipeline, "run_folder", lambda: tmp_path)
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        cfg = compose("eval", [f"ckpt_path={run}/checkpoints/last.ckpt", "evaluation.floor=false"])
+    with pytest.warns(UserWarning, match=r"test/test_60: the (prior|learned law) cannot be simulated .*substep 7, particle 3: gone"):
+        pipeline.evaluate_checkpoint(cfg)
+    figures, before = read_figures(tmp_path / "metrics.json"), read_figures(run / "metrics.json")
+    model = evaluation.PREFIX[variant]
+    for part in ("test/test_60", "test"):
+        assert figures[f"{model}{part}/rms_m"] == figures[f"{model}{part}/cd_m"] == float("inf")
+        assert figures[f"{model}{part}/psnr_crop"] == -float("inf")
+    other = "prior_eta/test/rms_m"
+    assert figures[other] == pytest.approx(before[other], rel=1e-5) and np.isfinite(figures[f"{model}train/rms_m"])
+    assert {key.split("/x")[0] for key in np.load(tmp_path / motion) if key.endswith("/x")} == {"train"}
+    assert "inf" in (tmp_path / "results.md").read_text() and (tmp_path / "video.mp4").is_file()
+    shutil.copytree(run / "checkpoints", tmp_path / "checkpoints")
+    assert read_run(tmp_path)
 
 
 def test_eval_puts_the_starts_where_the_body_is(run, tmp_path, monkeypatch):

@@ -115,6 +115,20 @@ def test_zero_numbers_are_exactly_no_correction(nu):
     assert (adapter_of(torch.zeros(NUMBERS), nu).relative() == 0).all()
 
 
+def test_the_basis_is_the_same_on_every_processor():
+    """A checkpoint holds coordinates in it. What a decomposition gives among matrices of one singular value is left to the
+    processor's library; written out, squares of the entries are these fractions, and the order and the signs are kept."""
+    basis = anisotropic_basis(torch.float64, torch.device("cpu"))
+    fractions = torch.tensor([0, 1, 1 / 2, 1 / 4, 1 / 6, 2 / 3, 1 / 12, 1 / 3, 2 / 15, 1 / 30], dtype=torch.float64)
+    assert ((basis.square()[..., None] - fractions).abs().amin(-1) < 1e-15).all()
+    kept = {0: {(0, 0): 0.5**0.5, (1, 1): -(0.5**0.5)}, 3: {(3, 3): (1 / 6) ** 0.5, (5, 5): -((2 / 3) ** 0.5)},
+            4: {(1, 2): 0.5, (0, 2): -0.5}, 6: {(0, 0): (2 / 15) ** 0.5, (3, 3): -((2 / 15) ** 0.5), (0, 1): -((1 / 30) ** 0.5)},
+            7: {(0, 3): 0.5**0.5}, 18: {(4, 5): 0.5**0.5}}  # fmt: skip
+    for number, entries in kept.items():
+        for place, value in entries.items():
+            assert abs(float(basis[number][place]) - value) < 1e-15, (number, place)
+
+
 def test_nothing_but_zero_is_isotropic():
     """The change under three rotations is of full rank on the 19 matrices, of rank 19 on all 21 symmetric ones."""
     basis = anisotropic_basis(torch.float64, torch.device("cpu"))
