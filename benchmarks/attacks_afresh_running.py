@@ -147,7 +147,7 @@ def changed_keys(fitted: Callable, words: Callable, message: Callable, same: Cal
     """A fit that goes on with another configuration."""
     for number, key in enumerate(("simulation.particles=120", "fit.joint.newton_iterations=2", "scene.scale=0.4", "scene=rabbit",
                                   "reconstruction.points=2000", "identification.count=20", "adapter=none",
-                                  "heterogeneity.enabled=false", "prior.parameters.E=1e5", "world.walls={mode: separate}",
+                                  "heterogeneity.enabled=false", "prior.parameters.E=2e5", "world.walls={mode: separate}",
                                   "deterministic=true", "scene.seed=3")):  # fmt: skip
         yield f"goes on with {key}", lambda k=key, n=number: message(*words(fitted(f"key_{n}")), k)
     yield "goes on with another logger", lambda: same(fitted("logger"), "logger=csv")

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 from attacks import ROOT, Attack, refuse
+from drawn_runs import RESUMED, leftovers
 from drawn_runs import SMALL as SHORT
-from drawn_runs import leftovers
 
 from mosa.analysis.figures import ffmpeg
 from mosa.errors import ConfigError
@@ -173,19 +173,24 @@ def running(folder: Path) -> Iterator[Attack]:
     for name, line in {"early": "mosa", "late": "fit: "}.items():
         yield f"the folder is removed while it runs, {name}", lambda n=name, x=line: gone(n, x)
 
-    def beside() -> None:
-        run = fitted("twice")
+    def beside(waits: bool) -> None:
+        """The second one is refused; with resume=auto it waits, and finds the run complete."""
+        run = fitted(f"twice_{waits}")
         first = subprocess.Popen([sys.executable, str(ROOT / "train.py"), *arguments(run)], cwd=ROOT, stdout=subprocess.DEVNULL,
                                  stderr=subprocess.DEVNULL)  # fmt: skip
         while not (run / "train.log").is_file() and first.poll() is None:
             time.sleep(0.05)
         time.sleep(1.0)
-        program(*arguments(run), wanted=2)
+        given = [word for word in arguments(run) if waits or word != "resume=auto"]
+        told = program(*given, wanted=0 if waits else 2)
+        if waits and not ("is at work in" in told and RESUMED["skipped"] in told):
+            raise AssertionError(f"it did not wait: {told[-300:]}")
         if first.wait():
             raise AssertionError(f"the first ended with {first.returncode}")
         equal(whole, run)
 
-    yield "a second process in the folder", beside
+    for waits in (False, True):
+        yield f"a second process in the folder{', which waits' if waits else ''}", lambda w=waits: beside(w)
 
     def limited(name: str, limit: str) -> None:
         program(*arguments(fitted(name)), shell=f"ulimit {limit}; {{}}", wanted=2)

@@ -35,8 +35,8 @@ SPLATS = {"means": (3,), "scales": (3,), "rotations": (4,), "opacities": (), "co
 BOUND_BYTES = 4000
 """Of a splat while it is bound to its neighbours."""
 VERSION = 2
-"""Of what a run keeps under `mosa` in its checkpoint; grows when a program that knows the one before could not read it. Before 2, the
-numbers of the default adapter were coordinates in a basis that each processor found for itself."""
+"""Of what a run keeps under `mosa` in its checkpoint; grows when a program that knows the one before could not read it. Before 2,
+the numbers of the default adapter were coordinates in a basis that each processor found for itself."""
 RESUMED = ("epoch", "global_step", "pytorch-lightning_version", "loops", "callbacks", "optimizer_states", "lr_schedulers")
 """What Lightning reads where a fit goes on."""
 NAMED = {"collections OrderedDict", "torch Size", "torch._utils _rebuild_tensor_v2", "torch._utils _rebuild_parameter",
@@ -111,8 +111,8 @@ def read_checkpoint(path: str | Path) -> dict:
         raise DataError(f"ckpt_path: {path}: mosa.version: expected at most {VERSION}, found {version!r}: it is of a newer "
                         "version of this program")
     weights = checkpoint.get("state_dict")
-    learned = [value for name, value in weights.items() if str(name).endswith("adapter.numbers")] if isinstance(weights, dict) else []
-    if version < 2 and any(isinstance(value, torch.Tensor) and bool((value != 0).any()) for value in learned):
+    numbers = weights.get("body.adapter.numbers") if isinstance(weights, Mapping) else None
+    if version < 2 and isinstance(numbers, torch.Tensor) and bool((numbers != 0).any()):
         raise DataError(f"ckpt_path: {path}: mosa.version: expected {VERSION} for a law learned by the default adapter, found "
                         f"{version}: its numbers are coordinates in a basis that depended on the processor it was learned on, and "
                         "would be another law here; learn it again")

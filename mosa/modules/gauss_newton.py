@@ -55,10 +55,12 @@ class Block:
 @dataclass
 class Seat:
     """A model that can be moved and asked. tensors: its parameters, one for each block; residuals: a vector, of the numbers that
-    stand in them; it may raise MosaError. Seats share nothing that either writes to: each has a thread of its own."""
+    stand in them; it may raise MosaError, and so may possible, where a fit must not stay at these numbers. Seats share nothing that
+    either writes to: each has a thread of its own."""
 
     tensors: Sequence[Tensor]
     residuals: Callable[[], Tensor]
+    possible: Callable[[], object] | None = None
 
     def read(self) -> Tensor:
         """(D,) float64 on the CPU."""
@@ -218,6 +220,8 @@ class GaussNewton:
                 break
             seat.write(moved)
             try:
+                if seat.possible is not None:
+                    seat.possible()
                 there = seat.residuals()
             except MosaError:
                 there = None

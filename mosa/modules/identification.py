@@ -103,7 +103,14 @@ class Identification:
         tensors = tensors_of(body, adapter=self.adapter, heterogeneity=self.heterogeneity)
         if self.knows_grid:
             tensors.append(multiple)
-        return Seat(tensors, lambda: self._whitened(body, float(multiple)))
+        return Seat(tensors, lambda: self._whitened(body, float(multiple)), lambda: self._possible(body))
+
+    def _possible(self, body: Body) -> None:
+        """Errors: ConfigError where the numbers ask for more substeps than `max_substeps`. An iteration holds those of its
+        beginning and would not see it; the next one, and whoever simulates the law, could not go on."""
+        if not body.settings.adaptive:
+            for i in range(len(self.takes)):
+                self.ready(body, i)
 
     @property
     def knows_grid(self) -> bool:
@@ -114,6 +121,13 @@ class Identification:
     def pairs(self) -> list[tuple[int, float]]:
         """(take, gain) of every rollout that is compared."""
         return [(i, gain) for i in range(len(self.takes)) for gain in self.gains]
+
+    @torch.no_grad()
+    def ready(self, body: Body, index: int, substeps: int | None = None) -> Ready:
+        """The body at the start of a take, with what is learned here."""
+        take = self.takes[index]
+        model = body.model().only(heterogeneity=self.heterogeneity, adapter=self.adapter)
+        return body.ready(take.start, self.world, len(take.cues.positions), take.frame_dt, model=model, substeps=substeps)
 
     @torch.no_grad()
     def rollout(self, body: Body, index: int, gain: float = 0.0, substeps: int | None = None):
@@ -144,10 +158,7 @@ class Identification:
                 take, parts = self.takes[i], []
                 for row in some:
                     seat.write(row)
-                    parts.append(self.body.ready(
-                        take.start, self.world, len(take.cues.positions), take.frame_dt, substeps=self.substeps[i],
-                        model=self.body.model().only(heterogeneity=self.heterogeneity, adapter=self.adapter),
-                    ).answered())  # fmt: skip
+                    parts.append(self.ready(self.body, i, self.substeps[i]).answered())
                 rollout = Ready.stack(parts).simulate(
                     len(take.cues.positions), self.world.colliders, observed=take.cues.positions if gain else None, gain=gain,
                     unseen=self.unseen(take))

@@ -1,6 +1,7 @@
 """Identification of a small body from its own rollouts: what it finds, what it leaves alone, going on after a stop, threads."""
 
 import copy
+import math
 from dataclasses import replace
 
 import pytest
@@ -82,6 +83,30 @@ def test_a_calibration_finds_modulus_and_poisson_number_from_the_coarse_grid(beg
     seen = away[found.takes[0].first_contact :]
     assert posterior.model_error == pytest.approx(float((seen**2).sum(-1).mean().sqrt()), rel=1e-9)
     assert 0 < found.takes[0].first_contact < FRAMES - 3 and posterior.model_error < 1e-5
+
+
+def test_a_calibration_stays_where_the_time_step_allows_it():
+    """The truth is stiffer than the substeps that are allowed can bear: it comes near that bound, and ends. An iteration holds its
+    substeps and did not see the bound; the next one ended the run with all that was found."""
+    stiff = 100 * E
+    truth, body = small_body(adapter=False, E=stiff), small_body(adapter=False, E=stiff / 12)
+    found = identification(body, [take_and_turn(truth, 0.5)], "prior")
+    body.settings = replace(body.settings, max_substeps=32)
+
+    def allowed(share: float) -> bool:
+        try:
+            small = small_body(adapter=False, E=share * stiff)
+            small.settings = body.settings
+            small.simulate(start(), WORLD, 2, FRAME_DT)
+        except ConfigError:
+            return False
+        return True
+
+    bound = max(share for share in (0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0) if allowed(share))
+    assert 0.1 < bound < 1
+    run(found)
+    assert allowed(values(body)["E"] / stiff) and values(body)["E"] > bound / 2 * stiff
+    assert math.isfinite(found.distance())
 
 
 def test_a_contact_offset_is_found_with_them():
