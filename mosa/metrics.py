@@ -9,12 +9,12 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
+from mosa.assignment import assigned
 from mosa.errors import ConfigError
 
 CHAMFER_SAMPLES, ASSIGNMENT_SAMPLES = 8192, 2048
@@ -121,8 +121,7 @@ def emd(a: Tensor, b: Tensor, *, samples: int = ASSIGNMENT_SAMPLES, seed: int = 
     """`emd_m`: mean distance [m] of the exact assignment between equally many random points of (N, 3) and (M, 3) [m]."""
     count = min(samples, len(a), len(b))
     cost = cdist(subsample(a, count, seed), subsample(b, count, seed + 1))
-    rows, columns = linear_sum_assignment(cost)
-    return float(cost[rows, columns].mean())
+    return float(np.take_along_axis(cost, assigned(cost)[:, None], 1).mean())
 
 
 def resample_shape(cloud: Tensor, count: int, seed: int) -> Tensor:
