@@ -111,6 +111,7 @@ class Twin:
         variant: str = "adapted",
         progress: bool = False,
         colliders: Sequence[Collider | Mapping] | None = None,
+        box: Sequence[Sequence[float]] | Tensor | None = None,
     ) -> Rollout:
         """Roll the learned law out from a new start.
 
@@ -118,14 +119,15 @@ class Twin:
         of the body's centre, None for a number that is left as it is; height [m] of the lowest point above the ground, in place
         of the position along `up`; velocity [m/s]; angular_velocity [rad/s]; what is left out is taken from the training
         sequence. colliders: rigid solids instead of the world's, or entries as a configuration has them; `reactions` of the result
-        holds the forces on them. No gradients: `reset(differentiable=True)` and `step` have them, and a tensor that requires them
-        is refused. Errors: ConfigError naming the argument (also a solid that the body starts in), SimulationDiverged (the body
-        leaves the box of the scene).
+        holds the forces on them. box: (2, 3) [m] the lower and the upper corner of what no particle may leave, None for the
+        scene's; walls of the world stay where they are. No gradients: `reset(differentiable=True)` and `step` have them, and a
+        tensor that requires them is refused. Errors: ConfigError naming the argument (also a solid that the body starts in),
+        SimulationDiverged (the body leaves the box).
         """
         check_frames(frames, len(self.body.rest))
         check_variant(variant)
         given = {"rotation": rotation, "height": height, "position": position, "velocity": velocity,
-                 "angular_velocity": angular_velocity, "colliders": colliders}  # fmt: skip
+                 "angular_velocity": angular_velocity, "colliders": colliders, "box": box}  # fmt: skip
         check_wants_no_gradients(**given)
         with torch.no_grad(), tqdm(total=frames - 1, desc="simulate", unit="frame", disable=not progress) as bar:
             start, world = start_in(self.body, self.world, self.training_start, **given)
@@ -146,11 +148,12 @@ class Twin:
         substeps: int | None = None,
         frames: int = 30,
         differentiable: bool = False,
+        box: Sequence[Sequence[float]] | Tensor | None = None,
     ) -> TwinState:
         """Begin a motion that `step` goes on with; returns its state at time 0.
 
-        rotation, height, position, velocity, angular_velocity, colliders, variant: as `simulate`. control_dt [s]: of a step, the
-        `frame_dt` of the training by default; substeps: of every step, None for as many as the time step bound asks for in a
+        rotation, height, position, velocity, angular_velocity, colliders, variant, box: as `simulate`. control_dt [s]: of a step,
+        the `frame_dt` of the training by default; substeps: of every step, None for as many as the time step bound asks for in a
         motion of `frames` steps, `simulate(frames=...)`'s. differentiable: whether gradients reach tensors among these arguments
         (a rotation as a matrix), the actions, and the law's parameters; it keeps states between the passes. Without it tensors that
         require gradients are refused. Errors: ConfigError.
@@ -159,7 +162,7 @@ class Twin:
         check_variant(variant)
         check_differentiable(differentiable)
         given = {"rotation": rotation, "height": height, "position": position, "velocity": velocity,
-                 "angular_velocity": angular_velocity, "colliders": colliders}  # fmt: skip
+                 "angular_velocity": angular_velocity, "colliders": colliders, "box": box}  # fmt: skip
         if not differentiable:
             check_wants_no_gradients(**given)
         start, world = start_in(self.body, self.world, self.training_start, **given)

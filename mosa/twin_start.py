@@ -135,11 +135,20 @@ def vector(name: str, value: Sequence[float]) -> Tensor:
     return result
 
 
+def box_around(value: Sequence[Sequence[float]] | Tensor) -> Tensor:
+    """(2, 3) [m] the corners of a box. Errors: ConfigError."""
+    expected = f"[low, high] corners, (2, 3) finite numbers within {FASTEST:g} [m] with low below high on every axis"
+    result = numbers("box", value, expected).detach()
+    if result.shape != (2, 3) or float(result.abs().max()) > FASTEST or not bool((result[0] < result[1]).all()):
+        raise ConfigError(f"box: expected {expected}, found {str(value)[:120]}")
+    return result
+
+
 def start_in(
     body: Body, world: World, first: Start, *, rotation=None, height=None, position=None, velocity=None, angular_velocity=None,
-    colliders=None,
+    colliders=None, box=None,
 ) -> tuple[Start, World]:  # fmt: skip
-    """(the start, the world with its colliders) of arguments as `Twin.simulate` takes them, None for those of `first`.
+    """(the start, the world with its colliders and box) of arguments as `Twin.simulate` takes them, None for those of `first`.
 
     Errors: ConfigError naming the argument."""
     Q = first.rotation if rotation is None else rotation_matrix(rotation)
@@ -159,6 +168,13 @@ def start_in(
     start = Start(Q, center, velocity_.to(body.rest), spin.to(body.rest))
     if colliders is not None:
         world = replace(world, colliders=colliders_from_config(colliders, "colliders"))
+    if box is not None:
+        world = replace(world, box=box_around(box).to(world.box))
+        x, (low, high) = (center + arms).detach(), world.box.to(arms)
+        outside = float(((x < low) | (x > high)).any(1).double().mean())
+        if outside > 0:
+            raise ConfigError(f"box: expected one that the body starts in, found {outside:.0%} of it outside of "
+                              f"{world.box.tolist()} m; its centre is at {[round(c, 4) for c in center.tolist()]} m")
     check_clear(world.colliders, center + arms, "the body", "world.colliders" if colliders is None else "colliders")
     if world.ground is not None:
         below = float((((center + arms) @ up).detach() < world.ground.height).double().mean())

@@ -38,11 +38,13 @@ class TwinWorlds:
         self.body, self.world, self.frame_dt, self.training_start = body, world, frame_dt, training_start
         self.count, self.laws = count, laws
         self.episode: Episode | None = None
+        self._box: Sequence[Sequence[float]] | Tensor | None = None
 
     def reset(
         self, starts: Mapping | Sequence[Mapping] | None = None, *, colliders: Sequence[Collider | Mapping] | None = None,
         gravity: Tensor | Sequence | None = None, variant: str = "adapted", control_dt: float | None = None,
         substeps: int | None = None, frames: int = 30, differentiable: bool = False,
+        box: Sequence[Sequence[float]] | Tensor | None = None,
     ) -> TwinState:  # fmt: skip
         """Begin a motion in every world; returns the state (count, ...).
 
@@ -53,12 +55,13 @@ class TwinWorlds:
         check_variant(variant)
         check_differentiable(differentiable)
         if not differentiable:
-            check_wants_no_gradients(starts=starts, colliders=colliders, gravity=gravity)
-        found = self._found(starts, range(self.count), colliders)
+            check_wants_no_gradients(starts=starts, colliders=colliders, gravity=gravity, box=box)
+        found = self._found(starts, range(self.count), colliders, box)
         if gravity is not None:
             gravity = numbers("gravity", gravity, f"finite numbers ({self.count}, 3)")
             if gravity.shape != (self.count, 3):
                 raise ConfigError(f"gravity: expected shape ({self.count}, 3), found {tuple(gravity.shape)}")
+        self._box = box
         self.episode = Episode(
             self.body, found[0][1], checked_dt(control_dt, self.frame_dt), [start for start, _ in found],
             variant=variant, frames=frames, substeps=checked_substeps(substeps), laws=self.laws, gravity=gravity,
@@ -73,10 +76,12 @@ class TwinWorlds:
         if not isinstance(which, (list, tuple, range)):
             raise ConfigError(f"restart: expected a list of numbers of worlds, found {str(which)[:80]}")
         which, episode = list(which), self._going()
-        given = None if starts is None else [start for start, _ in self._found(starts, which, episode.colliders)]
+        given = None if starts is None else [start for start, _ in self._found(starts, which, episode.colliders, self._box)]
         return episode.restart(which, given)
 
-    def _found(self, starts: Mapping | Sequence[Mapping] | None, which: Sequence[int], colliders) -> list[tuple[Start, World]]:
+    def _found(
+        self, starts: Mapping | Sequence[Mapping] | None, which: Sequence[int], colliders, box
+    ) -> list[tuple[Start, World]]:
         """The starts of these worlds, and the world. Errors: ConfigError."""
         listed = isinstance(starts, (list, tuple)) and all(isinstance(start, Mapping) for start in starts)
         if starts is not None and not isinstance(starts, Mapping) and not listed:
@@ -92,7 +97,7 @@ class TwinWorlds:
                 found.append(found[0])
                 continue
             try:
-                found.append(start_in(self.body, self.world, self.training_start, colliders=colliders, **given))
+                found.append(start_in(self.body, self.world, self.training_start, colliders=colliders, box=box, **given))
             except ConfigError as error:
                 raise ConfigError(f"starts[{b}]: {error}") from error
         return found

@@ -193,6 +193,13 @@ class ParticleState:
     F_tot: Tensor
 
     @classmethod
+    def at_rest(cls, x: Tensor) -> ParticleState:
+        """Undeformed particles at x (N, 3) or (B, N, 3) [m] that do not move."""
+        still = torch.zeros_like(x)
+        F = torch.eye(3).to(x).expand(*x.shape, 3).contiguous()
+        return cls(x, still, torch.zeros_like(F), F, F)
+
+    @classmethod
     def stack(cls, states: Sequence[ParticleState]) -> ParticleState:
         """The states of equally many particles each, as those of B worlds."""
         return cls(*(torch.stack([getattr(state, f.name) for state in states]) for f in fields(cls)))

@@ -98,8 +98,9 @@ class Posterior:
         rivals = {name: numbers.double() for name, numbers in written.get("rivals", {}).items()}
         return cls(list(written["names"]), *tensors, float(written["model_error"]), rivals)
 
-    def draws(self, count: int, generator: torch.Generator) -> Tensor:
-        """(count, D) float64."""
+    def draws(self, count: int, generator: torch.Generator | None = None) -> Tensor:
+        """(count, D) float64. generator: of the random numbers; None: one with seed 0, so that the same draws come every time."""
+        generator = torch.Generator().manual_seed(0) if generator is None else generator
         L = torch.linalg.cholesky(self.covariance)
         return self.mean + torch.randn(count, len(self.mean), generator=generator, dtype=torch.float64) @ L.T
 

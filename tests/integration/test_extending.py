@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from mosa.data.scene import load_scene
 
@@ -103,6 +104,20 @@ def test_a_checkpoint_needs_the_package_and_does_not_import_it(run):
     flag, *numbers = found.split()
     figures = json.loads((run / "run" / "metrics.json").read_text())
     assert flag == "True" and [float(n) for n in numbers] == pytest.approx([figures[f"id/fibre_{a}"] for a in "xyz"], abs=1e-6)
+
+
+def test_the_simulator_alone():
+    section = (ROOT / "docs" / "extending.md").read_text().partition("## The simulator alone")[2]
+    (block,) = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
+    names = {}
+    exec(block, names)
+    rollout = names["rollout"]
+    assert rollout.x.shape == (26, 13**3, 3) and len(block.strip().splitlines()) <= 12
+    height = rollout.x[:, :, 1].mean(1)
+    fall = 0.165 - 0.5 * 9.8 * rollout.times[:7].square()
+    torch.testing.assert_close(height[:7], fall, rtol=0, atol=1.5e-3)  # half a substep of gravity early, 0.3 mm in 0.12 s
+    low = int(height.argmin())
+    assert 6 < low < 25 and rollout.x[:, :, 1].min() > -names["dx"] / 2 and height[low:].max() > 1.5 * height[low]
 
 
 BASELINE = """

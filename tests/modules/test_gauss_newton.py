@@ -295,6 +295,7 @@ def test_draws_have_the_moments_of_the_posterior():
     assert ((torch.cov(found.T) - C).abs() < allowed).all()
     assert (C - torch.diag(C.diagonal())).abs().max() > 0.05 * C.diagonal().min()
     assert torch.equal(found, posterior.draws(n, torch.Generator().manual_seed(1)))
+    assert torch.equal(posterior.draws(3), posterior.draws(3, torch.Generator().manual_seed(0)))  # without a generator
 
 
 def test_a_model_that_moves_alike_is_transferred_to_in_one_step():

@@ -1,12 +1,27 @@
 """Colliders from plain containers, and what is wrong with them."""
 
 import math
+import re
+from pathlib import Path
 
 import pytest
 import torch
 
 from mosa.errors import ConfigError
-from mosa.physics.contact.colliders import Collider, Sphere, colliders_from_config, pack_colliders, reach
+from mosa.physics.contact.colliders import (
+    Box,
+    Capsule,
+    Collider,
+    Cylinder,
+    HalfSpace,
+    Sphere,
+    colliders_from_config,
+    differentiable_thickness,
+    pack_colliders,
+    reach,
+    thickness_on,
+)
+from mosa.physics.contact.keys import KEYS
 from mosa.physics.contact.motion import Motion
 from mosa.physics.contact.reference import signed_distance
 from mosa.physics.engine.simulator import Simulator
@@ -41,6 +56,36 @@ def test_every_type(tmp_path):
     torch.testing.assert_close(R[2] @ R[2], torch.diag(torch.tensor([1.0, -1.0, -1.0])).double(), rtol=0, atol=1e-12)
     centre = torch.ones(1, 3).double()
     assert float(signed_distance(mesh.shape, centre)) == pytest.approx(-1.0, abs=0.06)
+    # a quarter of a cell; inside of what may let go: 1.8 cells less the half width, over 0.6, and where there are edges 1.4 cells
+    thin, slab, beam = (0.18 - 0.05) / 0.6, Box((0.1, 1.0, 1.0)), Capsule(0.05, 0.4)
+    for shape, mode, least in ((HalfSpace(), "separate", 0.025), (Sphere(0.02), "slip", 0.025), (slab, "sticky", 0.025),
+                               (slab, "slip", thin), (slab, "separate", thin), (box.shape, "slip", 0.14), (beam, "slip", thin),
+                               (Capsule(0.2, 0.4), "slip", 0.025), (Cylinder(0.3, 0.1), "slip", thin), (roll.shape, "slip", 0.14),
+                               (mesh.shape, "sticky", 0.025), (mesh.shape, "slip", 0.14)):  # fmt: skip
+        assert differentiable_thickness(Collider(shape, mode), 0.1) == pytest.approx(least)
+    assert differentiable_thickness(Collider(mesh.shape, "slip"), 2.0) == pytest.approx((3.6 - 1.0) / 0.6, rel=0.03)
+    assert (thickness_on(roll, 0.1), thickness_on(box, 0.1)) == (0.02, pytest.approx(0.14))
+    assert thickness_on(Collider(mesh.shape), 1.0) == mesh.shape.margin < 1.4
+
+
+def test_the_page_about_the_twin_lists_every_type_and_key():
+    page = (Path(__file__).parents[2] / "docs" / "twin.md").read_text()
+    section = page.partition("**Colliders** are")[2].partition("**Actions**")[0]
+    rows = dict(re.findall(r"^\| `(\w+)`[^|]*\| (.*?) \|", section, re.MULTILINE))
+    own = {"plane": ["normal"], "sphere": ["radius"], "capsule": ["radius", "length"], "cylinder": ["radius", "length"],
+           "box": ["size"], "mesh": ["path", "scale", "spacing", "margin"]}  # fmt: skip
+    needed = {"radius": 0.1, "length": 0.2, "size": [1, 1, 1]}
+    for kind, keys in own.items():
+        assert {key for key in KEYS if f"`{key}`" in rows[kind]} - {"rotation"} == set(keys)
+        if kind != "mesh":
+            given = {"type": kind, **{key: needed[key] for key in keys if key in needed}}
+            assert colliders_from_config([given])[0].mode == "sticky"  # needs no other key
+    common = set(KEYS) - {key for keys in own.values() for key in keys}
+    assert common == set(rows) - set(own) - {"type"} and "| 1.4 cells, of a mesh at most its `margin` |" in section
+    turned, facing = colliders_from_config([{"type": "plane", "rotation": [1, 0, 0, -90]}, {"type": "plane", "normal": [0, 1, 0]}])
+    poses = [collider.motion.sample(1, 1, 0.1)[1][0] for collider in (turned, facing)]
+    torch.testing.assert_close(*poses, rtol=0, atol=1e-15)
+    assert turned.shape == HalfSpace()
 
 
 @pytest.mark.parametrize(

@@ -49,6 +49,15 @@ LAWS = {"corotated": ({"lam": 5e4}, None), "von_mises": ({"lam": 5e4, "yield_str
         "neo_hookean": ({"lam": 5e4}, 0.1)}  # fmt: skip
 
 
+def test_particles_at_rest():
+    x = torch.rand(2, 5, 3, dtype=torch.float64)
+    one, both = ParticleState.at_rest(x[0]), ParticleState.at_rest(x)
+    assert both.x is x and both.F is both.F_tot and both.F.is_contiguous()
+    assert torch.equal(both.F, torch.eye(3).double().expand(2, 5, 3, 3)) and not both.v.any() and not both.C_affine.any()
+    for part, whole in zip(one.__dict__.values(), both.worlds()[0].__dict__.values(), strict=True):
+        assert torch.equal(part, whole) and part.dtype == torch.float64
+
+
 def alone(world, start, law, order=slice(None)):
     """(rollout, gradients of velocities, mu and first collider's velocity) of one world by itself. order: of the particles, which
     `start` has already."""

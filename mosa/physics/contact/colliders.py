@@ -58,6 +58,11 @@ class Box:
     size: tuple[float, float, float]
 
 
+SMOOTH = 0.25
+"""Cells: a contact that fades in over them joins a node smoothly enough for a gradient; over none it does so by a jump."""
+DEEP, KEPT = 1.8, 0.6
+"""Cells from particles that a solid keeps off, by the share `KEPT` of its thickness, to its middle, from which on nodes there no
+longer matter (a particle's weights reach 1.5 cells): measured with plates of 0.5 to 5 cells, docs/twin.md, Gradients."""
 Shape = HalfSpace | Sphere | Capsule | Cylinder | Box | SignedDistanceField
 KINDS = {HalfSpace: packing.HALF_SPACE, Sphere: packing.SPHERE, Capsule: packing.CAPSULE, Cylinder: packing.CYLINDER,
          Box: packing.BOX, SignedDistanceField: packing.FIELD}  # fmt: skip
@@ -98,6 +103,39 @@ class PackedColliders(NamedTuple):
         return len(self.codes)
 
 
+def thickness_on(collider: Collider, dx: float) -> float:
+    """[m] of its contact on a grid of spacing dx [m]: its own, or the one of a collider without any."""
+    if collider.thickness is not None:
+        return collider.thickness
+    usual = THICKNESS * dx
+    return min(usual, collider.shape.margin) if isinstance(collider.shape, SignedDistanceField) else usual
+
+
+def differentiable_thickness(collider: Collider, dx: float) -> float:
+    """[m], on a grid of spacing dx [m]: from which on the gradient in the collider's pose and velocity is what differences of a
+    per cent find, to a few per cent of it (docs/twin.md, Gradients).
+
+    Where it is thinner, nodes change their velocity by a jump as the solid passes over them, which no derivative sees: at the
+    surface where nothing fades in; and inside of the solid where the nearest face becomes another one, in modes that act along
+    its normal alone. Those nodes matter as long as they carry mass of particles outside: behind the middle of a thin solid, and
+    next to the edges of boxes, cylinders and meshes. Half spaces have none inside, and spheres a single point.
+    """
+    shape, least = collider.shape, SMOOTH * dx
+    if collider.mode == "sticky" or isinstance(shape, HalfSpace | Sphere):
+        return least
+    least = max(least, (DEEP * dx - half_width(shape)) / KEPT)
+    return least if isinstance(shape, Capsule) else max(least, THICKNESS * dx)
+
+
+def half_width(shape: Shape) -> float:
+    """Distance [m] from the surface to the deepest point inside; infinite for a half space."""
+    if isinstance(shape, SignedDistanceField):
+        return max(0.0, -float(shape.values.min()))
+    if isinstance(shape, Capsule):
+        return shape.radius
+    return min(_sizes(shape), default=math.inf)
+
+
 def pack_colliders(colliders: Sequence[Collider], dtype: torch.dtype, device: torch.device, dx: float) -> PackedColliders:
     """dx [m]: of the grid. Errors: ConfigError naming the collider and the field."""
     shapes = torch.zeros(len(colliders), packing.SHAPE_COLUMNS, dtype=torch.float64)
@@ -109,8 +147,7 @@ def pack_colliders(colliders: Sequence[Collider], dtype: torch.dtype, device: to
             raise ConfigError(f"{where}: shape: expected one of {', '.join(k.__name__ for k in KINDS)}, found {shape!r}")
         if collider.mode not in NODE_MODES:
             raise ConfigError(f"{where}: mode: expected one of {', '.join(NODE_MODES)}, found {collider.mode!r}")
-        given = collider.thickness
-        thickness = THICKNESS * dx if given is None else given
+        given, thickness = collider.thickness, thickness_on(collider, dx)
         for name, value in (("friction", collider.friction), ("thickness", thickness)):
             if isinstance(value, bool) or not 0 <= value < math.inf:
                 raise ConfigError(f"{where}: {name}: expected a finite number >= 0, found {value}")
@@ -123,9 +160,7 @@ def pack_colliders(colliders: Sequence[Collider], dtype: torch.dtype, device: to
         shapes[i, packing.THICKNESS], shapes[i, packing.FRICTION] = thickness, collider.friction
         codes[i, packing.KIND], codes[i, packing.MODE] = KINDS[type(shape)], NODE_MODES[collider.mode]
         if isinstance(shape, SignedDistanceField):
-            if given is None:
-                shapes[i, packing.THICKNESS] = min(thickness, shape.margin)
-            elif shape.margin < thickness:
+            if given is not None and shape.margin < thickness:
                 raise ConfigError(
                     f"{where}: thickness: the field of the mesh reaches {shape.margin:.3g} m beyond it, less than {thickness}: "
                     "make it with a larger margin"

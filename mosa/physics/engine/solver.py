@@ -201,7 +201,10 @@ class SegmentSolver:
             INVERTED: "det F <= 0, which "
             + (f"law {law.name} has no value for" if law.needs_positive_J else "on_inversion=error forbids"),
         }[event]
+        remedy = "use more substeps, or parameters nearer to the calibrated ones"
+        if event == OUTSIDE:
+            remedy = ("use a larger box (scene.box of a run, box= of a twin), or another start: a velocity that is not given is "
+                      "the training's")
         return SimulationDiverged(
-            f"{self._named(world)}substep {substep}, particle {particle}: {what} (dt {dt:.3g} s, dx {numerics.dx:.3g} m); "
-            "use more substeps, a larger box, or parameters nearer to the calibrated ones"
+            f"{self._named(world)}substep {substep}, particle {particle}: {what} (dt {dt:.3g} s, dx {numerics.dx:.3g} m); {remedy}"
         )
