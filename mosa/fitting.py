@@ -45,7 +45,7 @@ def fit(cfg, module: LitMosa, data: MultiViewDataModule, folder: Path, device: s
         check_same(stored, module, cfg.ckpt_path)
         checked_posterior(stored, len(read_numbers(module.body)), cfg.ckpt_path)
     settings = plain(cfg.logger)
-    logger = build_loggers(settings, folder)
+    logger = build_loggers(settings, folder, module.body.material.law)
     callbacks = [KeepLast(folder / "checkpoints"), FitProgress(), StageNotes(), *([Pace()] if logger else [])]
     if logger and settings.get("images_every"):
         callbacks.append(ImageStrips(settings["images_every"]))

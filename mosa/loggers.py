@@ -9,8 +9,12 @@ from typing import Any
 
 import numpy as np
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, WandbLogger
+from lightning.pytorch.utilities import rank_zero_only
+from tensorboard.compat.proto.summary_pb2 import DATA_CLASS_SCALAR
 from torch import Tensor
+from torch.utils.tensorboard.summary import scalar
 
+from mosa.curves import described
 from mosa.errors import ConfigError
 
 KINDS = ("tensorboard", "csv", "wandb")
@@ -33,14 +37,40 @@ def chosen(settings: Mapping[str, Any] | None) -> list[str]:
     return kinds
 
 
-def build_loggers(settings: Mapping[str, Any] | None, folder: Path) -> list[Logger]:
-    """Loggers that write into the run folder. settings: conf/logger. Errors: ConfigError (`chosen`)."""
-    build = {"tensorboard": tensorboard, "csv": csv_table, "wandb": lambda folder: wandb_run(settings["wandb"], folder)}
+def build_loggers(settings: Mapping[str, Any] | None, folder: Path, law: str) -> list[Logger]:
+    """Loggers that write into the run folder. settings: conf/logger; law: of the prior, for the units of its parameters.
+    Errors: ConfigError (`chosen`)."""
+    build = {"tensorboard": lambda folder: tensorboard(folder, law), "csv": csv_table,
+             "wandb": lambda folder: wandb_run(settings["wandb"], folder)}  # fmt: skip
     return [build[kind](folder) for kind in chosen(settings)]
 
 
-def tensorboard(folder: Path) -> TensorBoardLogger:
-    return TensorBoardLogger(folder, name="tensorboard", version="", default_hp_metric=False)
+class DescribingLogger(TensorBoardLogger):
+    """TensorBoard's logger whose scalars carry descriptions (`mosa.curves`), which TensorBoard shows beside their titles."""
+
+    def __init__(self, folder: Path, law: str) -> None:
+        super().__init__(folder, name="tensorboard", version="", default_hp_metric=False)
+        self.law = law
+        self.written: set[str] = set()
+
+    @rank_zero_only
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """TensorBoard takes a description from the first point of a file, where torch's writer has no place for one."""
+        rest = dict(metrics)
+        for tag in [tag for tag in metrics if tag not in self.written]:
+            self.written.add(tag)
+            if (text := described(tag, self.law)) is not None:
+                point = scalar(tag, float(rest.pop(tag)))
+                about = point.value[0].metadata
+                about.summary_description, about.plugin_data.plugin_name = text, "scalars"
+                # without its class TensorBoard's fast reader takes the point for one of old programs and drops what is beside it
+                about.data_class = DATA_CLASS_SCALAR
+                self.experiment._get_file_writer().add_summary(point, step)
+        super().log_metrics(rest, step)
+
+
+def tensorboard(folder: Path, law: str) -> TensorBoardLogger:
+    return DescribingLogger(folder, law)
 
 
 def csv_table(folder: Path) -> CSVLogger:
@@ -62,14 +92,17 @@ def add_picture(loggers: list[Logger], name: str, picture: Tensor, step: int) ->
             logger.log_image(name, [np.asarray(picture.movedim(0, -1))], step=step)
 
 
-def log_outcome(settings: Mapping[str, Any] | None, folder: Path, cfg: dict, figures: Mapping[str, float | str]) -> None:
+def log_outcome(
+    settings: Mapping[str, Any] | None, folder: Path, cfg: dict, figures: Mapping[str, float | str], law: str
+) -> None:
     """The run's configuration beside its final figures, as `final/...`: TensorBoard's table of hyper-parameters, the summary of
-    wandb's run, which ends here. A table of steps has no place for them; metrics.json has them all."""
+    wandb's run, which ends here. A table of steps has no place for them; metrics.json has them all. law: of
+    the prior."""
     final = {f"final/{k}": v for k, v in figures.items() if k in OUTCOME or k.startswith(("id/", "id_prior/"))}
     parameters = {k: v for k, v in cfg.items() if k not in ("evaluation", "logger", "hydra")}
     kinds = chosen(settings)
     if "tensorboard" in kinds:
-        logger = tensorboard(folder)
+        logger = tensorboard(folder, law)
         (Path(logger.log_dir) / "hparams.yaml").unlink(missing_ok=True)  # the fit's logger left an empty one, which would be kept
         logger.log_hyperparams(parameters, final)
         logger.finalize("success")

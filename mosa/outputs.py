@@ -8,7 +8,14 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from mosa.analysis.comparison import TITLES, compare, write_comparisons
-from mosa.analysis.tables import continued_text, determined_text, geometry_lines, parameter_table, results_table
+from mosa.analysis.tables import (
+    columns_text,
+    continued_text,
+    determined_text,
+    geometry_lines,
+    parameter_table,
+    results_table,
+)
 from mosa.data.builtin.true_geometry import geometry_figures
 from mosa.data.splats import save_ply
 from mosa.evaluation import (
@@ -87,8 +94,9 @@ def write_outputs(
         shown = [s for s in evaluated if s.prefix.startswith("test") and TITLES.keys() & kept[s.prefix].keys()]
         shown = shown or evaluated[:1]
         write_comparisons(folder, {s.prefix: compare(body, s, kept[s.prefix]) for s in shown})
-    parts = (results_table(figures), parameter_table(figures), continued_text(figures), determined_text(figures),
-             geometry_lines(figures))  # fmt: skip
+    law = body.material.law
+    parts = (results_table(figures), columns_text(figures, evaluated[0].scene.name), parameter_table(figures, law),
+             continued_text(figures, law), determined_text(figures, law), geometry_lines(figures))  # fmt: skip
     table = "\n\n".join(filter(None, parts))
     with written_whole(folder / "results.md") as partial:
         partial.write_text(table + "\n")

@@ -147,7 +147,7 @@ def train(cfg: DictConfig) -> float | None:
             figures |= extrapolated(cfg, run, scene.known_parameters)
     figures |= clock.figures | cost(device) | {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
     figures["geometry/cells_across"] = resolved.cells
-    log_outcome(plain(cfg.logger), folder, plain(cfg), figures)
+    log_outcome(plain(cfg.logger), folder, plain(cfg), figures, body.material.law)
     write_outputs(folder, cfg, body, evaluated, figures, kept, world)
     return optimized(figures, cfg.optimized_metric)
 

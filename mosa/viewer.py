@@ -186,6 +186,9 @@ def options(arguments: Sequence[str]) -> dict[str, str | None]:
         key, mark, value = argument.partition("=")
         if key not in known and known["run"] is None and Path(argument).exists():
             key, mark, value = "run", "=", argument
+        if not mark and not argument.startswith("-") and key not in known and known["run"] is None:
+            raise ConfigError(f"run: expected the folder of a run, found no file or folder {argument!r}; the options are written "
+                              "key=value, and python -m mosa.viewer --help lists them")
         if not mark or key not in known:
             raise ConfigError("viewer: expected run=<folder>, --live, checkpoint=<file>, host=<address>, port=<number>, "
                               f"device=<name>, found {argument!r}")

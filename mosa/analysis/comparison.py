@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mosa.analysis.figures import side_by_side, to_uint8, write_strip, write_video
+from mosa.analysis.figures import FONT, fitted, side_by_side, text_width, to_uint8, write_strip, write_video
 from mosa.evaluation import Sequence, true_motion
 from mosa.modules.body import Body
 from mosa.modules.carried_splats import seen
@@ -154,11 +154,11 @@ def legend(shown: Comparison) -> np.ndarray:
     bar = to_uint8(paint(torch.linspace(0, 1, int(0.8 * width)), shown.colors)[None].expand(max(8, height // 20), -1, -1))
     top, left = height // 2, int(0.1 * width)
     picture[top : top + bar.shape[0], left : left + bar.shape[1]] = bar
-    write = lambda text, x, y: cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (30, 30, 30), 1, cv2.LINE_AA)  # noqa: E731
-    write(shown.label, left, top - 10)
+    text, scale = fitted(shown.label, width - left, 0.42)
+    write = lambda text, x, y: cv2.putText(picture, text, (x, y), FONT, scale, (30, 30, 30), 1, cv2.LINE_AA)  # noqa: E731
+    write(text, left, top - 10)
     write("0", left, top + bar.shape[0] + 18)
-    (extent, _), _ = cv2.getTextSize(shown.high, cv2.FONT_HERSHEY_SIMPLEX, 0.42, 1)
-    write(shown.high, left + bar.shape[1] - extent, top + bar.shape[0] + 18)
+    write(shown.high, left + bar.shape[1] - text_width(shown.high, scale), top + bar.shape[0] + 18)
     return picture
 
 

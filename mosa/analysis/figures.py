@@ -31,12 +31,32 @@ def to_uint8(image: Tensor | np.ndarray) -> np.ndarray:
     return image if isinstance(image, np.ndarray) else (image.clamp(0, 1).numpy() * 255 + 0.5).astype(np.uint8)
 
 
+FONT, SIZE, SMALLEST, LEFT = cv2.FONT_HERSHEY_SIMPLEX, 0.48, 0.3, 6
+"""Of captions: the letters, their usual and their smallest scale, and the pixels left of them."""
+
+
+def text_width(text: str, scale: float) -> int:
+    """[px] of a caption."""
+    return cv2.getTextSize(text, FONT, scale, 1)[0][0]
+
+
+def fitted(text: str, room: int, usual: float = SIZE) -> tuple[str, float]:
+    """A caption and its scale, of at most `room` [px]: smaller than `usual` where that suffices, else cut with dots at the end."""
+    scale = min(usual, max(SMALLEST, usual * room / max(1, text_width(text, usual))))
+    kept = text
+    while kept and text_width(text, scale) > room:
+        kept = kept[:-1]
+        text = kept.rstrip() + "..."
+    return text, scale
+
+
 def bar(width: int, texts: list[str], height: int = 26) -> np.ndarray:
-    """A caption bar, with the texts at equal distances."""
+    """A caption bar, with the texts at equal distances, each within its share of the width."""
     picture = np.full((height, width, 3), 245, np.uint8)
     for k, text in enumerate(texts):
-        place = (6 + k * width // len(texts), height - 8)
-        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.48, (30, 30, 30), 1, cv2.LINE_AA)
+        shown, scale = fitted(text, width // len(texts) - 2 * LEFT)
+        place = (LEFT + k * width // len(texts), height - 8)
+        cv2.putText(picture, shown, place, FONT, scale, (30, 30, 30), 1, cv2.LINE_AA)
     return picture
 
 

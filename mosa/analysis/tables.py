@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from mosa.metrics import IMAGE_METRICS, MOTION_METRICS
 from mosa.modules.ground_choice import EXPLAINED, NEARER, alike, contact, learned_on, taken_of
+from mosa.modules.material import unit_of
 from mosa.types import RUBBING
 
 MODELS = (("floor", "floor/"), ("prior", "prior/"), ("prior + eta", "prior_eta/"), ("adapted", ""))
@@ -30,6 +32,18 @@ def results_table(figures: Mapping[str, float], metrics=("rms_m", "cd_m", "psnr_
     return markdown(["figure", "model", *sequences], rows)
 
 
+def columns_text(figures: Mapping[str, float], recording: str) -> str:
+    """What the columns of `results_table` are, in a sentence; empty where nothing of the training sequence was measured. recording:
+    name of the scene that is learned from first, which no column has."""
+    columns = _sequences(figures)
+    if "train" not in columns:
+        return ""
+    parts = [f"`train` is the recording {recording}"]
+    parts += ["`train/...` the others that were learned from"] * any(column.startswith("train/") for column in columns)
+    parts += ["`test/...` those held out, `test` their mean"] * any(column.startswith("test/") for column in columns)
+    return f"Columns: {', '.join(parts)}."
+
+
 def _sequences(figures: Mapping[str, float]) -> list[str]:
     names = {key.rsplit("/", 1)[0] for key in figures if key.endswith("/psnr_crop")}
     plain = {n for n in names if n.split("/")[0] in ("train", "frames", "camera") and n.count("/") == 0}
@@ -37,22 +51,44 @@ def _sequences(figures: Mapping[str, float]) -> list[str]:
     return sorted(plain, key=("train", "frames", "camera").index) + others[0] + others[1]
 
 
-def parameter_table(figures: Mapping[str, float]) -> str:
+def parameter_table(figures: Mapping[str, float], law: str) -> str:
     """Markdown table of identified parameters: after calibration, after the joint stage, each with its relative error where the
-    truth is known."""
+    truth is known. law: of the prior, which says what they are measured in."""
     names = [k.split("/", 1)[1] for k in figures
              if k.startswith("id_prior/") and k.count("/") == 1 and not k.endswith(("_relative_error", "_ratio"))]
     stages = ("id_prior", "id")
-    rows = [[n, *(f"{figures.get(f'{stage}/{n}', float('nan')):.5g}" for stage in stages),
+    rows = [[with_unit(law, n), *(f"{figures.get(f'{stage}/{n}', float('nan')):.5g}" for stage in stages),
              *(f"{figures[key]:.1%}" if (key := f"{stage}/{n}_relative_error") in figures else "" for stage in stages)]
             for n in names]  # fmt: skip
     return markdown(["parameter", "prior", "joint", "error of prior", "error of joint"], rows)
+
+
+def with_unit(law: str, name: str) -> str:
+    """A parameter as a row names it: `E [Pa]`, and bare where it has no unit."""
+    unit = unit_of(law, name)
+    return f"{name} [{unit}]" if unit else name
 
 
 SURE_DEGREES = 30.0
 """Half angle of a direction's 95 % cone above which it counts as not determined."""
 NOTICEABLE = 1.1
 """Ratio of the largest to the smallest Young's modulus below which a law counts as isotropic."""
+
+
+LISTED = 3
+"""So many contacts the sentence lists; more are in a table."""
+
+
+def ground_table(distances: Mapping[str, float], gains: Mapping[str, float]) -> str:
+    """Markdown table of all contacts that were compared, the nearest first; empty where the sentence lists them. distances [m],
+    gains: as in `ground_text`."""
+    if len(distances) <= LISTED:
+        return ""
+    header = ["a body that ...", "calibrated law: distance [mm]", "learned law: gain in log likelihood"]
+    rows = [[_words(name), f"{1e3 * distances[name]:.2f}" if name in distances else "",
+             f"{gains[name]:+.1f}" if name in gains else ""]
+            for name in sorted({**distances, **gains}, key=lambda name: distances.get(name, math.inf))]  # fmt: skip
+    return markdown(header, rows) if gains else markdown(header[:2], [row[:2] for row in rows])
 
 
 def ground_text(distances: Mapping[str, float], gains: Mapping[str, float] | None = None) -> str:
@@ -63,7 +99,8 @@ def ground_text(distances: Mapping[str, float], gains: Mapping[str, float] | Non
     if touches != "sticky" and (taken == "sticky" or not gains):  # only the isotropic law was asked for its friction
         said.append(_guessed(distances, contact(touches)[0]))
     listed = ", ".join(f"{_words(name)} {distances[name] * 1e3:.2f} mm" for name in sorted(distances, key=distances.get))
-    first = f"Ground: the body {_words(touches)} (mean distance from the training motion after calibration: {listed})."
+    where = f": {listed}" if len(distances) <= LISTED else " in the table below"
+    first = f"Ground: the body {_words(touches)} (mean distance from the training motion after calibration{where})."
     if len(distances) > 1 and NEARER * max(distances.values()) <= min(distances.values()):
         first += " All of them are within a tenth: this film hardly shows how the body slides."
     return " ".join([first, *said])
@@ -92,8 +129,9 @@ def _guessed(distances: Mapping[str, float], mode: str) -> str:
             f"{near}, and is wrong itself.")
 
 
-def determined_text(figures: Mapping[str, float]) -> str:
-    """What the data determine and what they do not, in sentences; empty where a run kept no posterior."""
+def determined_text(figures: Mapping[str, float], law: str) -> str:
+    """What the data determine and what they do not, in sentences; empty where a run kept no posterior. law: of the prior, which
+    says what its parameters are measured in."""
     compared = {k.removeprefix("id_prior/compared/").removesuffix("_m"): v for k, v in figures.items()
                 if k.startswith("id_prior/compared/")}
     lines = []
@@ -104,14 +142,18 @@ def determined_text(figures: Mapping[str, float]) -> str:
     touched, gains = ({k.removeprefix("id_prior/ground/").removesuffix(end): v for k, v in figures.items()
                        if k.startswith("id_prior/ground/") and k.endswith(end)} for end in ("_m", "_gain"))  # fmt: skip
     if touched:
-        lines += [ground_text(touched, gains), ""]
+        for part in filter(None, (ground_text(touched, gains), ground_table(touched, gains))):
+            lines += [part, ""]
     if "posterior/draws" not in figures:
         return "\n".join(lines[:-1])
     lines += ["What the data determine:", ""]
-    for name, unit in (("E", "Pa"), ("mu", "Pa"), ("kappa", "Pa"), ("yield_stress", "Pa")):
+    for name in ("E", "mu", "kappa", "yield_stress", "viscosity"):
         if f"posterior/{name}_relative_sd" in figures:
-            lines.append(f"- {name} = {figures[f'id/{name}']:.4g} {unit}, with a standard deviation of "
+            lines.append(f"- {name} = {figures[f'id/{name}']:.4g} {unit_of(law, name)}, with a standard deviation of "
                          f"{figures[f'posterior/{name}_relative_sd']:.1%}.")
+    if "posterior/friction_angle_sd" in figures:
+        lines.append(f"- friction angle = {figures['id/friction_angle']:.3g} degrees, with a standard deviation of "
+                     f"{figures['posterior/friction_angle_sd']:.2g}.")
     if "posterior/nu_sd" in figures:
         lines.append(f"- nu = {figures['id/nu']:.3f} with a standard deviation of {figures['posterior/nu_sd']:.3f}.")
     if "posterior/stiffest_cone_deg" in figures:
@@ -137,15 +179,15 @@ def determined_text(figures: Mapping[str, float]) -> str:
     return "\n".join(lines)
 
 
-def continued_text(figures: Mapping[str, float]) -> str:
-    """Sentences for results.md; empty where nothing was extrapolated."""
+def continued_text(figures: Mapping[str, float], law: str) -> str:
+    """Sentences for results.md; empty where nothing was extrapolated. law: of the prior."""
     if "extrapolated/dx_m" not in figures:
         return ""
     fine, coarse = (1e3 * figures[f"extrapolated/{name}"] for name in ("dx_m", "coarse_dx_m"))
     lines = [f"On grids of {fine:.3g} and {coarse:.3g} mm, and continued to 0:", ""]
     for name in (k.removeprefix("extrapolated/").removesuffix("_coarse") for k in figures if k.endswith("_coarse")):
         values = (figures[f"id/{name}"], *(figures[f"extrapolated/{name}{end}"] for end in ("_coarse", "", "_sd")))
-        lines.append("- {}: {:.4g}, {:.4g}, **{:.4g}** +- {:.2g}".format(name, *values))
+        lines.append("- {}: {:.4g}, {:.4g}, **{:.4g}** +- {:.2g}".format(with_unit(law, name), *values))
     return "\n".join(lines)
 
 

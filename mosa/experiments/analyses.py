@@ -146,8 +146,13 @@ def redistribution(body: Body, directions: Tensor) -> Tensor | None:
     return redistribution_response(stress_jacobian(adapter, zero, zero)[0], directions.double())
 
 
+NEARLY = 0.05
+"""What E over its mean is drawn around 1 at least."""
+
+
 def directions(experiment: Experiment, records: Sequence[Record], stem: Path) -> tuple[str, list[Path]]:
-    """w(theta) and E(theta) in the plane of the true fibres (or xy), theta from the fibres; beside the truth where it is known."""
+    """w(theta) and E(theta) in the plane of the true fibres (or xy), theta from the fibres; beside the truth where it is known. The
+    parts of a row share their axis, which shows NEARLY at least, so that what is isotropic is a level line."""
     found = []
     for record, twin in loaded(records):
         scene = twin.config["cfg"]["scene"]
@@ -162,7 +167,7 @@ def directions(experiment: Experiment, records: Sequence[Record], stem: Path) ->
         return "", []
     names = list(dict.fromkeys(record.place[experiment.columns].name for record, *_ in found))
     canvas = Canvas(figsize=(1.5 + 3.4 * len(names), 5.6), layout="constrained")
-    grid, rows, lines = canvas.subplots(2, len(names), squeeze=False), [], []
+    grid, rows, lines = canvas.subplots(2, len(names), squeeze=False, sharey="row"), [], []
     for record, angles, n, w, E, truth in found:
         column = names.index(record.place[experiment.columns].name)
         name = label(experiment, record)
@@ -186,6 +191,8 @@ def directions(experiment: Experiment, records: Sequence[Record], stem: Path) ->
     grid[0, 0].set_ylabel("w")
     for place in grid[0]:
         place.set_ylim(0, max(0.05, *(float(w.max()) for _, _, _, w, _, _ in found if w is not None), 0.05) * 1.05)
+    low, high = grid[1, 0].get_ylim()
+    grid[1, 0].set_ylim(min(low, 1 - NEARLY), max(high, 1 + NEARLY))
     grid[1, 0].set_ylabel("E over its mean")
     grid[1, -1].legend(fontsize=8)
     path = stem.with_name(stem.name + "_directions")

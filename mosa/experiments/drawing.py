@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure as Canvas
 
 from mosa.experiments.collecting import Cell
-from mosa.experiments.specification import Experiment
+from mosa.experiments.specification import Experiment, Figure
 from mosa.whole_files import written_whole
 
 Tables = Mapping[str, Mapping[str, Mapping[str, Cell | None]]]
@@ -34,8 +34,8 @@ def draw(experiment: Experiment, tables: Tables) -> Canvas | None:
     places = canvas.subplots(1, len(experiment.figures), squeeze=False)[0]
     how = {"bars": bars, "lines": lines, "map": heat_map}[experiment.plot]
     for place, figure in zip(places, experiment.figures):
-        how(place, experiment, tables[figure.label], figure.best)
         place.set_title(figure.label, fontsize=10)
+        how(place, experiment, tables[figure.label], figure)
     if experiment.plot != "map":
         handles, labels = places[0].get_legend_handles_labels()
         if len(labels) > 1:
@@ -43,9 +43,9 @@ def draw(experiment: Experiment, tables: Tables) -> Canvas | None:
     return canvas
 
 
-def bars(place, experiment: Experiment, rows: Mapping[str, Mapping[str, Cell | None]], best: str | None) -> None:
+def bars(place, experiment: Experiment, rows: Mapping[str, Mapping[str, Cell | None]], figure: Figure) -> None:
     """A group of bars for each column, a bar for each row. Of figures with no zero of their own (PSNR, SSIM) the axis begins below
-    the least."""
+    the least, and says so; that of SSIM ends at its 1."""
     columns = list(next(iter(rows.values())))
     width, least = 0.8 / len(rows), np.inf
     for i, (row, cells) in enumerate(rows.items()):
@@ -58,12 +58,16 @@ def bars(place, experiment: Experiment, rows: Mapping[str, Mapping[str, Cell | N
         place.bar(at, means, width, yerr=spread if any(spread) else None, label=row, error_kw={"linewidth": 0.8})
         least = min(least, min(m - s for m, s in zip(means, spread)))
     most = place.get_ylim()[1]
-    if best == "most" and np.isfinite(least) and least > 0.5 * most:
+    if "ssim" in figure.figure:
+        most = min(most, figure.scale)
+        place.set_ylim(top=most)
+    if figure.best == "most" and np.isfinite(least) and least > 0.5 * most:
         place.set_ylim(bottom=least - 0.2 * (most - least) - 1e-9)
+        place.set_ylabel(f"axis cut at {place.get_ylim()[0]:.4g}", fontsize=8)
     place.set_xticks(range(len(columns)), columns, rotation=30, ha="right", fontsize=8)
 
 
-def lines(place, experiment: Experiment, rows: Mapping[str, Mapping[str, Cell | None]], best: str | None) -> None:
+def lines(place, experiment: Experiment, rows: Mapping[str, Mapping[str, Cell | None]], figure: Figure) -> None:
     """A line for each column over the rows, at their values where these are numbers."""
     options = experiment.axes[experiment.rows]
     numeric = all(option.value is not None for option in options)
@@ -85,7 +89,7 @@ def lines(place, experiment: Experiment, rows: Mapping[str, Mapping[str, Cell | 
         place.set_xticks(at, [option.name for option in options], rotation=30, ha="right", fontsize=8)
 
 
-def heat_map(place, experiment: Experiment, rows: Mapping[str, Mapping[str, Cell | None]], best: str | None) -> None:
+def heat_map(place, experiment: Experiment, rows: Mapping[str, Mapping[str, Cell | None]], figure: Figure) -> None:
     """Rows downwards, columns to the right, each cell with its number; what is missing stays white."""
     columns = [option.name for option in experiment.axes[experiment.columns]]
     values = np.array([[cells[c].mean if cells.get(c) is not None else np.nan for c in columns] for cells in rows.values()])
@@ -94,7 +98,8 @@ def heat_map(place, experiment: Experiment, rows: Mapping[str, Mapping[str, Cell
     middle = np.nanmean([np.nanmin(values), np.nanmax(values)])
     for (i, j), value in np.ndenumerate(values):
         if np.isfinite(value):
-            place.text(j, i, f"{value:.3g}", ha="center", va="center", fontsize=8, color="white" if value < middle else "black")
+            color = "white" if value < middle else "black"
+            place.text(j, i, f"{value:.{figure.decimals}f}", ha="center", va="center", fontsize=8, color=color)
     place.set_xticks(range(len(columns)), columns, fontsize=8)
     place.set_yticks(range(len(rows)), list(rows), fontsize=8)
     place.set_xlabel(experiment.columns, fontsize=9)

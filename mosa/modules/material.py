@@ -83,16 +83,33 @@ FORMS: dict[str, Form | Direction] = {
     "nu": _scaled_sigmoid(NU_MAX, (0.0, NU_MAX)), "friction_angle": _scaled_sigmoid(ANGLE_MAX, (0.0, ANGLE_MAX)),
 }  # fmt: skip
 """Every parameter a prior may name, SI units; friction_angle in degrees, cohesion a strain."""
+UNITS = {"E": "Pa", "mu": "Pa", "kappa": "Pa", "yield_stress": "Pa", "viscosity": "Pa s", "friction_angle": "degrees"}
+"""Of the parameters that have one; what is a viscosity in place of it, the law says (`unit_of`)."""
 GIVES = {"E": ("mu", "lam"), "nu": (), "friction_angle": ("friction_alpha",)}
 """What the simulator takes in place of a parameter; others are taken by their own name."""
 STIFFNESS = ("E", "mu", "kappa")
 
 
-def register_form(name: str, form: Form | Direction) -> None:
+def register_form(name: str, form: Form | Direction, unit: str = "") -> None:
     """Give a parameter of a law with a new name its range: `LOG` (positive, in its logarithm), `SOFTPLUS` (positive or held at 0),
-    a `Form` of one's own, or `Direction()`. Errors: ConfigError if the name has another range already."""
+    a `Form` of one's own, or `Direction()`; and the unit that reports write beside it. Errors: ConfigError if the name has another
+    range already."""
     if FORMS.setdefault(name, form) != form and not isinstance(form, Direction):
         raise ConfigError(f"parameter {name!r} has a range already; choose another name")
+    if unit:
+        UNITS[name] = unit
+
+
+def unit_of(law: str, name: str) -> str:
+    """Unit of a law's parameter, empty for one without (nu, cohesion) and where `register_form` was told none. A parameter that the
+    law's explicit viscosity depends on is a viscosity [Pa s], whatever the same name is in other laws. Errors: ConfigError for an
+    unknown law."""
+    known = law_named(law)
+    if name in known.parameters and known.viscosity is not None:
+        ones = {each: torch.ones(()) for each in known.parameters}
+        if not torch.equal(known.explicit_viscosity(ones), known.explicit_viscosity(ones | {name: torch.full((), 2.0)})):
+            return "Pa s"
+    return UNITS.get(name, "")
 
 
 class Material(nn.Module):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from mosa.analysis.comparison import compare, ground_lines, legend, on_ground, paint, round_up, write_comparisons
+from mosa.analysis.comparison import Comparison, compare, ground_lines, legend, on_ground, paint, round_up, write_comparisons
 from mosa.analysis.figures import side_by_side, write_strip
 from mosa.evaluation import Sequence
 from mosa.modules.body import Body, SimulationSettings, Start
@@ -155,3 +155,12 @@ def test_every_frame_has_its_own_caption(tmp_path):
                     for notes in ({}, {"a": [f"frame {t}" for t in range(T)]}))
     assert noted.shape[0] == plain.shape[0] + 22
     assert (noted[26 + 22 :] == plain[26:]).all() and cv2.absdiff(noted[26:48, :200], noted[26:48, 200:400]).any()
+
+
+def test_the_legend_s_words_fit_beside_a_narrow_image():
+    """Of an image of 120 px: what it would lose at its edge is written smaller."""
+    images = {"real": np.full((1, 200, 120, 3), 255, np.uint8)}
+    wide = {"real": np.full((1, 200, 400, 3), 255, np.uint8)}
+    found = [legend(Comparison(each, {}, "distance to the true motion", "5 mm", "viridis", [0.0])) for each in (images, wide)]
+    columns = [np.flatnonzero((picture[60:95] < 200).any((0, 2))) for picture in found]  # of the words above the colours
+    assert 105 < columns[0].max() < 119 and columns[1].max() < 240

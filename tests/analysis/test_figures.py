@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mosa.analysis.figures import write_strip, write_video
+from mosa.analysis.figures import LEFT, SMALLEST, bar, fitted, text_width, write_strip, write_video
 
 
 def test_a_strip_takes_rows_of_different_sizes(tmp_path):
@@ -37,3 +37,13 @@ def test_an_ffmpeg_that_writes_nothing_is_said(tmp_path, monkeypatch, program):
     with pytest.raises(OSError, match=r"(ffmpeg has ended while it wrote|of 5 pictures are in it).*a\.mp4"):
         write_video(tmp_path / "a.mp4", [np.zeros((400, 600, 3), np.uint8)] * 5)
     assert [file.name for file in tmp_path.iterdir()] == ["ffmpeg"]
+
+
+@pytest.mark.parametrize("text", ["real", "adapted (MoSA): distance to the true motion, blue 0, yellow 20 mm", "x" * 300])
+def test_a_caption_fits_into_its_share(text):
+    """Three columns of 230 px, as in the rabbit's strip: no caption ends in its neighbour's or beyond the picture."""
+    shown, scale = fitted(text, 230 - 2 * LEFT)
+    assert text_width(shown, scale) <= 230 - 2 * LEFT and scale >= SMALLEST
+    assert shown == text or (shown.endswith("...") and text.startswith(shown[:-3]))
+    alone = bar(690, ["", text, ""])
+    assert (alone[:, :230] == 245).all() and (alone[:, 460:] == 245).all() and (alone[:, 230:460] < 245).any()

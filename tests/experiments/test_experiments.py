@@ -8,6 +8,7 @@ import re
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,9 +19,10 @@ from mosa import whole_files
 from mosa.commands.experiment import arguments, run, shown
 from mosa.config import rehearse
 from mosa.errors import ConfigError, DataError
-from mosa.experiments import commits, running
+from mosa.experiments import analyses, commits, running
 from mosa.experiments.analyses import ANALYSES
 from mosa.experiments.collecting import Cell, best_of, records_of, table
+from mosa.experiments.drawing import draw
 from mosa.experiments.page import older, verdict
 from mosa.experiments.printed import printed_table
 from mosa.experiments.specification import (
@@ -93,6 +95,18 @@ def test_every_entry_of_the_paper_that_is_named_exists():
         assert found.analysis is None or found.analysis in ANALYSES
         if found.printed is not None:
             assert "The paper prints" in printed_table(found.printed)
+
+
+@pytest.mark.parametrize("quick", [False, True], ids=["whole", "quick"])
+def test_the_rows_that_a_note_names_are_in_its_table(quick):
+    named = 0
+    for name in NAMES:
+        made = load_experiment(PAPER, name, quick)
+        rows = {option.name for option in made.axes[made.rows]}
+        for row in re.findall(r"\(row ([^)]*)\)", made.note):
+            named += 1
+            assert row in rows, name
+    assert named  # of table_grounding
 
 
 def test_the_paper_s_figures_are_those_of_its_tables():
@@ -305,6 +319,44 @@ def test_every_kind_of_picture_is_drawn_also_where_cells_are_missing(tmp_path, p
     found, jobs = made_up(tmp_path / "runs")
     write_results(replace(found, plot=plot), jobs, tmp_path / "results", "")
     assert (tmp_path / "results" / "made.png").is_file() == (plot is not None)
+
+
+def test_a_map_has_the_figure_s_decimals_and_bars_say_where_they_begin(tmp_path):
+    found, jobs = made_up(tmp_path / "runs")
+    tables = {figure.label: table(found, records_of(jobs), figure) for figure in found.figures}
+    for place, figure in zip(draw(replace(found, plot="map"), tables).axes, found.figures):  # colour bars come after the maps
+        written = [text.get_text() for text in place.texts]
+        assert written and {len(text.partition(".")[2]) for text in written} == {figure.decimals}
+    close = {"method": {"a": Cell(98.0, None, 1)}, "other": {"a": Cell(99.0, None, 1)}}
+    ssim = Figure("SSIM x100", "test/ssim_crop", 100, 1, "most")
+    place = draw(replace(found, figures=(ssim,), plot="bars"), {"SSIM x100": close}).axes[0]
+    low, high = place.get_ylim()
+    assert high == 100 and low > 90 and place.get_ylabel() == f"axis cut at {low:.4g}"
+    alone = {"method": {"a": Cell(1.0, None, 1)}, "other": {"a": Cell(30.0, None, 1)}}
+    place = draw(replace(found, figures=(replace(ssim, figure="test/psnr_crop"),), plot="bars"), {"SSIM x100": alone}).axes[0]
+    assert place.get_ylim()[0] == 0 and place.get_ylabel() == ""
+
+
+@pytest.mark.parametrize("columns", [["a"], ["a", "b"]])
+def test_the_parts_of_a_picture_of_directions_share_their_axes(tmp_path, monkeypatch, columns):
+    """An isotropic law beside one with a ratio of 1.6: the rounding of the first is no curve, also where it is alone."""
+    found = narrowed(experiment(), {"method": ["ours"], "scene": columns}, (0,))
+    records = records_of(jobs_of(found, tmp_path))
+    laws = {"a": lambda n: 1e5 * (1 + 1e-4 * n[:, 0]), "b": lambda n: 1e5 * (1 + 0.6 * n[:, 0] ** 2)}
+    twins = [SimpleNamespace(body=record.place["scene"].name, config={"cfg": {"scene": {"name": "rabbit"}}}) for record in records]
+    monkeypatch.setattr(analyses, "loaded", lambda _: zip(records, twins))
+    monkeypatch.setattr(analyses, "redistribution", lambda body, n: 0.1 * n[:, 0].abs())
+    monkeypatch.setattr(analyses, "learned_modulus", lambda body, n: laws[body](n))
+    monkeypatch.setattr(analyses, "true_modulus", lambda *_: None)
+    drawn = []
+    monkeypatch.setattr(analyses, "save", lambda canvas, path: drawn.append(canvas) or path)
+    ANALYSES["directions"](found, records, tmp_path / "law")
+    places = np.array(drawn[0].axes).reshape(2, len(columns))
+    for row in places:
+        assert len({place.get_ylim() for place in row}) == 1
+    low, high = places[1, 0].get_ylim()
+    curve = places[1, 0].lines[0].get_ydata()
+    assert low <= 0.95 and high >= 1.05 and curve.max() - curve.min() < 0.01 * (high - low)
 
 
 def test_results_that_cannot_be_written_leave_the_ones_before(tmp_path, monkeypatch):

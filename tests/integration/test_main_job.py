@@ -128,6 +128,9 @@ def test_steps_times_and_pictures_are_logged(run):
     assert len(shares) == 5 and all(0 <= s <= 1 for s in shares) and max(shares) > 0
     assert [float(row["newton/share"]) for row in rows] == pytest.approx(shares)
     assert not any(tag.startswith("lr/") for tag in events.Tags()["scalars"])  # no optimiser of torch has stepped
+    for tag in events.Tags()["scalars"]:  # also Lightning's own
+        assert events.summary_metadata[tag].summary_description, tag
+    assert events.summary_metadata["id/E"].summary_description == "parameter E after the step, without eta [Pa]"
     pictures = events.Images("real_above_rendered_below")
     assert [p.step for p in pictures] == [2, 4] and all(p.height >= 320 for p in pictures)
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from small_bodies import NU, WORLD, E, small_body, start, take_of
 
-from mosa.analysis.tables import determined_text, ground_text, parameter_table
+from mosa.analysis.tables import determined_text, ground_table, ground_text, parameter_table
 from mosa.checkpoints import check_resumed
 from mosa.errors import DataError, SimulationDiverged
 from mosa.modules import ground_choice, ground_search, newton_steps
@@ -124,6 +124,22 @@ def test_a_report_says_how_the_ground_is_touched():
     sticks = ground_text(near, {"touch_0.6": -8.0})
     assert sticks.startswith("Ground: the body sticks to it (mean") and "worse by 8.0" in sticks
     assert "determined" not in sticks and "hardly" not in sticks
+
+
+def test_many_contacts_are_a_table():
+    few = {"sticky": 20e-3, "separate_0.3": 12e-3, "touch_0.6": 15.5e-3}
+    assert ground_table(few, {}) == "" and "below" not in ground_text(few)
+    many, gains = few | {"separate_1.2": 31e-3}, {"touch_0.3": 2.5, "separate_0.3": -1.0}
+    said = ground_text(many)
+    assert said.startswith("Ground: the body leaves it freely, friction 0.3 (separate) (mean distance from the training motion")
+    assert "after calibration in the table below)." in said and " mm" not in said
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in ground_table(many, gains).splitlines()[2:]]
+    assert rows[0] == ["leaves it freely, friction 0.3 (separate)", "12.00", "-1.0"]  # the nearest first
+    assert rows[-2:] == [["leaves it freely, friction 1.2 (separate)", "31.00", ""],
+                         ["leaves it freely, friction 0.3 (touch)", "", "+2.5"]]
+    figures = {f"id_prior/ground/{name}_m": value for name, value in many.items()}
+    assert "gain" not in ground_table(many, {})  # none was asked for
+    assert ground_table(many, {}) in determined_text(figures, "neo_hookean")
 
 
 def test_a_report_says_what_of_the_contact_is_not_determined():
@@ -367,5 +383,6 @@ def test_frictions_are_within_two_of_each_other():
 def test_the_table_of_parameters_has_no_row_for_it():
     figures = {"id_prior/E": 1e5, "id/E": 1.1e5, "id_prior/ground/sticky_m": 0.02, "id_prior/ground/separate_1.2_m": 0.021,
                "id_prior/ground/separate_1.2_gain": 1.5}
-    assert "ground" not in parameter_table(figures) and "worse" not in determined_text(figures)
-    assert determined_text(figures).startswith("Ground: the body sticks to it") and "better by 1.5" in determined_text(figures)
+    text = determined_text(figures, "neo_hookean")
+    assert "ground" not in parameter_table(figures, "neo_hookean") and "worse" not in text
+    assert text.startswith("Ground: the body sticks to it") and "better by 1.5" in text
