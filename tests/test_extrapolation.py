@@ -53,8 +53,9 @@ def test_a_calibration_is_continued_from_the_scene_s_own_images(tmp_path):
     own = INFLATION * float(run.module.posterior.covariance[0, 0]) ** 0.5
     assert found["extrapolated/E_sd"] > (1 + weight) * own * found["extrapolated/E"]
     assert found["extrapolated/E_relative_error"] == pytest.approx(abs(found["extrapolated/E"] / 1e5 - 1))
-    lines = continued_text(found | {f"id/{name}": 1.0 for name in ("E", "nu")}).splitlines()
-    assert lines[0].startswith("On grids of ") and sum(line.startswith("- ") for line in lines) == 2 and not continued_text({})
+    law = run.body.material.law
+    lines = continued_text(found | {f"id/{name}": 1.0 for name in ("E", "nu")}, law).splitlines()
+    assert lines[0].startswith("On grids of ") and sum(line.startswith("- ") for line in lines) == 2 and not continued_text({}, law)
 
 
 def test_a_fit_by_adam_cannot_be_continued():

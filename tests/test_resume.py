@@ -150,4 +150,4 @@ def test_a_checkpoint_that_is_removed_before_the_fit_reads_it_is_named(tmp_path,
     cfg = OmegaConf.create({"ckpt_path": "gone/last.ckpt", "logger": {"images_every": 0},
                             "trainer": {"accelerator": "cpu", "devices": 1}})  # fmt: skip
     with pytest.raises(DataError, match=r"ckpt_path: gone/last\.ckpt: the fit cannot go on from it \(FileNotFoundError"):
-        fitting.fit(cfg, SimpleNamespace(body=None), None, tmp_path, "cpu")
+        fitting.fit(cfg, SimpleNamespace(body=SimpleNamespace(material=SimpleNamespace(law="corotated"))), None, tmp_path, "cpu")
