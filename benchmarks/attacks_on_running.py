@@ -193,8 +193,15 @@ def running(folder: Path) -> Iterator[Attack]:
         yield f"a second process in the folder{', which waits' if waits else ''}", lambda w=waits: beside(w)
 
     def limited(name: str, limit: str) -> None:
-        program(*arguments(fitted(name)), shell=f"ulimit {limit}; {{}}", wanted=2)
-        refuse("one message")
+        run = fitted(name)
+        try:
+            program(*arguments(run), shell=f"ulimit {limit}; {{}}", wanted=2)
+        except AssertionError:  # another Python may need fewer handles than are left
+            if not (run / "metrics.json").is_file():
+                raise
+            equal(whole, run)
+        else:
+            refuse("one message")
 
     for name, limit in {"memory": "-v 1200000", "more_memory": "-v 1800000", "file_size": "-f 200", "handles": "-n 9"}.items():
         yield f"ulimit {limit}", lambda n=name, x=limit: limited(n, x)

@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from typing import NoReturn
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -170,8 +171,7 @@ def run_command(run: Callable[[], None], conf: str | Path) -> None:
                 sys.exit(2)
             raise
         except KeyboardInterrupt:  # between jobs, or before the first
-            fail("stopped")
-            sys.exit(130)
+            leave("stopped", 130)
 
 
 begun: list[bool] = []
@@ -221,6 +221,20 @@ def terminated(number: int, *_) -> None:
     """SIGTERM, as a batch system sends it before it kills, stops what Ctrl-C stops."""
     signals.append(number)
     raise KeyboardInterrupt
+
+
+def leave(message: str | None, code: int) -> NoReturn:
+    """Say that the process was stopped and end it. A further stop ends it at once: an exception amid the interpreter's own exit was
+    a traceback."""
+    answered = [number for number in (signal.SIGINT, signal.SIGTERM)
+                if threading.current_thread() is threading.main_thread() and callable(signal.getsignal(number))]  # fmt: skip
+    for number in answered:
+        signal.signal(number, signal.SIG_IGN)
+    if message is not None:
+        fail(message)
+    for number in answered:
+        signal.signal(number, signal.SIG_DFL)
+    sys.exit(code)
 
 
 @contextmanager
@@ -297,9 +311,8 @@ def attempted(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> flo
         with held(folder, wait=(cfg or {}).get("resume") == "auto") if first and folder is not None else nullcontext():
             return job(cfg)
     except KeyboardInterrupt:
-        if first:
-            fail("stopped; resume with ckpt_path=<run folder>/checkpoints/last.ckpt, where the fit had begun")
-        sys.exit(143 if signal.SIGTERM in signals else 130)
+        resume = "stopped; resume with ckpt_path=<run folder>/checkpoints/last.ckpt, where the fit had begun"
+        leave(resume if first else None, 143 if signal.SIGTERM in signals else 130)
     except MosaError as error:
         message = f"{type(error).__name__}: {error}"
     except Exception as error:

@@ -4,6 +4,7 @@ import errno
 import io
 import os
 import shlex
+import signal
 import subprocess
 import sys
 import textwrap
@@ -291,6 +292,16 @@ def test_a_stop_says_how_to_go_on(name, code):
     found = subprocess.run([sys.executable, "-c", textwrap.dedent(PROGRAM.format(name=name))], cwd=ROOT, capture_output=True,
                            text=True, timeout=60)
     assert found.returncode == code and "stopped; resume with" in found.stderr and "Traceback" not in found.stderr
+
+
+@pytest.mark.parametrize("name", ["TERM", "INT"])
+def test_a_second_stop_on_the_way_out_is_no_traceback(name):
+    """It fell into a library's clearing up at the interpreter's exit."""
+    leaving = f"import atexit, os, signal; atexit.register(lambda: os.kill(os.getpid(), signal.SIG{name}))\n"
+    found = subprocess.run([sys.executable, "-c", leaving + textwrap.dedent(PROGRAM.format(name=name))], cwd=ROOT,
+                           capture_output=True, text=True, timeout=60)  # fmt: skip
+    assert found.returncode == -getattr(signal, f"SIG{name}")
+    assert "stopped; resume with" in found.stderr and "Traceback" not in found.stderr
 
 
 def test_a_joblib_sweep_with_failed_jobs_does_not_exit_with_0(tmp_path):
