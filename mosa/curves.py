@@ -20,7 +20,8 @@ class Curve(NamedTuple):
 
 CURVES = (
     Curve("loss/total", "-", "what the step descends: the sum of all weighted terms, mean over the training sequences; of "
-          "Gauss-Newton its cost, minus the logarithm of the posterior, after the step"),
+          "Gauss-Newton its cost, minus the logarithm of the posterior, after the step (of several drops the first four count a "
+          "part of the data, and less)"),
     Curve("loss_raw/<term>", "-", "a term of the loss (`mosa/losses.py`) before its weight"),
     Curve("loss_weighted/<term>", "-", "a term of the loss times its weight in `losses`"),
     Curve("id/contact_offset", "m", "height above the ground at which the grid stops the body, after the step"),

@@ -33,6 +33,9 @@ def draw(experiment: Experiment, tables: Tables) -> Canvas | None:
     canvas = Canvas(figsize=(1.5 + 4.2 * len(experiment.figures), 3.6), layout="constrained")
     places = canvas.subplots(1, len(experiment.figures), squeeze=False)[0]
     how = {"bars": bars, "lines": lines, "map": heat_map}[experiment.plot]
+    if experiment.plot == "bars":  # a row that nothing was run of would take a place and a colour
+        run = {row for rows in tables.values() for row, cells in rows.items() if any(cells.values())}
+        tables = {label: {row: cells for row, cells in rows.items() if row in run} for label, rows in tables.items()}
     for place, figure in zip(places, experiment.figures):
         place.set_title(figure.label, fontsize=10)
         how(place, experiment, tables[figure.label], figure)
@@ -51,11 +54,12 @@ def bars(place, experiment: Experiment, rows: Mapping[str, Mapping[str, Cell | N
     for i, (row, cells) in enumerate(rows.items()):
         found = [(j, cells[c]) for j, c in enumerate(columns) if cells.get(c) is not None and np.isfinite(cells[c].mean)]
         if not found:
-            place.bar([], [], label=row)
+            place.bar([], [], label=row, color=f"C{i}")
             continue
         at = [j - 0.4 + width * (i + 0.5) for j, _ in found]
         means, spread = [c.mean for _, c in found], [c.sd or 0.0 for _, c in found]
-        place.bar(at, means, width, yerr=spread if any(spread) else None, label=row, error_kw={"linewidth": 0.8})
+        place.bar(at, means, width, yerr=spread if any(spread) else None, label=row, color=f"C{i}",
+                  error_kw={"linewidth": 0.8})  # fmt: skip
         least = min(least, min(m - s for m, s in zip(means, spread)))
     most = place.get_ylim()[1]
     if "ssim" in figure.figure:

@@ -117,8 +117,9 @@ def older(lines: Sequence[str]) -> list[str]:
     if found is None or found[1] == 0:
         return []
     made, count = found
-    return [f"**These figures are of an older commit, {made}:** {count} commits have changed the program (`mosa/`, `conf/`) since, "
-            "up to when this page was made. What it gives now was not run."]
+    changed = "1 commit has" if count == 1 else f"{count} commits have"
+    return [f"**These figures are of an older commit, {made}:** {changed} changed the program (`mosa/`, `conf/`) since, up to when "
+            "this page was made. What it gives now was not run."]  # fmt: skip
 
 
 def ours(experiment: Experiment, tables: Tables) -> str:

@@ -34,6 +34,9 @@ EVIDENCE_ITERATIONS = 5
 """Iterations in which the sizes of the blocks are found again, later they stay. Two sizes of the stiffness modes can each bear
 themselves out: a large one saturates the field, and what is saturated says nothing against it. On two drops of the rabbit the size
 fell to a twentieth in the ninth iteration, where the fit was done, and began again from a cost 20 times as large."""
+SOFTLY = (0.05, 0.1, 0.25, 0.5)
+"""Shares of the data that the first iterations on several drops count. Counted in full from the start, a few drops are explained by
+sizes that later ones do not bear out, and the fit is half done when its iterations are over: see docs/identification.md."""
 FLAT = 0.5
 """Of minus the logarithm of the posterior: an iteration of the joint stage that lowers it by less, with the sizes settled, is the
 last. Numbers that still move then lie on a floor that the data do not tell apart."""
@@ -69,7 +72,7 @@ class Identification:
         seats: int | None = None,
     ) -> None:  # fmt: skip
         self.body, self.takes, self.world, self.settings = body, list(takes), world, settings
-        self.calibrating = stage.calibrates
+        self.calibrating, self.iterations = stage.calibrates, stage.iterations
         self.adapter = stage.learns_adapter and is_learned(body.adapter)
         self.heterogeneity = not self.calibrating and is_learned(body.heterogeneity)
         self.gains = (0.0,) if self.calibrating else criterion.gains
@@ -116,6 +119,12 @@ class Identification:
     def knows_grid(self) -> bool:
         """Whether there is a second grid, and with it a last number: the multiple of the difference."""
         return self.settings.grid_error > 0 and not self.calibrating
+
+    @property
+    def softly(self) -> tuple[float, ...]:
+        """Shares of the data that the first iterations count, all of it afterwards. A calibration, one drop, and a stage too short
+        for it count in full."""
+        return SOFTLY if len(self.takes) > 1 and not self.calibrating and self.iterations >= 2 * len(SOFTLY) else ()
 
     @property
     def pairs(self) -> list[tuple[int, float]]:
@@ -181,6 +190,8 @@ class Identification:
 
     def _compared(self, found: list[residuals.Fields], multiple: float) -> Tensor:
         share = self.settings.count / len(self.gains) * (COUNTED_AT_FIRST if self.calibrating else 1)
+        if self.iteration < len(self.softly):
+            share *= self.softly[self.iteration]
         counts = tuple(share * on for on in self.kinds)
         return residuals.whitened(self._along(found, multiple), self.noise, [counts] * len(self.pairs))
 
@@ -241,7 +252,8 @@ class Identification:
         small = self.iteration > NOISE_ITERATIONS and report["length"] * report["share"] < self.settings.tolerance
         gained = report["before"] - report["after"]
         flat = self.iteration > EVIDENCE_ITERATIONS and not self.calibrating and gained < FLAT
-        self.converged = small or flat or report["share"] == 0
+        whole = not self.softly or self.iteration > len(self.softly) + 1
+        self.converged = whole and (small or flat or report["share"] == 0)
         return report
 
     def state(self) -> dict:

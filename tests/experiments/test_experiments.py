@@ -337,6 +337,18 @@ def test_a_map_has_the_figure_s_decimals_and_bars_say_where_they_begin(tmp_path)
     assert place.get_ylim()[0] == 0 and place.get_ylabel() == ""
 
 
+def test_a_method_of_which_nothing_was_run_takes_no_bar_and_no_colour(tmp_path):
+    """It had the first one's colour in the legend."""
+    found, _ = made_up(tmp_path / "runs")
+    figures = (Figure("a", "test/rms_m", 1, 1, "least"), Figure("b", "test/psnr_crop", 1, 1, "least"))
+    rows = {"first": {"x": Cell(1.0, None, 1)}, "not run": {"x": None}, "last": {"x": Cell(2.0, None, 1)}}
+    partly = rows | {"last": {"x": None}}
+    canvas = draw(replace(found, figures=figures, plot="bars"), {"a": partly, "b": rows})
+    assert [text.get_text() for text in canvas.legends[0].get_texts()] == ["first", "last"]
+    colours = [patch.get_facecolor() for place in canvas.axes for patch in place.patches]
+    assert len(colours) == 3 and colours[0] == colours[1] != colours[2]
+
+
 @pytest.mark.parametrize("columns", [["a"], ["a", "b"]])
 def test_the_parts_of_a_picture_of_directions_share_their_axes(tmp_path, monkeypatch, columns):
     """An isotropic law beside one with a ratio of 1.6: the rounding of the first is no curve, also where it is alone."""

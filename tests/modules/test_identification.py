@@ -16,7 +16,7 @@ from mosa.modules.backbone_search import compass
 from mosa.modules.criteria import Criterion
 from mosa.modules.gauss_newton import Seat
 from mosa.modules.hyperelastic import anisotropic_basis
-from mosa.modules.identification import COARSER, EVIDENCE_ITERATIONS, Identification
+from mosa.modules.identification import COARSER, EVIDENCE_ITERATIONS, SOFTLY, Identification
 from mosa.modules.identification_settings import IdentificationSettings
 from mosa.modules.learned_numbers import as_rival, read_numbers, write_numbers
 from mosa.modules.stages import Stage
@@ -53,6 +53,31 @@ def test_an_iteration_that_hardly_lowers_the_cost_is_the_last(monkeypatch, lower
     found = identification(body, [take_and_turn(small_body(), 0.5)])
     monkeypatch.setattr(found.newton, "iterate", lambda **_: {"before": 10.0, "after": 10.0 - lowered, "share": 1.0, "length": 3.0})
     assert next((i + 1 for i in range(8) if found.iterate() and found.converged), None) == stops
+
+
+def test_the_first_iterations_on_several_drops_count_a_part_of_the_data():
+    """Of one drop, in a calibration and in a stage too short for it all of it."""
+    truth = small_body(numbers=fibres(0.3))
+    several = [take_and_turn(truth, angle) for angle in (0.5, 1.6)]
+    found = identification(small_body(), several)
+    found.iterate()
+
+    def counted(iteration: int) -> float:
+        found.iteration = iteration
+        return float(found.newton.seats[0].residuals().double().square().sum())
+
+    whole = counted(len(SOFTLY))
+    assert whole > 0 and counted(40) == whole
+    assert [counted(i) / whole for i in range(len(SOFTLY))] == pytest.approx(SOFTLY, rel=1e-5)
+    short = Identification(small_body(), several, WORLD, Stage("joint", 3, 0.1), Criterion("corrected"), IdentificationSettings())
+    assert identification(small_body(), several[:1]).softly == short.softly == ()
+    assert identification(small_body(adapter=False), several, "prior").softly == ()
+
+
+def test_a_fit_of_several_drops_is_not_over_before_all_data_count(monkeypatch):
+    found = identification(small_body(), [take_and_turn(small_body(), angle) for angle in (0.5, 1.6)])
+    monkeypatch.setattr(found.newton, "iterate", lambda **_: {"before": 10.0, "after": 10.0, "share": 0.0, "length": 0.0})
+    assert next(i + 1 for i in range(9) if found.iterate() and found.converged) == len(SOFTLY) + 2
 
 
 def values(body) -> dict[str, float]:
