@@ -147,7 +147,7 @@ def verdict(experiment: Experiment, claim: Claim, tables: Tables) -> str:
     """What the tables say of a claim, in words and figures."""
     figure = next(f for f in experiment.figures if f.label == claim.figure)
     rows = tables.get(claim.figure, {})
-    return within(claim, rows, tables) if claim.most is not None else ahead(figure, claim, rows)
+    return within(experiment, claim, rows, tables) if claim.most is not None else ahead(figure, claim, rows)
 
 
 def place_of(cells: Mapping[str, Cell | None], column: str | None) -> Cell | None:
@@ -175,15 +175,26 @@ def ahead(figure: Figure, claim: Claim, rows: Mapping[str, Mapping[str, Cell | N
     return text + (f"; {NOT_RUN}: {', '.join(missing)}" if missing else "") + ("; one seed" if mine.sd is None else "")
 
 
-def within(claim: Claim, rows: Mapping[str, Mapping[str, Cell | None]], tables: Tables) -> str:
+def covered(off: float, sd: float, scale: float | None) -> bool:
+    """Whether twice the posterior's deviation covers an error. scale: of what 1 is written as, where the deviation is that of a
+    modulus, hence of its logarithm: an error of less than 1 may then be one downwards, which is the larger step."""
+    if scale is None:
+        return 2 * sd >= off
+    off, sd = off / scale, sd / scale
+    return 2 * sd >= (math.log1p(off) if off >= 1 else -math.log1p(-off))
+
+
+def within(experiment: Experiment, claim: Claim, rows: Mapping[str, Mapping[str, Cell | None]], tables: Tables) -> str:
     """Of how many rows a figure is at most what is claimed; of the others, whether twice the posterior's deviation covers it."""
     known = {row: cell for row in rows if (cell := place_of(rows[row], claim.column)) is not None}
     if not known:
         return NOT_RUN
     above = {row: cell for row, cell in known.items() if not cell.mean <= claim.most}
+    scales = {f.label: f.scale for f in experiment.figures if f.figure.endswith("_relative_sd")}
     unsure = [] if claim.unless is None else [
         row for row, cell in above.items()
-        if (sd := place_of(tables.get(claim.unless, {}).get(row, {}), claim.column)) is not None and 2 * sd.mean >= cell.mean]
+        if (sd := place_of(tables.get(claim.unless, {}).get(row, {}), claim.column)) is not None
+        and covered(cell.mean, sd.mean, scales.get(claim.unless))]  # fmt: skip
     wrong = {row: cell for row, cell in above.items() if row not in unsure}
     undetermined = "none is determined" if len(unsure) == len(known) else "holds where it is determined"
     text = f"{'holds' if not above else 'does not hold' if wrong else undetermined}, "

@@ -505,6 +505,18 @@ def test_a_bound_excuses_what_the_posterior_says_is_not_determined():
     assert verdict(experiment(), claim, {}) == "not run"
 
 
+@pytest.mark.parametrize(("off", "sd", "determined"), [
+    (3648.5, 262.0, False),  # 37 times as much is 3.6 in the logarithm
+    (184.1, 34.9, True), (54.1, 28.0, True), (30.0, 16.0, True), (30.0, 19.0, False),
+])  # fmt: skip
+def test_a_deviation_of_a_modulus_is_one_of_its_logarithm(off, sd, determined):
+    found = replace(experiment(), figures=(Figure("mu [%]", "id/mu_relative_error", 100, 1),
+                                           Figure("sd of mu [%]", "posterior/mu_relative_sd", 100, 1)))  # fmt: skip
+    claim = Claim("within 5 %", "mu [%]", most=5.0, unless="sd of mu [%]")
+    said = verdict(found, claim, {"mu [%]": cells(a=(off, None, 1)), "sd of mu [%]": cells(a=(sd, None, 1))})
+    assert said.startswith("does not hold" if determined else "none is determined")
+
+
 def test_the_page_has_what_was_run_and_says_what_was_not(tmp_path):
     found = narrowed(load_experiment(PAPER, "table_generalisation"), {"scene": ["rabbit", "peanut"]}, (0,))
     jobs = [job for job in jobs_of(found, tmp_path / "runs")
