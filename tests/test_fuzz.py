@@ -16,7 +16,7 @@ from test_known import composed
 from test_world import twin
 
 from mosa.config import rehearse
-from mosa.data.export import export_pacnerf, export_transforms
+from mosa.data.export import export_pacnerf, export_spring_gaus, export_transforms
 from mosa.data.scene import load_scene
 from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
 from mosa.extensions import registered_keys
@@ -155,6 +155,7 @@ def folders(tmp_path_factory):
     """By format: folder, its listing."""
     base, scene = tmp_path_factory.mktemp("folders"), block_scene(views=4)
     return {"pacnerf": (export_pacnerf(scene, base / "p"), "all_data.json"),
+            "spring_gaus": (export_spring_gaus(scene, base / "s"), "camera.json"),
             "transforms": (export_transforms(scene, base / "t"), "transforms.json")}  # fmt: skip
 
 

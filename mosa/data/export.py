@@ -65,6 +65,20 @@ def export_transforms(scene: Scene, folder: str | Path, *, masks: bool = False) 
     return folder
 
 
+def export_spring_gaus(scene: Scene, folder: str | Path) -> Path:
+    """Write camera.json, frame.json and <camera>/<frame>.png."""
+    folder, cameras = Path(folder), []
+    for v, name in enumerate(scene.cameras.names):
+        (folder / f"camera_{name}").mkdir(parents=True, exist_ok=True)
+        pose = opengl_pose(scene.cameras.w2c[v]).tolist()
+        cameras.append({"camera": f"camera_{name}", "K": scene.cameras.K[v].tolist(), "c2w": pose})
+        for t in range(len(scene.times)):
+            iio.imwrite(folder / f"camera_{name}" / f"{t:03d}.png", rgba(scene, v, t))
+    (folder / "camera.json").write_text(json.dumps(cameras, indent=1))
+    (folder / "frame.json").write_text(json.dumps([{f"{t:03d}": time} for t, time in enumerate(scene.times.tolist())], indent=1))
+    return folder
+
+
 def export_particles(positions: torch.Tensor, folder: str | Path) -> Path:
     """Write (T, M, 3) positions [m] as <frame>.ply."""
     folder = Path(folder)

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from mosa.data.footage import (
-    WHITE,
     Footage,
     even_times,
     footage_of,
@@ -19,13 +18,13 @@ from mosa.data.footage import (
     number,
     read_json,
     same_camera,
-    scaled,
     told_rate,
     world_to_camera,
 )  # fmt: skip
-from mosa.data.images import check_amount, composite, expect_size, faintless, fill_holes, read_image, resize, scaled_size
+from mosa.data.images import expect_size, read_image
 from mosa.data.matting import matte_from_plate
 from mosa.data.scene_from_footage import scene_from_footage
+from mosa.data.views import read_views, split_alpha
 from mosa.errors import DataError
 from mosa.types import Scene
 
@@ -70,29 +69,10 @@ def read_pacnerf(path: str | Path, *, frames=None, fps: float | None = None, sca
         told_rate([times[f][0] for f in numbers], fps, str(listing))
     if prefix == "r":
         log.info("%s: raw images without mattes; matted from the background plates r_<camera>_-1.png", folder)
-    images, mattes, scaled_calibration = [], [], {}
-    for camera, (K, w2c) in calibration.items():
-        rows, full = [], None
-        plate = read_plate(folder / "data" / f"r_{camera}_-1.png") if prefix == "r" else None
-        for frame in numbers:
-            file = folder / "data" / f"{prefix}_{camera}_{frame}.png"
-            if not file.is_file():
-                raise DataError(
-                    f"{file}: image not found, though {listing.name} lists camera {camera} and other cameras have "
-                    f"frame {frame}; restore it or restrict scene.frames"
-                )
-            pixels = read_image(file)
-            if full is None:
-                full, first = pixels.shape[1::-1], file.name
-                size = scaled_size(*full, scale)
-                check_amount(len(calibration) * len(numbers), *size)
-                scaled_calibration[camera] = scaled(K, full, size), w2c
-            expect_size(file, pixels, *full, reason=f"as {first} of the same camera")
-            color, matte = split(file, pixels, plate)
-            matte = fill_holes(matte, fill)
-            rows.append((resize(composite(color, matte, WHITE), *size), resize(matte, *size)))
-        images.append(np.stack([r[0] for r in rows]))
-        mattes.append(np.stack([r[1] for r in rows]))
+    plates = {camera: read_plate(folder / "data" / f"r_{camera}_-1.png") if prefix == "r" else None for camera in calibration}
+    scaled_calibration, images, mattes = read_views(
+        calibration, numbers, lambda camera, frame: folder / "data" / f"{prefix}_{camera}_{frame}.png",
+        lambda camera, file, pixels: split(file, pixels, plates[camera]), listing.name, scale=scale, fill=fill)  # fmt: skip
     return footage_of(scaled_calibration, images, mattes, numbers, [times[f][0] for f in numbers], str(listing))
 
 
@@ -158,9 +138,7 @@ def split(file: Path, pixels: np.ndarray, plate: np.ndarray | None) -> tuple[np.
     """Colour (H, W, 3) and matte (H, W): the alpha channel of an a_ file, what is not white in an m_ file, what differs from the
     plate in an r_ file."""
     if file.name.startswith("a_"):
-        if pixels.shape[2] != 4:
-            raise DataError(f"{file}: expected RGBA with the matte as alpha, found {pixels.shape[2]} channels")
-        return pixels[..., :3], faintless(file, np.ascontiguousarray(pixels[..., 3]))
+        return split_alpha(file, pixels)
     color = np.ascontiguousarray(np.broadcast_to(pixels[..., :3], (*pixels.shape[:2], 3)))
     if plate is not None:
         expect_size(file, pixels, *plate.shape[1::-1], reason="as the background plate of its camera")

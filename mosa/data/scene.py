@@ -16,6 +16,7 @@ from mosa.types import AUTO, GROUND_MODES, RUBBING, Ground, Scene
 
 FORMATS = {
     "pacnerf": "mosa.data.pacnerf:load_pacnerf",
+    "spring_gaus": "mosa.data.spring_gaus:load_spring_gaus",
     "transforms": "mosa.data.transforms:load_transforms",
     "builtin": "mosa.data.builtin:load_builtin",
 }

@@ -208,7 +208,7 @@ def test_corrupted_particles(pacnerf_folder, tmp_path, name):
 
 
 KEYS = [
-    ({"format": "nerf"}, "scene.format: expected one of builtin, pacnerf, transforms, found 'nerf'"),
+    ({"format": "nerf"}, "scene.format: expected one of builtin, pacnerf, spring_gaus, transforms, found 'nerf'"),
     ({"path": None}, "scene.path: expected the folder"),
     ({"colour": "red"}, "scene.colour: not a key of this format"),
     ({"scale": 2.0}, r"scene.scale: expected a number in \(0, 1\]"),
