@@ -9,6 +9,9 @@ from dataclasses import dataclass
 
 from mosa.experiments.specification import Experiment, Figure, Job, Option, read_job
 
+OF_MEANS = "Mean: over the columns that all rows have, but for those rows that are less than half complete."
+"""What a mean of unequal rows is (`table`)."""
+
 
 @dataclass(frozen=True)
 class Record:

@@ -14,7 +14,7 @@ from typing import Any
 
 from mosa.analysis.tables import markdown
 from mosa.errors import ConfigError, DataError
-from mosa.experiments.collecting import Cell
+from mosa.experiments.collecting import OF_MEANS, Cell
 from mosa.experiments.commits import commits_since
 from mosa.experiments.printed import printed_table
 from mosa.experiments.specification import Claim, Experiment, Figure, load_experiment
@@ -140,7 +140,8 @@ def ours(experiment: Experiment, tables: Tables) -> str:
     for row in rows:
         cells = [[text(f, row, column) for f in figures] for column in columns]
         lines.append([row, *(" / ".join(values) if any(values) else NOT_RUN for values in cells)])
-    return f"Ours ({' / '.join(f.label for f in figures)}):\n\n" + markdown([experiment.rows, *columns], lines)
+    means = f"\n\n{OF_MEANS}" if "mean" in columns else ""
+    return f"Ours ({' / '.join(f.label for f in figures)}):\n\n" + markdown([experiment.rows, *columns], lines) + means
 
 
 def verdict(experiment: Experiment, claim: Claim, tables: Tables) -> str:

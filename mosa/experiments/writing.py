@@ -10,7 +10,7 @@ from pathlib import Path
 
 import mosa
 from mosa.analysis.tables import markdown
-from mosa.experiments.collecting import Cell, Record, best_of, records_of, table
+from mosa.experiments.collecting import OF_MEANS, Cell, Record, best_of, records_of, table
 from mosa.experiments.commits import commit
 from mosa.experiments.drawing import draw, save
 from mosa.experiments.page import write_json
@@ -59,7 +59,7 @@ def markdown_page(
         body = [[row, *(cell_text(rows, row, column, figure, "**{}**") for column in header[1:])] for row in rows]
         parts.append(f"{figure.label}{arrow(figure)} (`{figure.figure}`)\n\n" + markdown(header, body))
     if experiment.mean and any("mean" in row for rows in tables.values() for row in rows.values()):
-        parts.append("Mean: over the columns that all rows have, but for those rows that are less than half complete.")
+        parts.append(OF_MEANS)
     if extra:
         parts.append(extra)
     parts += [f"![{experiment.title}]({picture.name})" for picture in pictures]
