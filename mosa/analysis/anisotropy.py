@@ -56,10 +56,16 @@ def directions_in_plane(first: Sequence[float], second: Sequence[float], count: 
     return angles, torch.cos(angles)[:, None] * a / a.norm() + torch.sin(angles)[:, None] * b / b.norm()
 
 
+def golden_turns(count: int) -> Tensor:
+    """(K,) angles [rad] of points of a spiral that turn by the golden angle, one after the other, and so are spread evenly.
+    float64."""
+    return torch.arange(count, dtype=torch.float64) * math.pi * (3 - 5**0.5)
+
+
 def directions_on_sphere(count: int = 200) -> Tensor:
     """(K, 3) unit vectors spread over the half sphere z >= 0 (spiral of the golden angle). float64."""
     z = (torch.arange(count, dtype=torch.float64) + 0.5) / count
-    turn = torch.arange(count, dtype=torch.float64) * math.pi * (3 - 5**0.5)
+    turn = golden_turns(count)
     r = torch.sqrt(1 - z**2)
     return torch.stack([r * torch.cos(turn), r * torch.sin(turn), z], -1)
 
@@ -155,8 +161,7 @@ def directional_modulus(states: States, adapter: AdapterProtocol | None, directi
 def directions_about(axis: Tensor, radius: float, count: int) -> Tensor:
     """(K, 3) unit vectors spread over the cap of `radius` [rad] about a unit vector (3,), itself the first (spiral of the golden
     angle). float64."""
-    k = torch.arange(count, dtype=torch.float64)
-    turn, off = k * math.pi * (3 - 5**0.5), math.tan(radius) * torch.sqrt(k / max(1, count - 1))
+    turn, off = golden_turns(count), math.tan(radius) * torch.linspace(0, 1, count, dtype=torch.float64).sqrt()
     across = torch.linalg.svd(axis.double()[None]).Vh[1:]
     return torch.nn.functional.normalize(axis.double() + off[:, None] * torch.stack([turn.cos(), turn.sin()], -1) @ across, dim=-1)
 

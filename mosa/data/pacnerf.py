@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -69,10 +70,14 @@ def read_pacnerf(path: str | Path, *, frames=None, fps: float | None = None, sca
         told_rate([times[f][0] for f in numbers], fps, str(listing))
     if prefix == "r":
         log.info("%s: raw images without mattes; matted from the background plates r_<camera>_-1.png", folder)
-    plates = {camera: read_plate(folder / "data" / f"r_{camera}_-1.png") if prefix == "r" else None for camera in calibration}
+
+    @lru_cache(maxsize=1)  # one at a time: cameras come one after the other
+    def plate(camera: str) -> np.ndarray | None:
+        return read_plate(folder / "data" / f"r_{camera}_-1.png") if prefix == "r" else None
+
     scaled_calibration, images, mattes = read_views(
         calibration, numbers, lambda camera, frame: folder / "data" / f"{prefix}_{camera}_{frame}.png",
-        lambda camera, file, pixels: split(file, pixels, plates[camera]), listing.name, scale=scale, fill=fill)  # fmt: skip
+        lambda camera, file, pixels: split(file, pixels, plate(camera)), listing.name, scale=scale, fill=fill)  # fmt: skip
     return footage_of(scaled_calibration, images, mattes, numbers, [times[f][0] for f in numbers], str(listing))
 
 
