@@ -20,7 +20,7 @@ from mosa.errors import ConfigError
 from mosa.metrics import identification_errors
 from mosa.modules.lit_mosa import LitMosa
 from mosa.modules.material import FORMS, Form
-from mosa.prediction import INFLATION
+from mosa.prediction import INFLATION, physical_sd
 
 FEWER = 3.0
 """Particles of the run over those of the coarser one."""
@@ -78,11 +78,10 @@ def continued(fine: Identified, coarse: Identified) -> dict[str, tuple[float, fl
     found = {}
     for name, (value, sd) in fine.numbers.items():
         other, other_sd = coarse.numbers[name]
-        raw = torch.tensor(value + weight * (value - other), dtype=torch.float64, requires_grad=True)
-        limit = FORMS[name].physical(raw)
-        slope = float(torch.autograd.grad(limit, raw)[0].abs())
-        spread = slope * math.hypot((1 + weight) * sd, weight * other_sd)
-        found[name] = float(FORMS[name].physical(torch.tensor(other, dtype=torch.float64))), float(limit.detach()), spread
+        raw = torch.tensor(value + weight * (value - other), dtype=torch.float64)
+        spread = physical_sd(name, raw, math.hypot((1 + weight) * sd, weight * other_sd))
+        coarse_value, limit = (float(FORMS[name].physical(each)) for each in (torch.tensor(other, dtype=torch.float64), raw))
+        found[name] = coarse_value, limit, spread
     return found
 
 

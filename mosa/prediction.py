@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from collections.abc import Sequence as Ordered
 from typing import TypeVar
@@ -14,7 +15,9 @@ from mosa.errors import MosaError
 from mosa.evaluation import Sequence, true_motion
 from mosa.modules.body import Body, World
 from mosa.modules.gauss_newton import Posterior
-from mosa.modules.learned_numbers import as_rival, each_law
+from mosa.modules.learned_numbers import as_rival, each_law, limits_of
+from mosa.modules.material import FORMS as RANGES
+from mosa.modules.material import Form, Material
 from mosa.progress import tqdm
 
 DRAWS = 12
@@ -32,6 +35,8 @@ were chosen on the held-out drops of these four bodies under two backbones; thos
 what docs/identification.md#what-is-sure says."""
 LEAST_DRAWS = 4
 """Of those that could be simulated: fewer say nothing about a spread."""
+QUANTILES = 400
+"""Of a normal distribution, where its image under a bounded map is asked for."""
 
 
 @torch.no_grad()
@@ -127,6 +132,23 @@ def _positions(body: Body, s: Sequence, world: World) -> Tensor:
     return body.simulate(s.start, world, s.scene.frames, float(s.scene.times[1] - s.scene.times[0])).x
 
 
+def physical_sd(name: str, raw: Tensor, sd: float) -> float:
+    """Standard deviation of a global parameter in its own unit, of its unconstrained number `raw` () and that one's.
+
+    By the slope of its map; where its range is bounded on both sides, the root mean square distance from what was found of a normal
+    distribution within the limits of the fit. The slope vanishes at the bounds, and would say that a Poisson number of 0.02 is
+    known to 0.05 where 0.3 explains the motion as well."""
+    raw = raw.detach().double().cpu().requires_grad_(True)
+    with torch.enable_grad():
+        value = Material.physical_of(name, raw)
+        slope = torch.autograd.grad(value, raw)[0]
+    if not isinstance(RANGES.get(name), Form) or math.isinf(RANGES[name].high):
+        return sd * float(slope.abs())
+    shares = (torch.arange(QUANTILES, dtype=torch.float64) + 0.5) / QUANTILES
+    drawn = (raw.detach() + sd * torch.special.ndtri(shares)).clamp(*limits_of(name))
+    return float((Material.physical_of(name, drawn) - value.detach()).square().mean().sqrt())
+
+
 @torch.no_grad()
 def determined(body: Body, posterior: Posterior, *, draws: int = 400, seed: int = 1) -> dict[str, float]:
     """What the data say about the law: standard deviations of the global parameters (`posterior/<name>_sd`, relative for moduli),
@@ -138,14 +160,12 @@ def determined(body: Body, posterior: Posterior, *, draws: int = 400, seed: int 
         blocks.setdefault(name.split("[")[0], []).append(i)
     for name, index in blocks.items():
         if name in body.material.raw:
-            # unconstrained sd times the slope of the physical value there
-            raw = posterior.mean[index[0]].clone().requires_grad_(True)
-            with torch.enable_grad():
-                value = body.material.physical_of(name, raw)
-                slope = torch.autograd.grad(value, raw)[0]
-            sd = float(posterior.covariance[index[0], index[0]].sqrt() * slope.abs()) * INFLATION
-            relative = name in ("E", "mu", "kappa", "yield_stress", "viscosity")
-            figures[f"posterior/{name}_{'relative_' if relative else ''}sd"] = sd / float(value) if relative else sd
+            raw, own = posterior.mean[index[0]], float(posterior.covariance[index[0], index[0]].sqrt()) * INFLATION
+            sd = physical_sd(name, raw, own)
+            if name in ("E", "mu", "kappa", "yield_stress", "viscosity"):
+                figures[f"posterior/{name}_relative_sd"] = sd / float(body.material.physical_of(name, raw))
+            else:
+                figures[f"posterior/{name}_sd"] = sd
         elif name in ("operator", "stiffness"):
             figures[f"posterior/{name}_numbers"] = float(len(index))
             figures[f"posterior/{name}_determined"] = float(posterior.determined[index].sum())

@@ -295,14 +295,18 @@ class GaussNewton:
                 if b.learned and determined > 1e-6 and size > 0:
                     b.factor = min(max((size / determined) ** 0.5, b.limits[0]), b.limits[1])
 
-    def posterior(self, share: float = 1.0) -> Posterior:
-        """Laplace's, from the last iteration's matrix. share: of the data's precision, where they are fewer than they were counted.
-        Errors: ValueError before the first iteration."""
-        if self.matrix is None or self.data is None:
+    def posterior(self, share: float = 1.0, wrong: Tensor | None = None) -> Posterior:
+        """Laplace's, from the last iteration's matrix. share: of the data's precision, where they are fewer than they were counted;
+        wrong: residuals (R,) that model and truth may differ by whatever the numbers are, and that they were found without: how far
+        it would have moved them is one more standard deviation along that way. Errors: ValueError before the first iteration."""
+        if self.matrix is None or self.data is None or self.columns is None:
             raise ValueError("posterior: expected an iteration before it is asked for")
         names = [f"{b.name}[{i}]" if b.size > 1 else b.name for b in self.blocks for i in range(b.size)]
         covariance = torch.linalg.inv(self.matrix - (1 - share) * self.data)
         covariance = 0.5 * (covariance + covariance.T)
         determined = (1 - covariance.diagonal() * self.precision()).clamp(0, 1)
+        if wrong is not None:
+            moved = covariance @ (share * (self.columns.T @ wrong.to(self.columns)).double().cpu())
+            covariance = covariance + torch.outer(moved, moved)
         kept = [i for i, nuisance in enumerate(self._vector(lambda b: float(b.nuisance)).tolist()) if not nuisance]
         return Posterior([names[i] for i in kept], self.seats[0].read()[kept], covariance[kept][:, kept], determined[kept])

@@ -280,13 +280,23 @@ class Identification:
         """Laplace's approximation at what was found, with the root mean square distance of free rollouts from the cues after first
         contact as the model's error.
 
-        Of a calibration the data count for no more than its residuals say: see `independent`."""
+        Of a calibration the data count for no more than its residuals say (see `independent`). What the grid gets wrong moves what
+        it finds, as its search leaves that out: how far, the coarser grid says."""
         found = []
         for i, take in enumerate(self.takes):
             away = self.rollout(self.body, i).x - take.cues.positions
             found.append(float(away[take.first_contact :].square().sum(-1).mean()))
-        share = self.independent() if self.calibrating and self.noise is not None else 1.0
-        return replace(self.newton.posterior(share), model_error=(sum(found) / len(found)) ** 0.5, rivals=self.rivals())
+        kept = self.calibrating and self.noise is not None
+        posterior = self.newton.posterior(self.independent() if kept else 1.0, self._grids_part() if kept else None)
+        return replace(posterior, model_error=(sum(found) / len(found)) ** 0.5, rivals=self.rivals())
+
+    def _grids_part(self) -> Tensor | None:
+        """Of a calibration: `grid_error` times the difference from the coarser grid, whitened as the residuals are. None without a
+        second grid."""
+        coarser = self._coarser() if self.settings.grid_error > 0 else None
+        if coarser is None:
+            return None
+        return self.settings.grid_error * self._compared(residuals.difference(self._fields(self.body), coarser), 0.0)
 
     @torch.no_grad()
     def rivals(self) -> dict[str, Tensor]:

@@ -28,16 +28,21 @@ def few_numbers(module: torch.nn.Module | None) -> bool:
     return module is None or module.few_numbers
 
 
+def limits_of(name: str) -> tuple[float, float]:
+    """Of a global parameter's unconstrained number, within which it is learned: beyond those of nu a rollout no longer tells
+    another one."""
+    return (FORMS[name].inverse(0.02), FORMS[name].inverse(0.98 * NU_MAX)) if name == "nu" else (-math.inf, math.inf)
+
+
 def blocks_of(body: Body, *, adapter: bool, heterogeneity: bool, settings: IdentificationSettings,
               calibrating: bool = False) -> list[Block]:
     """The numbers that are learned, in the order of `tensors_of`."""
     blocks, step = [], 0.02 if calibrating else 0.02 * FINER
     for name, raw in body.material.raw.items():
         if raw.requires_grad:
-            bounds = (FORMS[name].inverse(0.02), FORMS[name].inverse(0.98 * NU_MAX)) if name == "nu" else (-math.inf, math.inf)
             start = body.material.begins[name]
             wider = 2.5 if name == "nu" else 1.0
-            blocks.append(Block(name, torch.tensor([start]), torch.tensor([1.5]), wider * step, bounds=bounds))
+            blocks.append(Block(name, torch.tensor([start]), torch.tensor([1.5]), wider * step, bounds=limits_of(name)))
     if body.contact.enabled:
         sd = 0.05 if calibrating else 0.03
         blocks.append(Block("contact", torch.tensor([ContactOffset.START]), torch.tensor([sd]), step, bounds=ContactOffset.LIMITS))

@@ -266,6 +266,21 @@ def test_a_column_that_is_not_finite_is_named():
     assert (x == 0).all()
 
 
+@pytest.mark.parametrize("share", [1.0, 0.3])
+def test_what_the_model_gets_wrong_is_a_standard_deviation_where_it_moves_the_numbers(share):
+    """With the wrong in the data the numbers are found elsewhere: that way is added to the covariance, and nothing across it."""
+    A, b, blocks, wrong = drawn(40, 4, seed=3), drawn(40, seed=4), two_blocks(), drawn(40, seed=6)
+    newton, other = linear(blocks, A, b), linear(blocks, A * share**0.5, (b + wrong) * share**0.5)
+    same = linear(blocks, A * share**0.5, b * share**0.5)
+    for each in (newton, other, same):
+        each.iterate(learn=False)
+    way = other.seats[0].read() - same.seats[0].read()
+    alone, found = newton.posterior(share), newton.posterior(share, wrong)
+    assert torch.allclose(found.covariance, alone.covariance + torch.outer(way, way), rtol=0, atol=1e-11)
+    assert torch.equal(found.mean, alone.mean) and torch.equal(found.determined, alone.determined)
+    assert torch.equal(newton.posterior(share, 0 * wrong).covariance, alone.covariance)
+
+
 def test_no_posterior_before_an_iteration():
     with pytest.raises(ValueError, match="expected an iteration"):
         linear(two_blocks(), drawn(5, 4), drawn(5)).posterior()

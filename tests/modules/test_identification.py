@@ -367,6 +367,22 @@ def test_what_a_grid_gets_wrong_is_not_taken_for_the_law():
     assert wrong[1.0] < 0.02 and wrong[0.0] > 3 * wrong[1.0]
 
 
+def test_a_calibration_knows_what_a_grid_may_have_done_to_it():
+    """A law that is seen on a grid 1.25 times as coarse is found off by more than two deviations of the noise, and by about one of
+    those that know of the grid."""
+    body = small_body(adapter=False)
+    found = identification(body, [seen_on_a_coarser_grid(small_body(adapter=False))], "prior")
+    run(found)
+    found.independent = lambda: 1.0  # all of what it counts, so that the grid alone is what widens
+    aware = found.posterior()
+    found.settings = replace(found.settings, grid_error=0.0)
+    unaware = found.posterior()
+    off = (aware.mean - read_numbers(small_body(adapter=False))[: len(aware.mean)]).abs()
+    sds = [each.covariance.diagonal().sqrt() for each in (aware, unaware)]
+    assert torch.equal(aware.mean, unaware.mean) and bool((sds[0] >= sds[1]).all())
+    assert float((off / sds[1]).max()) > 2 and bool(((off / sds[0] - 1).abs() < 0.2).all())
+
+
 def seen_about_a_prediction(truth, prior, angle):
     """A take whose cues stay half of the way at what the prior predicts, in the quadratic patterns of motion."""
     take = take_and_turn(truth, angle)
@@ -471,7 +487,7 @@ def test_a_calibration_whose_residuals_are_a_few_patterns_is_less_sure():
     sure = []
     for each in (take, bent):
         body = small_body(adapter=False)
-        found = identification(body, [each], "prior")
+        found = identification(body, [each], "prior", grid_error=0)
         found.iterate()
         sure.append((found.independent(), found.posterior().covariance[0, 0], found.newton.posterior().covariance[0, 0]))
     assert sure[0][0] == 1.0 and sure[0][1] == sure[0][2]

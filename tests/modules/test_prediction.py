@@ -10,8 +10,9 @@ from small_bodies import WORLD, small_body, start
 from mosa.errors import ConfigError
 from mosa.modules.gauss_newton import Posterior
 from mosa.modules.learned_numbers import as_rival, each_law, read_numbers
+from mosa.modules.material import NU_MAX
 from mosa.plan import drawn_starts, information, plan
-from mosa.prediction import DRAWN, ELSEWHERE, FORMS, INFLATION, among_forms, total_spread
+from mosa.prediction import DRAWN, ELSEWHERE, FORMS, INFLATION, among_forms, determined, total_spread
 from mosa.twin import Twin
 
 
@@ -85,6 +86,23 @@ def test_a_sure_law_is_off_by_the_models_error_alone_and_an_unsure_one_by_more()
     assert float(wider[-1].mean()) > 0.00405 * ELSEWHERE and torch.equal(read_numbers(unsure.body), before)
     with pytest.raises(ConfigError, match="no posterior"):
         Twin(sure.body, WORLD, 0.01, {}, start(height=0.05, speed=-1.0)).predict(frames=3)
+
+
+def said_of_nu(nu: float, sd: float) -> float:
+    body = small_body(adapter=False, nu=nu)
+    one = torch.ones(2).double()
+    posterior = Posterior(["E", "nu"], read_numbers(body), (sd / INFLATION) ** 2 * torch.diag(one), one)
+    return determined(body, posterior)["posterior/nu_sd"]
+
+
+def test_a_poisson_number_at_its_limit_is_as_unsure_as_what_lies_inside():
+    """In the middle of its range the slope says it; at its limit, where the slope vanishes, all that the data leave open."""
+    assert said_of_nu(0.3, 0.01) == pytest.approx(0.01 * 0.3 * (1 - 0.3 / NU_MAX), rel=0.01)
+    # half of what is within a wide distribution about the lower limit is held there, the other half lies up to the upper one
+    wide = said_of_nu(0.02, 1e4)
+    assert wide == pytest.approx((0.98 * NU_MAX - 0.02) / 2**0.5, rel=0.01)
+    slope = 2.6 * 0.02 * (1 - 0.02 / NU_MAX)
+    assert slope < 0.05 < 0.1 < said_of_nu(0.02, 2.6) < wide
 
 
 def test_information_of_known_draws():
