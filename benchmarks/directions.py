@@ -38,9 +38,10 @@ from mosa.analysis.tables import markdown
 from mosa.data.builtin.floor import floor_rollout
 from mosa.data.builtin.hidden_material import HiddenMaterial
 from mosa.data.builtin.objects import BuiltinObject, object_named
-from mosa.experiments.analyses import force_at, learned_modulus, pressed_modulus, redistribution, true_modulus
+from mosa.experiments.analyses import learned_modulus, redistribution, true_modulus
 from mosa.experiments.commits import commit
 from mosa.experiments.drawing import save
+from mosa.experiments.specimens import force_at, pressed_modulus
 from mosa.modules.body import Body, Start
 from mosa.modules.lit_mosa import LitMosa
 from mosa.modules.takes import Take

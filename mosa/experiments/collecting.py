@@ -9,8 +9,10 @@ from dataclasses import dataclass
 
 from mosa.experiments.specification import Experiment, Figure, Job, Option, read_job
 
-OF_MEANS = "Mean: over the columns that all rows have, but for those rows that are less than half complete."
-"""What a mean of unequal rows is (`table`)."""
+WORDS = ("*diverged*: the law cannot be simulated there; *failed*: the run ended with an error, which the table's own file names.")
+"""What stands in place of figures."""
+OF_MEANS = "Mean: over all columns; a row that lacks one of them has none. " + WORDS
+"""What a mean is (`table`)."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,8 @@ class Record:
 
 @dataclass(frozen=True)
 class Cell:
-    """mean and sample standard deviation (None of fewer than two) over `count` seeds."""
+    """mean and sample standard deviation (None of fewer than two) over `count` seeds. A mean of infinity: it diverged; NaN, of no
+    seed: its runs failed."""
 
     mean: float
     sd: float | None
@@ -43,9 +46,13 @@ class Cell:
 
     def text(self, decimals: int, plus: str = "±") -> str:
         if not math.isfinite(self.mean):
-            return "inf" if self.mean > 0 else "-"
+            return "failed" if math.isnan(self.mean) else "diverged"
         spread = "" if self.sd is None else f" {plus} {self.sd:.{decimals}f}"
         return f"{self.mean:.{decimals}f}{spread}"
+
+
+FAILED = Cell(math.nan, None, 0)
+"""Of a place of which no run is complete, and one has failed."""
 
 
 def records_of(jobs: Sequence[Job]) -> list[Record]:
@@ -60,37 +67,40 @@ def records_of(jobs: Sequence[Job]) -> list[Record]:
 def cell(values: Sequence[float]) -> Cell | None:
     if not values:
         return None
-    return Cell(statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None, len(values))
+    spread = statistics.stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else None
+    return Cell(statistics.fmean(values), spread, len(values))
 
 
 def table(experiment: Experiment, records: Sequence[Record], figure: Figure) -> dict[str, dict[str, Cell | None]]:
-    """{row: {column: cell}} with a column `mean` (spread: over seeds, of these means), over the columns that every row has of which
-    at least half as many are complete as of the fullest; rows that lack one of them have no mean.
-
-    None where no run has the figure."""
+    """{row: {column: cell}}, None where nothing was run, with a column `mean` of the rows that have finite figures in all columns
+    (spread: over seeds, of these means)."""
     values: dict[str, dict[str, dict[int, float]]] = {}
+    failed: set[tuple[str, str]] = set()
     for record in records:
         row, column = record.place[experiment.rows].name, record.place[experiment.columns].name
         seeds = values.setdefault(row, {}).setdefault(column, {})
         found = record.value(figure)
         if found is not None:
             seeds[record.seed] = found
+        elif record.job.failed is not None:
+            failed.add((row, column))
     columns = [option.name for option in experiment.axes[experiment.columns]]
     rows = {option.name: values.get(option.name, {}) for option in experiment.axes[experiment.rows]}
-    result = {row: {column: cell(list(found.get(column, {}).values())) for column in columns} for row, found in rows.items()}
-    if experiment.mean and len(columns) > 1 and experiment.rows != experiment.columns:
-        complete = {row: sum(map(bool, found.values())) for row, found in rows.items()}
-        filled = [found for row, found in rows.items() if 0 < complete[row] >= 0.5 * max(complete.values())]
-        shared = [column for column in columns if filled and all(found.get(column) for found in filled)]
-        for row, found in rows.items():
-            seeds = sorted(set.intersection(*(set(found.get(column, {})) for column in shared))) if shared else []
-            result[row]["mean"] = cell([statistics.fmean(found[column][seed] for column in shared) for seed in seeds])
+    result: dict[str, dict[str, Cell | None]] = {}
+    for row, found in rows.items():
+        result[row] = {column: cell(list(found.get(column, {}).values())) for column in columns}
+        result[row] |= {column: FAILED for column in columns if result[row][column] is None and (row, column) in failed}
+        if experiment.mean and len(columns) > 1 and experiment.rows != experiment.columns:
+            seeds = sorted(set.intersection(*(set(found.get(column, {})) for column in columns)))
+            means = [statistics.fmean(found[column][seed] for column in columns) for seed in seeds]
+            result[row]["mean"] = cell(means) if all(map(math.isfinite, means)) else None
     return result
 
 
 def best_of(rows: Mapping[str, Mapping[str, Cell | None]], column: str, best: str | None) -> str | None:
     """The row with the best mean in a column."""
-    found = {row: cells[column].mean for row, cells in rows.items() if cells.get(column) is not None}
+    found = {row: cells[column].mean for row, cells in rows.items()
+             if cells.get(column) is not None and math.isfinite(cells[column].mean)}  # fmt: skip
     if best is None or len(found) < 2:
         return None
     return (max if best == "most" else min)(found, key=found.get)

@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from mosa.experiments.specification import MINUTES, Job
+from mosa.experiments.specification import FAILED, MINUTES, Job
 from mosa.whole_files import write_whole
 
 PROGRAM = "from mosa.commands.train import main; main()"
@@ -42,6 +42,7 @@ def run_jobs(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: i
                 done += 1
                 if process.returncode != 0 or not job.finished:
                     failed[job.folder.name] = reason(job, process.returncode)
+                    write_whole(job.folder / FAILED, failed[job.folder.name] + "\n")
                 outcome = "failed" if job.folder.name in failed else "complete"
                 minutes = (time.perf_counter() - began) / 60
                 if outcome == "complete":
@@ -66,6 +67,7 @@ def run_jobs(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: i
 
 def begin(job: Job, device: int | None) -> subprocess.Popen:
     job.folder.mkdir(parents=True, exist_ok=True)
+    (job.folder / FAILED).unlink(missing_ok=True)
     environment = dict(os.environ)
     environment.setdefault("OMP_NUM_THREADS", "1")
     if device is not None:

@@ -17,6 +17,10 @@ from mosa.errors import ConfigError, DataError
 PLOTS = ("bars", "lines", "map", None)
 SHARED = "_shared"
 """File of axes that several experiments name."""
+MINUTES = "minutes.txt"
+"""File of a job's folder with the wall time of its process."""
+FAILED = "failed.txt"
+"""File of a job's folder with the reason why its run failed."""
 
 
 @dataclass(frozen=True)
@@ -48,15 +52,18 @@ class Figure:
 
 @dataclass(frozen=True)
 class Claim:
-    """What the paper or an issue says of a figure (by its label), for the page of results. Either row is ahead of `against`, in a
-    column (None: the mean, or the only one), or every row is at most `most`; there `unless` names the figure with the posterior's
-    standard deviation, which excuses what it covers twice."""
+    """What the paper or an issue says of a figure (by its label), for the page of results. Either row is ahead of `against`: in one
+    column, with `each` in every one of them, else in the mean over those that both have; of one seed by more than `spread`. Or
+    every row is at most `most`; there `unless` names the figure with the posterior's standard deviation, which excuses what it
+    covers twice."""
 
     text: str
     figure: str
     row: str | None = None
     against: tuple[str, ...] = ()
     column: str | None = None
+    each: bool = False
+    spread: float = 0.0
     most: float | None = None
     unless: str | None = None
 
@@ -65,7 +72,7 @@ class Claim:
 class Experiment:
     """rows, columns: axes of the table (every other one but the seed is a table of its own); printed: entry of printed.yaml; note:
     how the data differ from the paper's; minutes: of a job that runs alone, on cpu and gpu; analysis: a function of `analyses`, or
-    None; claims: for the page of results."""
+    None; listed: whether the page of results shows the table of figures, which an analysis may say better; claims: for the page."""
 
     name: str
     title: str
@@ -81,6 +88,7 @@ class Experiment:
     plot: str | None = "bars"
     analysis: str | None = None
     mean: bool = True
+    listed: bool = True
     claims: tuple[Claim, ...] = ()
     quick: bool = False
 
@@ -99,6 +107,12 @@ class Job:
     @property
     def finished(self) -> bool:
         return (self.folder / "metrics.json").is_file()
+
+    @property
+    def failed(self) -> str | None:
+        """Why it failed when it was last run; None where it is complete, or was not run."""
+        said = self.folder / FAILED
+        return None if self.finished or not said.is_file() else said.read_text(errors="replace").strip()
 
 
 def experiment_names(folder: Path) -> list[str]:
@@ -239,8 +253,6 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
     return list(found.values())
 
 
-MINUTES = "minutes.txt"
-"""File of a job's folder with the wall time of its process."""
 QUIET = ("logger", "evaluation.video")
 """Overrides that the name of a folder leaves to its digest."""
 

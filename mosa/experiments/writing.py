@@ -10,7 +10,7 @@ from pathlib import Path
 
 import mosa
 from mosa.analysis.tables import markdown
-from mosa.experiments.collecting import OF_MEANS, Cell, Record, best_of, records_of, table
+from mosa.experiments.collecting import OF_MEANS, WORDS, Cell, Record, best_of, records_of, table
 from mosa.experiments.commits import commit
 from mosa.experiments.drawing import draw, save
 from mosa.experiments.page import write_json
@@ -56,16 +56,17 @@ def markdown_page(
     for figure in experiment.figures:
         rows = tables[figure.label]
         header = [experiment.rows, *next(iter(rows.values()))]
-        body = [[row, *(cell_text(rows, row, column, figure, "**{}**") for column in header[1:])] for row in rows]
+        bold = "{}" if experiment.plot == "map" else "**{}**"  # of a map no column has a best row
+        body = [[row, *(cell_text(rows, row, column, figure, bold) for column in header[1:])] for row in rows]
         parts.append(f"{figure.label}{arrow(figure)} (`{figure.figure}`)\n\n" + markdown(header, body))
-    if experiment.mean and any("mean" in row for rows in tables.values() for row in rows.values()):
-        parts.append(OF_MEANS)
+    parts.append(OF_MEANS if experiment.mean and any("mean" in row for rows in tables.values() for row in rows.values()) else WORDS)
     if extra:
         parts.append(extra)
     parts += [f"![{experiment.title}]({picture.name})" for picture in pictures]
     if experiment.printed is not None:
         parts.append(printed_table(experiment.printed))
-    missing = [f"missing: {job.folder.name} ({' '.join(job.overrides)})" for job in jobs if not job.finished]
+    missing = [f"{'failed' if job.failed else 'not run'}: {job.folder.name} ({' '.join(job.overrides)})"
+               + (f": {job.failed}" if job.failed else "") for job in jobs if not job.finished]
     parts.append("\n".join(f"- {line}" for line in (*lines, *missing)))
     return "\n\n".join(parts) + "\n"
 
@@ -132,7 +133,8 @@ def latex(experiment: Experiment, tables: Mapping[str, Mapping[str, Mapping[str,
                  r"\toprule",
                  " & ".join([escaped(figure.label), *map(escaped, columns)]) + r" \\", r"\midrule"]  # fmt: skip
         for row in rows:
-            cells = (cell_text(rows, row, column, figure, r"\textbf{{{}}}", r"$\pm$") for column in columns)
+            bold = "{}" if experiment.plot == "map" else r"\textbf{{{}}}"
+            cells = (cell_text(rows, row, column, figure, bold, r"$\pm$") for column in columns)
             lines.append(" & ".join([escaped(row), *cells]) + r" \\")
         parts.append("\n".join([*lines, r"\bottomrule", r"\end{tabular}"]))
     return "\n\n".join(parts) + "\n"

@@ -12,7 +12,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
+import yaml
 from hydra import compose, initialize_config_dir
+from matplotlib.colors import to_rgba
 from omegaconf import OmegaConf
 
 from mosa import whole_files
@@ -22,8 +25,8 @@ from mosa.errors import ConfigError, DataError
 from mosa.experiments import analyses, commits, running
 from mosa.experiments.analyses import ANALYSES
 from mosa.experiments.collecting import Cell, best_of, records_of, table
-from mosa.experiments.drawing import draw
-from mosa.experiments.page import older, verdict
+from mosa.experiments.drawing import FURTHER, MARKED, STYLES, draw, style_of
+from mosa.experiments.page import older, read_tables, verdict
 from mosa.experiments.printed import printed_table
 from mosa.experiments.specification import (
     CROWD,
@@ -280,12 +283,29 @@ def test_a_table_has_means_and_spreads_over_seeds_and_the_mean_over_columns_that
     assert rows["ours"]["a"] == Cell(pytest.approx(11.0), pytest.approx(math.sqrt(2)), 2)
     assert rows["prior"]["a"] == Cell(pytest.approx(20.0), pytest.approx(0.0), 2)
     assert rows["box"]["b"] is None
-    assert rows["ours"]["mean"] == rows["ours"]["a"]  # of a alone: b is missing of one row
+    assert rows["ours"]["mean"] == Cell(pytest.approx(21.0), pytest.approx(math.sqrt(2)), 2) and rows["box"]["mean"] is None
     assert best_of(rows, "a", "least") in ("ours", "box") and best_of(rows, "b", "least") == "prior"
     assert best_of(rows, "a", None) is None
-    only = narrowed(found, {"method": ["prior", "ours"]}, None)
-    rows = table(only, records_of(jobs_of(only, tmp_path)), found.figures[1])
-    assert rows["ours"]["mean"] == Cell(pytest.approx(21.0), pytest.approx(math.sqrt(2)), 2)
+
+
+def test_what_failed_or_diverged_is_not_what_was_not_run(tmp_path):
+    """A run that failed says why in the table's file; an infinite error is one that diverged, and neither is best or in a mean."""
+    found, jobs = made_up(tmp_path)
+    missing = [job for job in jobs if not job.finished]
+    assert table(found, records_of(jobs), found.figures[1])["box"]["b"] is None
+    (missing[0].folder).mkdir(parents=True, exist_ok=True)
+    (missing[0].folder / "failed.txt").write_text("SimulationDiverged: the step is too large\n")
+    ended = next(job for job in jobs if job.finished for place in job.places
+                 if place["scene"].name == "a" and place["method"].name == "ours")  # fmt: skip
+    write_metrics(ended, rms=math.inf, prior=0.020)
+    rows = table(found, records_of(jobs), found.figures[1])
+    assert rows["box"]["b"].text(1) == "failed" and rows["ours"]["a"].text(1) == "diverged" and rows["ours"]["a"].sd is None
+    assert rows["ours"]["mean"] is None and best_of(rows, "a", "least") != "ours" and best_of(rows, "b", "least") == "prior"
+    page = write_results(found, jobs, tmp_path / "results", "the command").read_text()
+    assert f"failed: {missing[0].folder.name} (" in page and "): SimulationDiverged: the step is too large" in page
+    assert "not run: " in page  # the other seed of it
+    again = read_tables(tmp_path / "results" / f"{found.name}.json")[0][found.figures[1].label]
+    assert again["box"]["b"].text(1) == "failed" and again["ours"]["a"].text(1) == "diverged"
 
 
 def test_what_was_identified_before_the_adapter_has_its_own_name_and_infinite_figures_are_read(tmp_path):
@@ -296,7 +316,7 @@ def test_what_was_identified_before_the_adapter_has_its_own_name_and_infinite_fi
     rows = table(found, records_of(jobs), found.figures[0])
     assert rows["prior"]["a"].mean == pytest.approx(2.0) and rows["ours"]["a"].mean == pytest.approx(3.0)
     assert rows["ours"]["a"].sd is None and rows["ours"]["a"].text(2) == "3.00"
-    assert table(found, records_of(jobs), found.figures[1])["ours"]["a"].text(2) == "inf"
+    assert table(found, records_of(jobs), found.figures[1])["ours"]["a"].text(2) == "diverged"
 
 
 def test_the_page_says_where_its_figures_come_from_and_what_is_missing(tmp_path):
@@ -306,7 +326,7 @@ def test_the_page_says_where_its_figures_come_from_and_what_is_missing(tmp_path)
     for part in ("| ours ", "11.0 ± 1.4", "`the command`", "seeds: 0, 1", "a machine", "6 of 8 jobs complete",
                  "12.0 minutes", "The paper prints", "31.35 / 92.3", "made.png"):  # fmt: skip
         assert part in text, part
-    assert text.count("- missing: ") == 2
+    assert text.count("- not run: ") == 2
     assert (tmp_path / "results" / "made.png").stat().st_size > 1000 and (tmp_path / "results" / "made.pdf").is_file()
     lines = (tmp_path / "results" / "made.csv").read_text().splitlines()
     assert lines[0] == "method,scene,seed,label,figure,value,run" and len(lines) == 1 + 3 * 2 * 2 * 2
@@ -331,7 +351,7 @@ def test_a_map_has_the_figure_s_decimals_and_bars_say_where_they_begin(tmp_path)
     ssim = Figure("SSIM x100", "test/ssim_crop", 100, 1, "most")
     place = draw(replace(found, figures=(ssim,), plot="bars"), {"SSIM x100": close}).axes[0]
     low, high = place.get_ylim()
-    assert high == 100 and low > 90 and place.get_ylabel() == f"axis cut at {low:.4g}"
+    assert 99 < high <= 100 and 90 < low < 98 and place.get_ylabel() == f"axis cut at {low:.4g}"
     alone = {"method": {"a": Cell(1.0, None, 1)}, "other": {"a": Cell(30.0, None, 1)}}
     place = draw(replace(found, figures=(replace(ssim, figure="test/psnr_crop"),), plot="bars"), {"SSIM x100": alone}).axes[0]
     assert place.get_ylim()[0] == 0 and place.get_ylabel() == ""
@@ -349,26 +369,131 @@ def test_a_method_of_which_nothing_was_run_takes_no_bar_and_no_colour(tmp_path):
     assert len(colours) == 3 and colours[0] == colours[1] != colours[2]
 
 
+def test_every_method_of_the_paper_has_a_colour_of_its_own_in_every_picture():
+    """Whatever else is in the picture, and whether it is bars or lines."""
+    names = [option.name for option in load_experiment(PAPER, "table_generalisation").axes["method"]]
+    assert set(names) <= set(STYLES) and len({STYLES[name]["color"] for name in names}) == len(names)
+    assert not {style["color"] for style in STYLES.values()} & set(FURTHER)
+    value = Cell(2.0, None, 1)
+    few = {"box": {"a": value}, "ours": {"a": value}}
+    many = {"NeuMA": {"a": value}, "box": {"a": None}, "ours": {"a": value}, "other": {"a": value}}
+    figures = (Figure("rms", "test/rms_m", 1, 1, "least"),)
+    first, second = (draw(experiment(figures=figures), {"rms": rows}).axes[0] for rows in (few, many))
+    colours = [{bar.get_label(): bar[0].get_facecolor() for bar in place.containers} for place in (first, second)]
+    assert colours[0]["ours"] == colours[1]["ours"] and len(set(colours[1].values())) == 3
+    lines = draw(experiment(figures=figures, plot="lines", rows="scene", columns="method"),
+                 {"rms": {scene: {name: value for name in ("prior", "box", "ours")} for scene in "ab"}}).axes[0]  # fmt: skip
+    (ours,) = [line for line in lines.lines if line.get_label() == "ours"]
+    assert to_rgba(ours.get_color()) == colours[0]["ours"]
+
+
+def test_what_diverged_what_failed_and_what_was_not_run_differ():
+    cells = {"x": Cell(1.0, None, 1), "y": Cell(math.inf, None, 1), "z": Cell(math.nan, None, 0)}
+    rows = {"ours": cells, "box": {"x": None, "y": Cell(2.0, None, 1), "z": None}, "prior": dict.fromkeys("xyz")}
+    canvas = draw(experiment(figures=(Figure("rms", "test/rms_m", 1, 1, "least"),)), {"rms": rows})
+    (place,) = canvas.axes
+    assert [(round(float(line.get_xdata()[0])), line.get_marker()) for line in place.lines] == [(1, "x"), (2, "+")]
+    assert {line.get_color() for line in place.lines} == {style_of("ours")["color"]}
+    assert [text.get_text() for text in canvas.legends[0].get_texts()] == ["ours", "box", "diverged", "failed"]
+    assert canvas.get_supxlabel() == "gap: not run; not run: prior"
+    assert draw(experiment(figures=(Figure("rms", "test/rms_m"),)), {"rms": {"ours": {"x": None}}}) is None
+
+
+@pytest.mark.parametrize("plot", ["bars", "lines"])
+def test_every_axis_without_its_zero_says_so_and_errors_over_a_decade_are_logarithmic(plot):
+    figures = (Figure("PSNR", "test/psnr_crop", best="most"), Figure("wide", "test/rms_m", 1, 1, "least"),
+               Figure("rms", "test/rms_m", 1, 1, "least"))  # fmt: skip
+    sizes = {"PSNR": (25.0, 30.0, 31.0), "wide": (1.5, 20.0, 40.0), "rms": (5.0, 6.0, 7.0)}
+    tables = {label: {"prior": {"a": Cell(x, None, 1), "b": Cell(y, 0.5, 2)}, "ours": {"a": Cell(z, None, 1), "b": None}}
+              for label, (x, y, z) in sizes.items()}  # fmt: skip
+    made = experiment(figures=figures, plot=plot)
+    if plot == "lines":
+        made = replace(made, rows="scene", columns="method")
+        tables = {label: {column: {row: rows[row][column] for row in rows} for column in "ab"} for label, rows in tables.items()}
+    psnr, wide, rms = draw(made, tables).axes
+    assert 20 < psnr.get_ylim()[0] < 25 and psnr.get_ylabel() == f"axis cut at {psnr.get_ylim()[0]:.4g}"
+    assert wide.get_yscale() == "log" and wide.get_ylabel() == "logarithmic axis from 1"
+    assert rms.get_yscale() == "linear" and rms.get_ylim()[0] == 0 and rms.get_ylabel() == ""
+    if plot == "lines":  # a bar of an error for the one point with two seeds
+        assert [len(bar[2][0].get_segments()) for bar in psnr.containers] == [1]
+    most = (Figure("SSIM", "test/ssim_crop", 100, 1, "most"),)
+    high = {row: dict.fromkeys(cells, Cell(99.9, None, 1)) for row, cells in tables["rms"].items()}
+    (ssim,) = draw(replace(made, figures=most), {"SSIM": high}).axes
+    assert ssim.get_ylim()[1] <= 100 and ssim.get_ylabel().startswith("axis cut at 9")
+
+
+def test_a_map_is_lighter_where_it_is_better_and_frames_the_default_of_the_configuration():
+    made = load_experiment(PAPER, "figure_alpha")
+    defaults = yaml.safe_load((CONF / "adapter" / "mosa.yaml").read_text())["adapter"]
+    assert defaults["alpha_normal"] is None and MARKED["alpha", "alpha_normal"]["default"] == (defaults["alpha"], defaults["alpha"])
+    names = [option.name for option in made.axes["alpha"]]
+    cells = {row: {column: Cell(i + j, None, 1) for j, column in enumerate(names)} for i, row in enumerate(names)}
+    cells["0.30"] |= {"0.30": None, "0.20": Cell(-math.inf, None, 1)}
+    canvas = draw(made, {figure.label: cells for figure in made.figures})
+    psnr, rms = canvas.axes[:2]
+    for place in (psnr, rms):
+        assert [tuple(patch.get_xy()) for patch in place.patches] == [(0.52, 0.53), (1.52, 1.53)]
+        words = [text.get_text() for text in place.texts]
+        assert {"default", "the paper's", "diverged"} <= set(words) and len(words) == 2 + 24
+    shades = [place.images[0].cmap(place.images[0].norm(np.array([0.0, 7.0]))).sum(1) for place in (psnr, rms)]
+    assert shades[0][0] < shades[0][1] and shades[1][0] > shades[1][1]
+    assert canvas.get_supxlabel() == "white: not run"
+
+
+def test_many_bars_have_a_row_for_each_figure_and_no_picture_is_wider_than_a_page():
+    for bars_of_a_part, down in ((2, 2), (9, 4)):
+        rows = {name: {column: Cell(1.0, None, 1) for column in "abcdefghi"[:bars_of_a_part]} for name in ("ours", "NeuMA")}
+        figures = tuple(Figure(label, "test/rms_m", best="least") for label in "pqrs")
+        canvas = draw(experiment(figures=figures), dict.fromkeys("pqrs", rows))
+        canvas.draw_without_rendering()
+        assert len({round(place.get_position().y0, 3) for place in canvas.axes}) == down
+        assert canvas.get_figwidth() == 9
+
+
+def test_the_factors_of_all_bodies_have_one_range_about_one(tmp_path, monkeypatch):
+    found = narrowed(experiment(), {"method": ["ours"]}, (0,))
+    records = records_of(jobs_of(found, tmp_path))
+    rest = torch.rand(20, 3) - 0.5
+    factors = {"a": 1 + 0.1 * rest[:, 0], "b": 1 + 0.6 * rest[:, 1]}
+    model = SimpleNamespace(heterogeneity=None)
+    twins = [SimpleNamespace(body=SimpleNamespace(rest=rest, heterogeneity=True, model=lambda: model, factor=lambda _, f=f: f),
+                             config={"cfg": {"scene": {"name": "other"}}})
+             for f in (factors[record.place["scene"].name] for record in records)]  # fmt: skip
+    monkeypatch.setattr(analyses, "loaded", lambda _: zip(records, twins))
+    drawn = []
+    monkeypatch.setattr(analyses, "save", lambda canvas, path: drawn.append(canvas) or path)
+    ANALYSES["heterogeneity"](found, records, tmp_path / "law")
+    parts = [place.collections[0] for place in drawn[0].axes[:2]]
+    (limits,) = {part.get_clim() for part in parts}
+    assert sum(limits) == pytest.approx(2.0) and limits[1] >= float(factors["b"].max())
+    assert drawn[0].axes[-1].get_xlabel().startswith("factor on the stiffness, 1: as the calibrated law")
+    assert [drawn[0].axes[i].get_ylabel() for i in (0, 2)] == ["learned", "truth"]
+
+
 @pytest.mark.parametrize("columns", [["a"], ["a", "b"]])
-def test_the_parts_of_a_picture_of_directions_share_their_axes(tmp_path, monkeypatch, columns):
-    """An isotropic law beside one with a ratio of 1.6: the rounding of the first is no curve, also where it is alone."""
+def test_the_rounding_of_an_isotropic_law_is_no_curve_and_a_response_of_zero_is_seen(tmp_path, monkeypatch, columns):
+    """Beside one with a ratio of 1.6 and alone; the ripples of each part have a range of their own, E in kPa begins at 0."""
     found = narrowed(experiment(), {"method": ["ours"], "scene": columns}, (0,))
     records = records_of(jobs_of(found, tmp_path))
     laws = {"a": lambda n: 1e5 * (1 + 1e-4 * n[:, 0]), "b": lambda n: 1e5 * (1 + 0.6 * n[:, 0] ** 2)}
     twins = [SimpleNamespace(body=record.place["scene"].name, config={"cfg": {"scene": {"name": "rabbit"}}}) for record in records]
     monkeypatch.setattr(analyses, "loaded", lambda _: zip(records, twins))
-    monkeypatch.setattr(analyses, "redistribution", lambda body, n: 0.1 * n[:, 0].abs())
+    monkeypatch.setattr(analyses, "redistribution", lambda body, n: (0.1 if body == "b" else 0.0) * n[:, 0].abs())
     monkeypatch.setattr(analyses, "learned_modulus", lambda body, n: laws[body](n))
     monkeypatch.setattr(analyses, "true_modulus", lambda *_: None)
     drawn = []
     monkeypatch.setattr(analyses, "save", lambda canvas, path: drawn.append(canvas) or path)
     ANALYSES["directions"](found, records, tmp_path / "law")
-    places = np.array(drawn[0].axes).reshape(2, len(columns))
-    for row in places:
-        assert len({place.get_ylim() for place in row}) == 1
+    places = np.array(drawn[0].axes).reshape(3, len(columns))
     low, high = places[1, 0].get_ylim()
     curve = places[1, 0].lines[0].get_ydata()
-    assert low <= 0.95 and high >= 1.05 and curve.max() - curve.min() < 0.01 * (high - low)
+    assert low <= 0.95 and 1.05 <= high < 1.2 and curve.max() - curve.min() < 0.01 * (high - low)
+    assert places[1, 0].get_ylabel() == f"E over its mean (axis cut at {low:.4g})"
+    low, high = places[0, 0].get_ylim()
+    assert low < -0.02 * high  # w of 0 lies beside the axis, not on it
+    for place in places[2]:
+        assert place.get_ylim()[0] == 0 and place.lines[0].get_ydata().mean() > 90 and place.get_ylabel() == "E [kPa]"
+    assert all(place.lines[0].get_color() == style_of("ours")["color"] for place in places.ravel())
 
 
 def test_results_that_cannot_be_written_leave_the_ones_before(tmp_path, monkeypatch):
@@ -465,8 +590,14 @@ def test_a_quick_variant_runs_to_its_table_and_is_not_run_again(cache, tmp_path,
     text, _ = ANALYSES["compression"](two, records_of(jobs_of(two, tmp_path / "runs", more)), tmp_path / "law")
     assert "| tiny  | ours" in text and "| again | ours" in text and (tmp_path / "law_plates.png").is_file()
     plates = [line.split(",") for line in (tmp_path / "law_plates.csv").read_text().splitlines()[1:]]
-    assert [row[:2] for row in plates[::13]] == [["tiny", "truth"], ["tiny", "ours"], ["again", "truth"], ["again", "ours"]]
-    assert len(plates) == 4 * 13 and [row[2:] for row in plates[:26]] == [row[2:] for row in plates[26:]]
+    assert [row[:2] for row in plates[::13]] == [["tiny", "ours"], ["again", "ours"]]  # twelve directions and the fibres'
+    assert len(plates) == 2 * 13 and [row[2:] for row in plates[:13]] == [row[2:] for row in plates[13:]]
+    pressed = [float(row[4]) for row in plates[:13]]
+    assert max(pressed) / min(pressed) == pytest.approx(1.6, rel=0.1)  # of the truth, between plates
+    for job in jobs_of(two, tmp_path / "runs", more):
+        (job.folder / "checkpoints" / "last.ckpt").unlink(missing_ok=True)
+    kept, _ = ANALYSES["compression"](two, records_of(jobs_of(two, tmp_path / "runs", more)), tmp_path / "law")
+    assert kept == text  # what was measured is in the run's folder
     true = [float(row[5]) for row in rows]
     assert true[0] / true[18] == pytest.approx(1.6, rel=0.01)  # along the rabbit's fibres and across
     assert float(rows[0][4]) > 0 and float(rows[0][3]) >= 0
@@ -491,6 +622,45 @@ def test_a_claim_holds_only_by_more_than_the_spread_of_the_seeds():
     assert one == "holds against those that were run, 10.0 against 20.0 (prior); not run: box; one seed"
     best = Claim("more is better", "PSNR", row="ours", against=("prior",))
     assert verdict(found, best, {"PSNR": cells(ours=(30.0, None, 1), prior=(31.0, None, 1))}).startswith("does not hold")
+
+
+def of_columns(**rows) -> dict:
+    """Rows of figures in the columns a, b, c, of one seed."""
+    return {row: {column: None if value is None else Cell(value, None, 1) for column, value in zip("abc", values)}
+            for row, values in rows.items()}  # fmt: skip
+
+
+def test_rows_are_compared_where_both_were_run_and_that_is_said():
+    """A column in which the other one diverged is no part of the means, and counts as one in which it is worse."""
+    claim = Claim("ours is ahead", "rms [mm]", row="ours", against=("prior", "box"))
+    rows = of_columns(ours=(10.0, 12.0, 30.0), prior=(20.0, 22.0, 24.0), box=(15.0, None, math.inf))
+    assert verdict(experiment(), claim, {"rms [mm]": rows}) == (
+        "holds, 17.3 against 22.0 (prior; better in 2 of 3), 10.0 against 15.0 (box; better in 2 of 2; without b, c); one seed")
+    behind = rows | of_columns(box=(9.0, None, math.inf))
+    assert verdict(experiment(), claim, {"rms [mm]": behind}).startswith("does not hold, 17.3 against")
+    sds = {"ours": {"a": Cell(10.0, 3.0, 3), "b": Cell(10.0, 4.0, 3)}, "prior": {"a": Cell(12.0, 0.0, 3), "b": Cell(12.0, 0.0, 3)}}
+    assert verdict(experiment(), replace(claim, against=("prior",)), {"rms [mm]": sds}) == (
+        "within the spread, 10.0 ± 2.5 against 12.0 ± 0.0 (prior; better in 2 of 2)")  # of the mean sqrt(3^2 + 4^2) / 2
+
+
+def test_a_claim_of_every_column_names_those_in_which_it_fails():
+    claim = Claim("gains under each", "PSNR", row="ours", against=("prior",), each=True)
+    rows = of_columns(ours=(30.0, 28.0, -math.inf), prior=(29.0, 29.0, 25.0))
+    assert verdict(experiment(), claim, {"PSNR": rows}) == (
+        "does not hold, ahead in 1 of 3 (a); b: 28.00 against 29.00 (prior); c: diverged; one seed")
+    better = of_columns(ours=(30.0, 30.0, 26.0), prior=(29.0, 29.0, -math.inf))
+    assert verdict(experiment(), claim, {"PSNR": better}) == "holds, ahead in 3 of 3; one seed"
+    rows = of_columns(ours=(29.2, 31.0, 30.0), prior=(29.0, 30.0, 29.0))
+    near = verdict(experiment(), replace(claim, spread=0.5), {"PSNR": rows})
+    assert near == "does not hold, ahead in 2 of 3 (b, c); a: 29.20 against 29.00 (prior); one seed"
+    assert verdict(experiment(), claim, {"PSNR": of_columns(ours=(None, None, None), prior=(1.0, 1.0, 1.0))}) == "not run"
+
+
+def test_of_one_seed_a_difference_has_to_be_more_than_the_spread_that_is_given():
+    claim = Claim("helps", "PSNR", row="ours", against=("prior",), spread=0.3)
+    rows = {gain: cells(ours=(30.0 + gain, None, 1), prior=(30.0, None, 1)) for gain in (0.2, 0.4, -0.2, -0.4)}
+    said = {gain: verdict(experiment(), claim, {"PSNR": found}).partition(",")[0] for gain, found in rows.items()}
+    assert said == {0.2: "within the spread", 0.4: "holds", -0.2: "within the spread", -0.4: "does not hold"}
 
 
 def test_a_bound_excuses_what_the_posterior_says_is_not_determined():
@@ -529,18 +699,19 @@ def test_the_page_has_what_was_run_and_says_what_was_not(tmp_path):
     text = (tmp_path / "docs" / "results.md").read_text()
     assert "[A law](results/law_from_motion.md)." in text
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
-    glance = {row[0]: row[1:] for row in rows if len(row) == 4}
-    assert glance["Ablations of the paper's adapter and of its motion cues"] == ["not run", "", "4 not run"]
-    jobs_complete, _, claims = glance["Generalisation to drops that were not seen"]
-    assert jobs_complete == "4 of 4" and claims == "2 hold against what was run, 2 not run"
+    glance = {row[0]: row[1:] for row in rows if len(row) == 5}
+    assert glance["Ablations of the paper's adapter and of its motion cues"] == ["not run", "", "4 not run", ""]
+    jobs_complete, _, papers, about_ours = glance["Generalisation to drops that were not seen"]
+    assert jobs_complete == "4 of 4" and papers == "2 not run" and about_ours == "2 hold against what was run"
     for name in NAMES:
         assert f"## {load_experiment(PAPER, name).title}" in text
     assert "31.35 / 92.3" in text and "`the command`" in text and "](results/table_generalisation.png)" in text
     row = next(line for line in text.splitlines() if line.startswith("| NCLaw"))
     assert row.count("not run") >= 2
     least = "our default has the smallest error of all"
-    assert f"{least}: **holds against those that were run, 10.0 against 20.0 (prior only), 30.0 (NeuMA); not run:" in text
-    assert "Ours: not run. `mosa-experiment table_ablation`" in text
+    assert f"{least}: **holds against those that were run, 10.0 against 20.0 (prior only; better in 2 of 2), " in text
+    assert "30.0 (NeuMA; better in 2 of 2); not run: " in text
+    assert "Here: not run. `mosa-experiment table_ablation`" in text
     with pytest.raises(ConfigError, match="--results: expected a folder"):
         run(arguments(["--page", "--results", str(tmp_path / "nothing")]))
     (tmp_path / "docs" / "results" / "table_generalisation.json").write_text("{}")

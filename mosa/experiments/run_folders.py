@@ -1,0 +1,53 @@
+"""What the analyses of an experiment share: names of records, tables on disk, laws from the checkpoints of runs."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from mosa.experiments.collecting import Record
+from mosa.experiments.specification import Experiment
+from mosa.twin import Twin
+from mosa.whole_files import written_whole
+
+
+def label(experiment: Experiment, record: Record) -> str:
+    """What the record is called where the columns are parts of the picture."""
+    return record.place[experiment.rows].name
+
+
+def prefix(record: Record) -> str:
+    return "".join(option.prefix for option in record.place.values())
+
+
+def write_table(path: Path, header: Sequence[str], rows: Sequence[Sequence]) -> None:
+    with written_whole(path) as partial, open(partial, "w", newline="") as file:
+        csv.writer(file).writerows([header, *rows])
+
+
+def checkpoint(record: Record) -> Path:
+    """Where a record's run keeps its last checkpoint, whether there is one or not."""
+    return record.job.folder / "checkpoints" / "last.ckpt"
+
+
+def pressed_file(record: Record) -> Path:
+    """What `specimens` has measured of a record's laws."""
+    return record.job.folder / "pressed.json"
+
+
+def first_seeds(records: Sequence[Record], prefixes: Sequence[str], files: Sequence[Callable[[Record], Path]]) -> Iterator[Record]:
+    """The records of these models, of several seeds the first that has one of the files."""
+    seen = set()
+    for record in records:
+        key = tuple(option.name for option in record.place.values())
+        if prefix(record) in prefixes and key not in seen and any(file(record).is_file() for file in files):
+            seen.add(key)
+            yield record
+
+
+def loaded(records: Sequence[Record], prefixes: Sequence[str] = ("",)) -> Iterator[tuple[Record, Twin]]:
+    """The records of these models (the learned law's, where nothing else is said) that have a checkpoint, with it; of several seeds
+    the first."""
+    for record in first_seeds(records, prefixes, [checkpoint]):
+        yield record, Twin.load(checkpoint(record))
