@@ -9,7 +9,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from mosa.experiments.specification import FAILED, MINUTES, Job
+from mosa.experiments.commits import commit
+from mosa.experiments.specification import COMMIT, FAILED, MINUTES, Job
 from mosa.whole_files import write_whole
 
 PROGRAM = "from mosa.commands.train import main; main()"
@@ -68,6 +69,7 @@ def run_jobs(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: i
 def begin(job: Job, device: int | None) -> subprocess.Popen:
     job.folder.mkdir(parents=True, exist_ok=True)
     (job.folder / FAILED).unlink(missing_ok=True)
+    write_whole(job.folder / COMMIT, commit() + "\n")
     environment = dict(os.environ)
     environment.setdefault("OMP_NUM_THREADS", "1")
     if device is not None:

@@ -19,6 +19,8 @@ SHARED = "_shared"
 """File of axes that several experiments name."""
 MINUTES = "minutes.txt"
 """File of a job's folder with the wall time of its process."""
+COMMIT = "commit.txt"
+"""File of a job's folder with the state of the program that its run was last begun with."""
 FAILED = "failed.txt"
 """File of a job's folder with the reason why its run failed."""
 
@@ -285,6 +287,12 @@ def minutes_taken(job: Job) -> float | None:
     figures = figures_of(job)
     return sum(value for key, value in figures.items() if key.startswith("time/") and key.endswith("_s") and key.count("_") == 1
                and isinstance(value, (int, float))) / 60  # fmt: skip
+
+
+def commit_of(job: Job) -> str | None:
+    """Which state of the program made a complete job; None where that was not written."""
+    said = job.folder / COMMIT
+    return said.read_text(errors="replace").strip() if job.finished and said.is_file() else None
 
 
 def total_minutes(jobs: Sequence[Job]) -> float:

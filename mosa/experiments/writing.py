@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import platform
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,7 +16,7 @@ from mosa.experiments.commits import commit
 from mosa.experiments.drawing import draw, save
 from mosa.experiments.page import write_json
 from mosa.experiments.printed import printed_table
-from mosa.experiments.specification import Experiment, Figure, Job, minutes_taken
+from mosa.experiments.specification import Experiment, Figure, Job, commit_of, minutes_taken
 from mosa.whole_files import write_whole, written_whole
 
 
@@ -94,12 +95,21 @@ def provenance(experiment: Experiment, jobs: Sequence[Job], records: Sequence[Re
     minutes = [minutes_taken(job) or 0.0 for job in complete]
     return [
         f"command: `{command}`",
-        f"version {mosa.__version__}, commit {commit()}",
+        f"version {mosa.__version__}, {made_by(complete)}",
         f"seeds: {', '.join(map(str, experiment.seeds))}; ± is the standard deviation over them, of one seed there is none",
         f"machine: {', '.join(devices) or 'none'}; Python {platform.python_version()}",
         f"{len(complete)} of {len(jobs)} jobs complete, {sum(minutes):.1f} minutes of jobs, written "
         f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
     ]
+
+
+def made_by(jobs: Sequence[Job]) -> str:
+    """The states of the program that complete jobs were run with, the commonest first; of those that do not say it the present
+    one."""
+    counts = Counter(commit_of(job) or commit() for job in jobs) or Counter([commit()])
+    (first, _), *others = counts.most_common()
+    more = ", ".join(f"{count} job{'s' * (count > 1)} of {other}" for other, count in others)
+    return f"commit {first}" + (f" ({more})" if more else "")
 
 
 def write_csv(path: Path, experiment: Experiment, records: Sequence[Record]) -> None:

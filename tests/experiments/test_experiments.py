@@ -45,7 +45,7 @@ from mosa.experiments.specification import (
     narrowed,
     pairs,
 )
-from mosa.experiments.writing import write_results
+from mosa.experiments.writing import made_by, write_results
 from mosa.keys import EVALUATION, TRAINING
 from mosa.schema import check
 
@@ -729,6 +729,18 @@ def test_the_page_says_of_figures_that_the_program_has_changed_since(monkeypatch
     assert found == ["**These figures are of an older commit, 0123456789ab:** 3 commits have changed the program (`mosa/`, "
                      "`conf/`) since, up to when this page was made. What it gives now was not run."] * said
     assert older(["version 0.1.0, commit unknown"]) == [] and len(asked) == 1
+
+
+def test_results_name_the_commits_that_their_runs_were_made_with(tmp_path):
+    """Not the one that collects them: the commonest first, and the others with how many they are."""
+    found, jobs = made_up(tmp_path)
+    complete = [job for job in jobs if job.finished]
+    assert made_by(complete) == f"commit {commits.commit()}"
+    for job, made in zip(complete, ("0123456789ab", "ba9876543210, with changes") + ("0123456789ab",) * 9):
+        (job.folder / "commit.txt").write_text(made + "\n")
+    assert made_by(complete) == "commit 0123456789ab (1 job of ba9876543210, with changes)"
+    page = write_results(found, jobs, tmp_path / "results", "the command").read_text()
+    assert "commit 0123456789ab (1 job of ba9876543210, with changes)" in page
 
 
 def test_the_commit_of_a_result_is_that_of_the_checkout():
