@@ -21,6 +21,7 @@ from mosa.config import build_body, run_config
 from mosa.data.agreement import lines_of_sight, misses
 from mosa.errors import ConfigError, MosaError
 from mosa.limits import machine_memory
+from mosa.modules.backbone_search import rollouts_of_search
 from mosa.modules.body import Body, Start, World
 from mosa.modules.ground_search import ASKED, FRICTIONS, RIVAL_ITERATIONS, TRIED
 from mosa.modules.identification import Identification
@@ -256,7 +257,9 @@ def newton_rollouts(module: LitMosa, stage: Stage) -> float:
     begun = planned.calibrating and not stage.looks_again
     contacts = (3 + len(RUBBING) * len(FRICTIONS)) * (TRIED * each + 3) if begun and module.ground_is_sought else 0
     contacts += ASKED * RIVAL_ITERATIONS * each if stage.learns_adapter and module.ground_is_sought else 0
-    return len(planned.pairs) * (stage.iterations * each + contacts + (24 if begun else 0))
+    learned = [name for name, raw in module.body.material.raw.items() if raw.requires_grad]
+    searched = rollouts_of_search(learned, each) if begun else 0
+    return len(planned.pairs) * (stage.iterations * each + contacts + searched)
 
 
 def seconds_of_fit(module: LitMosa, speeds: Speeds, frames: int, processes: int = 1) -> float:

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 from mosa.experiments.specification import Experiment, Figure, Job, Option, read_job
 
-WORDS = ("*diverged*: the law cannot be simulated there; *failed*: the run ended with an error, which the table's own file names.")
-"""What stands in place of figures."""
-OF_MEANS = "Mean: over all columns; a row that lacks one of them has none. " + WORDS
-"""What a mean is (`table`)."""
+MEAN = "Mean: over all columns; a row that lacks one of them has none."
+INSTEAD = {"diverged": "the law cannot be simulated there",
+           "failed": "the run ended with an error, which the table's own file names"}
+"""What stands in place of a figure (`Cell.text`)."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,14 @@ class Cell:
 
 FAILED = Cell(math.nan, None, 0)
 """Of a place of which no run is complete, and one has failed."""
+
+
+def said_below(tables: Mapping[str, Mapping[str, Mapping[str, Cell | None]]]) -> str:
+    """What its words mean that stand in place of figures, and what a mean is; empty where there is neither."""
+    cells = [(column, cell) for rows in tables.values() for found in rows.values() for column, cell in found.items()]
+    used = {cell.text(0) for _, cell in cells if cell is not None}
+    words = "; ".join(f"*{word}*: {meaning}" for word, meaning in INSTEAD.items() if word in used)
+    return " ".join([MEAN] * any(column == "mean" for column, _ in cells) + [f"{words}."] * bool(words))
 
 
 def records_of(jobs: Sequence[Job]) -> list[Record]:

@@ -15,7 +15,7 @@ from typing import Any
 
 from mosa.analysis.tables import markdown
 from mosa.errors import ConfigError, DataError
-from mosa.experiments.collecting import OF_MEANS, WORDS, Cell
+from mosa.experiments.collecting import Cell, said_below
 from mosa.experiments.commits import commits_since
 from mosa.experiments.printed import printed_table
 from mosa.experiments.specification import Claim, Experiment, Figure, load_experiment
@@ -160,9 +160,9 @@ def ours(experiment: Experiment, tables: Tables) -> str:
     for row in rows:
         cells = [[text(f, row, column) for f in figures] for column in columns]
         lines.append([row, *(side_by_side(values, "-" if column == "mean" else NOT_RUN) for column, values in zip(columns, cells))])
-    words = OF_MEANS if "mean" in columns else WORDS
+    said = said_below(tables)
     header = [f"{experiment.rows} \\ {experiment.columns}" if experiment.plot == "map" else experiment.rows, *columns]
-    return f"Here ({' / '.join(f.label for f in figures)}):\n\n" + markdown(header, lines) + f"\n\n{words}"
+    return f"Here ({' / '.join(f.label for f in figures)}):\n\n" + markdown(header, lines) + (f"\n\n{said}" if said else "")
 
 
 def side_by_side(values: Sequence[str], without: str) -> str:

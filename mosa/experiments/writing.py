@@ -11,7 +11,7 @@ from pathlib import Path
 
 import mosa
 from mosa.analysis.tables import markdown
-from mosa.experiments.collecting import OF_MEANS, WORDS, Cell, Record, best_of, records_of, table
+from mosa.experiments.collecting import Cell, Record, best_of, records_of, said_below, table
 from mosa.experiments.commits import commit
 from mosa.experiments.drawing import draw, save
 from mosa.experiments.page import write_json
@@ -60,7 +60,7 @@ def markdown_page(
         bold = "{}" if experiment.plot == "map" else "**{}**"  # of a map no column has a best row
         body = [[row, *(cell_text(rows, row, column, figure, bold) for column in header[1:])] for row in rows]
         parts.append(f"{figure.label}{arrow(figure)} (`{figure.figure}`)\n\n" + markdown(header, body))
-    parts.append(OF_MEANS if experiment.mean and any("mean" in row for rows in tables.values() for row in rows.values()) else WORDS)
+    parts += [said] if (said := said_below(tables)) else []
     if extra:
         parts.append(extra)
     parts += [f"![{experiment.title}]({picture.name})" for picture in pictures]
@@ -97,7 +97,7 @@ def provenance(experiment: Experiment, jobs: Sequence[Job], records: Sequence[Re
         f"command: `{command}`",
         f"version {mosa.__version__}, {made_by(complete)}",
         f"seeds: {', '.join(map(str, experiment.seeds))}; ± is the standard deviation over them, of one seed there is none",
-        f"machine: {', '.join(devices) or 'none'}; Python {platform.python_version()}",
+        f"machine: {', '.join(devices) or 'none'}; collected under Python {platform.python_version()}",
         f"{len(complete)} of {len(jobs)} jobs complete, {sum(minutes):.1f} minutes of jobs, written "
         f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
@@ -12,6 +13,7 @@ import torch
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.modules.body import Body
 from mosa.modules.material import FORMS, STIFFNESS
+from mosa.progress import tqdm
 
 STIFFNESS_STEPS = (0.3, 0.6, 1.0, 1.5, 2.2, 3.2, 4.5, 7.0)
 POISSON_STEPS = (0.2, 0.32, 0.42)
@@ -24,6 +26,16 @@ STRIDES = {"E": 1.1, "mu": 1.1, "kappa": 1.1, "yield_stress": 1.1, "viscosity": 
 range and 17 degrees in that of the angle's."""
 FINEST = 0.2
 """Of the first steps: there a compass search ends, and Gauss-Newton goes on."""
+COMPASS = 40
+"""About how many rollouts it takes in three or four numbers."""
+MANY = 4
+"""Learned numbers from which a law has several valleys (a stiff and viscous one beside a soft one that yields early): there
+Gauss-Newton is begun at several starts, as a search in one number after the other goes down the wrong one."""
+WIDE = (0.3, 1.0, 3.2)
+"""Multiples of the stiffness among these starts, in all combinations with a first step of the compass up and down in the numbers
+that are no stiffness."""
+BEGUN, FIRST, KEPT, LAST = 6, 2, 3, 3
+"""Of these starts the nearest, beside the end of the compass search; iterations of each; how many go on, and for how many more."""
 
 
 class Calibration(Protocol):
@@ -39,6 +51,12 @@ class Calibration(Protocol):
 
     def distance(self) -> float:
         """Mean distance [m] of free rollouts from the cues."""
+
+    def state(self) -> dict:
+        """Beside the body's numbers."""
+
+    def restore(self, state: dict) -> None:
+        """As when `state` was taken."""
 
 
 def compass(at: Callable[[dict[str, float]], float], row: dict[str, float], strides: dict[str, float]) -> dict[str, float]:
@@ -59,11 +77,22 @@ def compass(at: Callable[[dict[str, float]], float], row: dict[str, float], stri
     return row
 
 
+def rollouts_of_search(learned: Sequence[str], each: float) -> float:
+    """About how many rollouts `search` takes for a law with these learned numbers; each: of an iteration."""
+    further = [n for n in learned if n not in ("E", "nu")]
+    count = len(STIFFNESS_STEPS) * (len(POISSON_STEPS) if "nu" in learned else 1) + COMPASS * bool(further)
+    if len(learned) < MANY:
+        return count
+    others = [n for n in further if n not in STIFFNESS]
+    return count + len(WIDE) * 3 ** len(others) + ((BEGUN + 1) * FIRST + KEPT * LAST) * each
+
+
 def search(calibration: Calibration) -> float:
     """Start a calibration near the smallest mean distance [m] of free rollouts from the cues, which is returned.
 
     The best of a coarse grid of stiffness and Poisson number, which goes on where its best is at an end of the stiffness; then,
-    for laws with parameters beside these, a compass search in all of them (Kolda, Lewis, Torczon, SIAM Review 45, 2003).
+    for laws with parameters beside these, a compass search in all of them (Kolda, Lewis, Torczon, SIAM Review 45, 2003); of laws
+    of `MANY` numbers, Gauss-Newton from its end and from other starts (`nearest_end`).
     Errors: SimulationDiverged where no start of the grid can be simulated."""
     material = calibration.body.material
     starts, learned = material.begins, [name for name, raw in material.raw.items() if raw.requires_grad]
@@ -104,9 +133,55 @@ def search(calibration: Calibration) -> float:
                                  "nearer to the body's, or raise simulation.max_substeps")
     row = row_of(*best[1:])
     if set(learned) - {"E", "nu"}:
-        row = compass(at, row, {n: STRIDES.get(n, 1.0) for n in learned})
+        strides = {n: STRIDES.get(n, 1.0) for n in learned}
+        row = compass(at, row, strides)
+        if len(learned) >= MANY:
+            others = [n for n in learned if n not in STIFFNESS and n != "nu"]
+            wide = [row_of(m, None) for m in (WIDE if modulated else (1.0,))]
+            wide = [each | {n: each[n] + step * strides[n] for n, step in zip(others, steps)}
+                    for each in wide for steps in itertools.product((-1, 0, 1), repeat=len(others))]  # fmt: skip
+            start_at(row)
+            return nearest_end(calibration, start_at, [row, *sorted(wide, key=at)[:BEGUN]])
     start_at(row)
     return at(row)
+
+
+def nearest_end(calibration: Calibration, start_at: Callable[[dict[str, float]], None], rows: Sequence[dict[str, float]]) -> float:
+    """Gauss-Newton from several starts, the nearest of which after a few iterations go on; the calibration is left at the nearest
+    end, as if it had not begun, and its mean distance [m] is returned. Starts that cannot be simulated are left out, but the first,
+    whose error is raised where none of them can."""
+    body = calibration.body
+    begun, here = calibration.state(), calibrated(body)
+    ends: list[tuple[float, dict[str, dict], dict]] = []
+    failed: SimulationDiverged | ConfigError | None = None
+    for row in tqdm(rows, "starts of the calibration", leave=False):
+        calibrate_as(body, here)  # the contact too
+        start_at(row)
+        try:
+            ends.append(went_on(calibration, begun, FIRST))
+        except (SimulationDiverged, ConfigError) as error:
+            failed = failed or error
+    if not ends and failed is not None:
+        raise failed
+    ends.sort(key=lambda end: end[0])
+    for end in tqdm(ends[:KEPT], "the nearest of them", leave=False):
+        calibrate_as(body, end[1])
+        try:
+            ends.append(went_on(calibration, end[2], LAST))
+        except (SimulationDiverged, ConfigError):
+            continue  # it stays where it was
+    distance, numbers, _ = min(ends, key=lambda end: end[0])
+    calibrate_as(body, numbers)
+    calibration.restore(begun)
+    return distance
+
+
+def went_on(calibration: Calibration, state: dict, iterations: int) -> tuple[float, dict[str, dict], dict]:
+    """(mean distance [m], numbers of the body, state) after further iterations. Errors: those of an iteration."""
+    calibration.restore(state)
+    for _ in range(iterations):
+        calibration.iterate()
+    return calibration.distance(), calibrated(calibration.body), calibration.state()
 
 
 def calibrated(body: Body) -> dict[str, dict]:

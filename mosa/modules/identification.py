@@ -264,8 +264,8 @@ class Identification:
                 "grid": None if self.grid is None else [[t.cpu() for t in each] for each in self.grid]}
 
     def restore(self, state: dict) -> None:
-        """As after the iterations that `state` was taken from."""
-        self.iteration = int(state["iteration"])
+        """As after the iterations that `state` was taken from, but for whether the last of them ended it."""
+        self.iteration, self.converged = int(state["iteration"]), False
         for block, factor in zip(self.newton.blocks, state["factors"], strict=True):
             block.factor = float(factor)
         device = self.body.rest.device
