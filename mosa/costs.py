@@ -257,8 +257,7 @@ def newton_rollouts(module: LitMosa, stage: Stage) -> float:
     begun = planned.calibrating and not stage.looks_again
     contacts = (3 + len(RUBBING) * len(FRICTIONS)) * (TRIED * each + 3) if begun and module.ground_is_sought else 0
     contacts += ASKED * RIVAL_ITERATIONS * each if stage.learns_adapter and module.ground_is_sought else 0
-    learned = [name for name, raw in module.body.material.raw.items() if raw.requires_grad]
-    searched = rollouts_of_search(learned, each) if begun else 0
+    searched = rollouts_of_search(module.body.material.learned, each) if begun else 0
     return len(planned.pairs) * (stage.iterations * each + contacts + searched)
 
 

@@ -17,7 +17,7 @@ from mosa.modules.body import Body, World
 from mosa.modules.gauss_newton import Posterior
 from mosa.modules.learned_numbers import as_rival, each_law, limits_of
 from mosa.modules.material import FORMS as RANGES
-from mosa.modules.material import Form, Material
+from mosa.modules.material import RELATIVE, Form, Material
 from mosa.progress import tqdm
 
 DRAWS = 12
@@ -162,7 +162,7 @@ def determined(body: Body, posterior: Posterior, *, draws: int = 400, seed: int 
         if name in body.material.raw:
             raw, own = posterior.mean[index[0]], float(posterior.covariance[index[0], index[0]].sqrt()) * INFLATION
             sd = physical_sd(name, raw, own)
-            if name in ("E", "mu", "kappa", "yield_stress", "viscosity"):
+            if name in RELATIVE:
                 figures[f"posterior/{name}_relative_sd"] = sd / float(body.material.physical_of(name, raw))
             else:
                 figures[f"posterior/{name}_sd"] = sd

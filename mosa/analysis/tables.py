@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from mosa.metrics import IMAGE_METRICS, MOTION_METRICS
 from mosa.modules.ground_choice import EXPLAINED, NEARER, alike, contact, learned_on, taken_of
-from mosa.modules.material import unit_of
+from mosa.modules.material import RELATIVE, unit_of
 from mosa.types import RUBBING
 
 MODELS = (("floor", "floor/"), ("prior", "prior/"), ("prior + eta", "prior_eta/"), ("adapted", ""))
@@ -147,7 +147,7 @@ def determined_text(figures: Mapping[str, float], law: str) -> str:
     if "posterior/draws" not in figures:
         return "\n".join(lines[:-1])
     lines += ["What the data determine:", ""]
-    for name in ("E", "mu", "kappa", "yield_stress", "viscosity"):
+    for name in RELATIVE:
         if f"posterior/{name}_relative_sd" in figures:
             lines.append(f"- {name} = {figures[f'id/{name}']:.4g} {unit_of(law, name)}, with a standard deviation of "
                          f"{figures[f'posterior/{name}_relative_sd']:.1%}.")

@@ -15,7 +15,7 @@ from typing import Any
 
 from mosa.analysis.tables import markdown
 from mosa.errors import ConfigError, DataError
-from mosa.experiments.collecting import Cell, said_below
+from mosa.experiments.collecting import INSTEAD, Cell, said_below
 from mosa.experiments.commits import commits_since
 from mosa.experiments.printed import printed_table
 from mosa.experiments.specification import Claim, Experiment, Figure, load_experiment
@@ -167,7 +167,7 @@ def ours(experiment: Experiment, tables: Tables) -> str:
 
 def side_by_side(values: Sequence[str], without: str) -> str:
     """Figures of a cell; one word where all say it; without: where there are none."""
-    return values[0] if len(set(values)) == 1 and values[0] in ("diverged", "failed") else (
+    return values[0] if len(set(values)) == 1 and values[0] in INSTEAD else (
         " / ".join(values) if any(values) else without)
 
 

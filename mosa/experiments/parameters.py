@@ -12,10 +12,7 @@ from mosa.experiments.collecting import Record
 from mosa.experiments.page import covered
 from mosa.experiments.run_folders import write_table
 from mosa.experiments.specification import Experiment
-from mosa.modules.material import unit_of
-
-MODULI = ("E", "mu", "kappa", "yield_stress", "viscosity")
-"""Their posterior's deviation is relative."""
+from mosa.modules.material import RELATIVE, unit_of
 
 
 def setting(overrides: Sequence[str], key: str) -> str | None:
@@ -39,12 +36,12 @@ def parameters(experiment: Experiment, records: Sequence[Record], stem: Path) ->
         material = OBJECTS[name].material.variant(setting(runs[0].job.overrides, "scene.material") or "anisotropic")
         for parameter, truth in material.known.items():
             found = [r.figures.get(f"id/{parameter}") for r in runs]
-            sds = [r.figures.get(f"posterior/{parameter}_{'relative_' if parameter in MODULI else ''}sd") for r in runs]
+            sds = [r.figures.get(f"posterior/{parameter}_{'relative_' if parameter in RELATIVE else ''}sd") for r in runs]
             if not all(isinstance(value, (int, float)) for value in [*found, *sds]):
                 continue
-            mean, sd = statistics.fmean(found), statistics.fmean(sds) / (1.0 if parameter in MODULI else abs(truth))
+            mean, sd = statistics.fmean(found), statistics.fmean(sds) / (1.0 if parameter in RELATIVE else abs(truth))
             off = statistics.fmean(abs(value / truth - 1) for value in found)
-            said = verdict(100 * off, 100 * sd, limits.get(parameter), 100.0 if parameter in MODULI else None)
+            said = verdict(100 * off, 100 * sd, limits.get(parameter), 100.0 if parameter in RELATIVE else None)
             spread = f" ± {statistics.stdev(found):.2g}" if len(found) > 1 else ""
             unit = unit_of(material.law, parameter)
             lines.append([option.name, f"{parameter} [{unit}]" if unit else parameter, f"{truth:g}", f"{mean:.3g}{spread}",

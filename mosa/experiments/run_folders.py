@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from mosa.experiments.collecting import Record
-from mosa.experiments.specification import Experiment
+from mosa.experiments.specification import PRESSED, Experiment
 from mosa.twin import Twin
 from mosa.whole_files import written_whole
 
@@ -33,7 +33,7 @@ def checkpoint(record: Record) -> Path:
 
 def pressed_file(record: Record) -> Path:
     """What `specimens` has measured of a record's laws."""
-    return record.job.folder / "pressed.json"
+    return record.job.folder / PRESSED
 
 
 def first_seeds(records: Sequence[Record], prefixes: Sequence[str], files: Sequence[Callable[[Record], Path]]) -> Iterator[Record]:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mosa.experiments.commits import commit
-from mosa.experiments.specification import COMMIT, FAILED, MINUTES, Job
+from mosa.experiments.specification import COMMIT, FAILED, MINUTES, PRESSED, Job
 from mosa.whole_files import write_whole
 
 PROGRAM = "from mosa.commands.train import main; main()"
@@ -68,7 +68,8 @@ def run_jobs(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: i
 
 def begin(job: Job, device: int | None) -> subprocess.Popen:
     job.folder.mkdir(parents=True, exist_ok=True)
-    (job.folder / FAILED).unlink(missing_ok=True)
+    for name in (FAILED, PRESSED):  # of the run that was here before
+        (job.folder / name).unlink(missing_ok=True)
     write_whole(job.folder / COMMIT, commit() + "\n")
     environment = dict(os.environ)
     environment.setdefault("OMP_NUM_THREADS", "1")

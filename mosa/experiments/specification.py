@@ -23,6 +23,8 @@ COMMIT = "commit.txt"
 """File of a job's folder with the state of the program that its run was last begun with."""
 FAILED = "failed.txt"
 """File of a job's folder with the reason why its run failed."""
+PRESSED = "pressed.json"
+"""File of a job's folder with what `specimens` has measured of its laws."""
 
 
 @dataclass(frozen=True)

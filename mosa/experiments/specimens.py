@@ -22,7 +22,7 @@ from mosa.analysis.vibration import longitudinal_modulus
 from mosa.data.builtin.objects import OBJECTS
 from mosa.errors import DataError, SimulationDiverged
 from mosa.experiments.collecting import Record
-from mosa.experiments.drawing import save, style_of
+from mosa.experiments.drawing import WIDTH, legend, save, style_of
 from mosa.experiments.run_folders import checkpoint, first_seeds, label, prefix, pressed_file, write_table
 from mosa.experiments.specification import Experiment
 from mosa.modules.body import Body
@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 MODELS = {"": "adapted", "prior/": "prior"}
 """Of a run, by the prefix of their figures."""
 ANGLES = 12
-"""Directions over half a turn of the plane of x and the vertical; the truth's stiffest one is pressed beside them."""
+"""Directions over half a turn of the plane of x and the vertical; along the fibres it is pressed too."""
 STRAIN = 0.04
 """At which the force is compared."""
 ASKED = 5.0
@@ -151,7 +151,7 @@ def compression(experiment: Experiment, records: Sequence[Record], stem: Path) -
 
 def drawn(laws: dict[str, dict[str, tuple[list[float], list[float], dict | None]]], order: Sequence[str]) -> Canvas:
     """laws: {column: {model: (degrees, truth [Pa], measured)}}; order: of the models."""
-    canvas = Canvas(figsize=(9.0, 3.4 * len(laws) + 0.6), layout="constrained")
+    canvas = Canvas(figsize=(WIDTH, 3.4 * len(laws) + 0.6), layout="constrained")
     grid = canvas.subplots(len(laws), 2, squeeze=False)
     for (column, of), (left, right) in zip(laws.items(), grid):
         degrees, truth, _ = next(iter(of.values()))
@@ -170,7 +170,5 @@ def drawn(laws: dict[str, dict[str, tuple[list[float], list[float], dict | None]
             part.set_xlabel("direction of loading, from x towards y [degrees]; dotted: stiffest of the truth")
             part.xaxis.label.set_size(8)
         left.set_ylim(0, 1.05 * left.get_ylim()[1])
-    handles = [*grid[0][0].get_legend_handles_labels()[0], *grid[0][1].get_legend_handles_labels()[0]]
-    names = [*grid[0][0].get_legend_handles_labels()[1], *grid[0][1].get_legend_handles_labels()[1]]
-    canvas.legend(handles, names, loc="outside lower center", ncol=4, fontsize=8)
+    legend(canvas, ["truth", *order])
     return canvas

@@ -54,10 +54,10 @@ def markdown_page(
         )
     if experiment.note:
         parts.append(experiment.note.strip())
+    bold = "{}" if experiment.plot == "map" else "**{}**"  # of a map no column has a best row
     for figure in experiment.figures:
         rows = tables[figure.label]
         header = [experiment.rows, *next(iter(rows.values()))]
-        bold = "{}" if experiment.plot == "map" else "**{}**"  # of a map no column has a best row
         body = [[row, *(cell_text(rows, row, column, figure, bold) for column in header[1:])] for row in rows]
         parts.append(f"{figure.label}{arrow(figure)} (`{figure.figure}`)\n\n" + markdown(header, body))
     parts += [said] if (said := said_below(tables)) else []
@@ -106,7 +106,8 @@ def provenance(experiment: Experiment, jobs: Sequence[Job], records: Sequence[Re
 def made_by(jobs: Sequence[Job]) -> str:
     """The states of the program that complete jobs were run with, the commonest first; of those that do not say it the present
     one."""
-    counts = Counter(commit_of(job) or commit() for job in jobs) or Counter([commit()])
+    present = commit()
+    counts = Counter(commit_of(job) or present for job in jobs) or Counter([present])
     (first, _), *others = counts.most_common()
     more = ", ".join(f"{count} job{'s' * (count > 1)} of {other}" for other, count in others)
     return f"commit {first}" + (f" ({more})" if more else "")
@@ -135,7 +136,7 @@ def write_csv(path: Path, experiment: Experiment, records: Sequence[Record]) -> 
 
 def latex(experiment: Experiment, tables: Mapping[str, Mapping[str, Mapping[str, Cell | None]]]) -> str:
     """A tabular for each figure; needs booktabs."""
-    parts = []
+    bold, parts = "{}" if experiment.plot == "map" else r"\textbf{{{}}}", []
     for figure in experiment.figures:
         rows = tables[figure.label]
         columns = list(next(iter(rows.values())))
@@ -143,7 +144,6 @@ def latex(experiment: Experiment, tables: Mapping[str, Mapping[str, Mapping[str,
                  r"\toprule",
                  " & ".join([escaped(figure.label), *map(escaped, columns)]) + r" \\", r"\midrule"]  # fmt: skip
         for row in rows:
-            bold = "{}" if experiment.plot == "map" else r"\textbf{{{}}}"
             cells = (cell_text(rows, row, column, figure, bold, r"$\pm$") for column in columns)
             lines.append(" & ".join([escaped(row), *cells]) + r" \\")
         parts.append("\n".join([*lines, r"\bottomrule", r"\end{tabular}"]))

@@ -32,8 +32,7 @@ MANY = 4
 """Learned numbers from which a law has several valleys (a stiff and viscous one beside a soft one that yields early): there
 Gauss-Newton is begun at several starts, as a search in one number after the other goes down the wrong one."""
 WIDE = (0.3, 1.0, 3.2)
-"""Multiples of the stiffness among these starts, in all combinations with a first step of the compass up and down in the numbers
-that are no stiffness."""
+"""Multiples of the stiffness among these starts, each with the numbers that are no stiffness `moved`."""
 BEGUN, FIRST, KEPT, LAST = 6, 2, 3, 3
 """Of these starts the nearest, beside the end of the compass search; iterations of each; how many go on, and for how many more."""
 
@@ -79,12 +78,19 @@ def compass(at: Callable[[dict[str, float]], float], row: dict[str, float], stri
 
 def rollouts_of_search(learned: Sequence[str], each: float) -> float:
     """About how many rollouts `search` takes for a law with these learned numbers; each: of an iteration."""
-    further = [n for n in learned if n not in ("E", "nu")]
-    count = len(STIFFNESS_STEPS) * (len(POISSON_STEPS) if "nu" in learned else 1) + COMPASS * bool(further)
+    count = len(STIFFNESS_STEPS) * (len(POISSON_STEPS) if "nu" in learned else 1)
+    count += COMPASS * bool(set(learned) - {"E", "nu"})
     if len(learned) < MANY:
         return count
-    others = [n for n in further if n not in STIFFNESS]
-    return count + len(WIDE) * 3 ** len(others) + ((BEGUN + 1) * FIRST + KEPT * LAST) * each
+    return count + len(WIDE) * len(moved(learned)) + ((BEGUN + 1) * FIRST + KEPT * LAST) * each
+
+
+def moved(learned: Sequence[str]) -> list[dict[str, float]]:
+    """Steps of the numbers that are no stiffness and no Poisson number: none, or a first step of the compass up or down in one or
+    in two of them. All combinations of many numbers were too many."""
+    others = [name for name in learned if name not in STIFFNESS and name != "nu"]
+    return [{name: sign * STRIDES.get(name, 1.0) for name, sign in zip(some, signs)} for count in range(3)
+            for some in itertools.combinations(others, count) for signs in itertools.product((-1, 1), repeat=count)]  # fmt: skip
 
 
 def search(calibration: Calibration) -> float:
@@ -93,9 +99,9 @@ def search(calibration: Calibration) -> float:
     The best of a coarse grid of stiffness and Poisson number, which goes on where its best is at an end of the stiffness; then,
     for laws with parameters beside these, a compass search in all of them (Kolda, Lewis, Torczon, SIAM Review 45, 2003); of laws
     of `MANY` numbers, Gauss-Newton from its end and from other starts (`nearest_end`).
-    Errors: SimulationDiverged where no start of the grid can be simulated."""
+    Errors: SimulationDiverged where no start of the grid can be simulated; those of `nearest_end`."""
     material = calibration.body.material
-    starts, learned = material.begins, [name for name, raw in material.raw.items() if raw.requires_grad]
+    starts, learned = material.begins, material.learned
     modulated = [n for n in STIFFNESS if n in learned and n in material.modulated]
     tried: dict[tuple[float, ...], float] = {}
 
@@ -133,15 +139,11 @@ def search(calibration: Calibration) -> float:
                                  "nearer to the body's, or raise simulation.max_substeps")
     row = row_of(*best[1:])
     if set(learned) - {"E", "nu"}:
-        strides = {n: STRIDES.get(n, 1.0) for n in learned}
-        row = compass(at, row, strides)
-        if len(learned) >= MANY:
-            others = [n for n in learned if n not in STIFFNESS and n != "nu"]
-            wide = [row_of(m, None) for m in (WIDE if modulated else (1.0,))]
-            wide = [each | {n: each[n] + step * strides[n] for n, step in zip(others, steps)}
-                    for each in wide for steps in itertools.product((-1, 0, 1), repeat=len(others))]  # fmt: skip
-            start_at(row)
-            return nearest_end(calibration, start_at, [row, *sorted(wide, key=at)[:BEGUN]])
+        row = compass(at, row, {n: STRIDES.get(n, 1.0) for n in learned})
+    if len(learned) >= MANY:
+        stiffnesses = [row_of(m, None) for m in (WIDE if modulated else (1.0,))]
+        wide = [each | {n: each[n] + step for n, step in steps.items()} for each in stiffnesses for steps in moved(learned)]
+        return nearest_end(calibration, start_at, [row, *sorted(wide, key=at)[:BEGUN]])
     start_at(row)
     return at(row)
 

@@ -286,17 +286,20 @@ class Identification:
         for i, take in enumerate(self.takes):
             away = self.rollout(self.body, i).x - take.cues.positions
             found.append(float(away[take.first_contact :].square().sum(-1).mean()))
-        kept = self.calibrating and self.noise is not None
-        posterior = self.newton.posterior(self.independent() if kept else 1.0, self._grids_part() if kept else None)
+        share, wrong = 1.0, None
+        if self.calibrating and self.noise is not None:
+            there = self._fields(self.body)
+            share, wrong = self.independent(there), self._grids_part(there)
+        posterior = self.newton.posterior(share, wrong)
         return replace(posterior, model_error=(sum(found) / len(found)) ** 0.5, rivals=self.rivals())
 
-    def _grids_part(self) -> Tensor | None:
-        """Of a calibration: `grid_error` times the difference from the coarser grid, whitened as the residuals are. None without a
-        second grid."""
+    def _grids_part(self, there: list[residuals.Fields]) -> Tensor | None:
+        """Of a calibration: `grid_error` times the difference of `there`, its residuals where it stands, from those on the coarser
+        grid, whitened as these are. None without a second grid."""
         coarser = self._coarser() if self.settings.grid_error > 0 else None
         if coarser is None:
             return None
-        return self.settings.grid_error * self._compared(residuals.difference(self._fields(self.body), coarser), 0.0)
+        return self.settings.grid_error * self._compared(residuals.difference(there, coarser), 0.0)
 
     @torch.no_grad()
     def rivals(self) -> dict[str, Tensor]:
@@ -326,14 +329,15 @@ class Identification:
         seat = self.newton.seats[0]
         return self.newton.cost(seat.read(), seat.residuals())
 
-    def independent(self) -> float:
-        """Share of the data that a calibration counts which its residuals bear out, in (0, 1].
+    def independent(self, there: list[residuals.Fields] | None = None) -> float:
+        """Share of the data that a calibration counts which its residuals bear out, in (0, 1]. there: these residuals, where they
+        are known.
 
         What a free rollout leaves beyond the cues' own noise is what grid, contact and the law's form get wrong: a few smooth
         patterns in all the frames together (`residuals.patterns`), and not `count` independent errors in every one of them."""
         each, cues = COUNTED_AT_FIRST * self.settings.count, 3 * residuals.floors(self.body.settings.dx, 0.0)[0] ** 2
         counted, wrong, late = 0.0, 0.0, []
-        for take, scales, found in zip(self.takes, self.noise, self._fields(self.body)):
+        for take, scales, found in zip(self.takes, self.noise, there or self._fields(self.body)):
             frames = slice(min(take.first_contact, len(scales[0])) - 1, None)
             wrong += (1 - cues / float(scales[0][frames].square().mean())) / len(self.takes)
             counted += each * len(scales[0][frames])

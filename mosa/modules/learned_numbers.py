@@ -38,11 +38,10 @@ def blocks_of(body: Body, *, adapter: bool, heterogeneity: bool, settings: Ident
               calibrating: bool = False) -> list[Block]:
     """The numbers that are learned, in the order of `tensors_of`."""
     blocks, step = [], 0.02 if calibrating else 0.02 * FINER
-    for name, raw in body.material.raw.items():
-        if raw.requires_grad:
-            start = body.material.begins[name]
-            wider = 2.5 if name == "nu" else 1.0
-            blocks.append(Block(name, torch.tensor([start]), torch.tensor([1.5]), wider * step, bounds=limits_of(name)))
+    for name in body.material.learned:
+        start = body.material.begins[name]
+        wider = 2.5 if name == "nu" else 1.0
+        blocks.append(Block(name, torch.tensor([start]), torch.tensor([1.5]), wider * step, bounds=limits_of(name)))
     if body.contact.enabled:
         sd = 0.05 if calibrating else 0.03
         blocks.append(Block("contact", torch.tensor([ContactOffset.START]), torch.tensor([sd]), step, bounds=ContactOffset.LIMITS))
@@ -58,7 +57,7 @@ def blocks_of(body: Body, *, adapter: bool, heterogeneity: bool, settings: Ident
 
 def tensors_of(body: Body, *, adapter: bool, heterogeneity: bool) -> list[Tensor]:
     """The parameters of `blocks_of`."""
-    tensors: list[Tensor] = [raw for raw in body.material.raw.values() if raw.requires_grad]
+    tensors: list[Tensor] = [body.material.raw[name] for name in body.material.learned]
     tensors += [body.contact.cells] if body.contact.enabled else []
     tensors += [body.adapter.numbers] if adapter else []
     return tensors + ([body.heterogeneity.coefficients] if heterogeneity else [])

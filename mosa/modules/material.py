@@ -85,6 +85,8 @@ FORMS: dict[str, Form | Direction] = {
 """Every parameter a prior may name, SI units; friction_angle in degrees, cohesion a strain."""
 UNITS = {"E": "Pa", "mu": "Pa", "kappa": "Pa", "yield_stress": "Pa", "viscosity": "Pa s", "friction_angle": "degrees"}
 """Of the parameters that have one; what is a viscosity in place of it, the law says (`unit_of`)."""
+RELATIVE = ("E", "mu", "kappa", "yield_stress", "viscosity")
+"""Parameters whose standard deviation is said relative: it is one of their logarithm."""
 GIVES = {"E": ("mu", "lam"), "nu": (), "friction_angle": ("friction_alpha",)}
 """What the simulator takes in place of a parameter; others are taken by their own name."""
 STIFFNESS = ("E", "mu", "kappa")
@@ -207,6 +209,11 @@ class Material(nn.Module):
         for coordinate in Direction.coordinates(name):
             self.begins[coordinate] = 0.0
             self.raw[coordinate] = nn.Parameter(torch.tensor(0.0), requires_grad=learned)
+
+    @property
+    def learned(self) -> list[str]:
+        """Names of the unconstrained numbers that are learned, of a direction its two angles."""
+        return [name for name, raw in self.raw.items() if raw.requires_grad]
 
     def direction(self, name: str) -> Tensor:
         """(3,) unit vector of a parameter that is one, in the rest shape."""

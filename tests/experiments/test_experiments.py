@@ -8,36 +8,29 @@ import re
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
-import yaml
 from hydra import compose, initialize_config_dir
-from matplotlib.colors import to_rgba
+from made_up import CONF, NAMES, PAPER, experiment, made_up, write_metrics
 from omegaconf import OmegaConf
 
 from mosa import whole_files
 from mosa.commands.experiment import arguments, run, shown
 from mosa.config import rehearse
 from mosa.errors import ConfigError, DataError
-from mosa.experiments import analyses, commits, running, specimens
+from mosa.experiments import running, specimens
 from mosa.experiments.analyses import ANALYSES
 from mosa.experiments.collecting import Cell, best_of, records_of, table
-from mosa.experiments.drawing import FURTHER, MARKED, STYLES, draw, style_of
-from mosa.experiments.page import older, read_tables, verdict
+from mosa.experiments.page import read_tables
 from mosa.experiments.printed import printed_table
 from mosa.experiments.specification import (
     CROWD,
     MINUTES,
-    Claim,
-    Experiment,
     Figure,
     Option,
     claim_of,
     estimate,
-    experiment_names,
     folder_name,
     jobs_of,
     load_experiment,
@@ -45,32 +38,9 @@ from mosa.experiments.specification import (
     narrowed,
     pairs,
 )
-from mosa.experiments.writing import made_by, write_results
+from mosa.experiments.writing import write_results
 from mosa.keys import EVALUATION, TRAINING
 from mosa.schema import check
-
-CONF = Path(__file__).parents[2] / "conf"
-PAPER = CONF / "experiment" / "paper"
-NAMES = experiment_names(PAPER)
-
-
-def experiment(**changes) -> Experiment:
-    """Three rows, of which two read the same runs, by two scenes and two seeds."""
-    axes = {
-        "method": (Option("prior", ("adapter=operator",), "prior/"), Option("box", ("adapter=direct",), cost=2.0),
-                   Option("ours", ("adapter=operator",))),
-        "scene": (Option("a", ("scene=a",)), Option("b", ("scene=b",))),
-    }  # fmt: skip
-    figures = (Figure("PSNR", "test/psnr_crop", best="most"), Figure("rms [mm]", "test/rms_m", 1e3, 1, "least"))
-    made = Experiment("made", "Made up", axes, "method", "scene", figures, seeds=(0, 1), minutes={"cpu": 3.0, "gpu": 1.0})
-    return replace(made, **changes)
-
-
-def write_metrics(job, rms=0.010, prior=0.020, **more) -> None:
-    job.folder.mkdir(parents=True, exist_ok=True)
-    figures = {"test/rms_m": rms, "prior/test/rms_m": prior, "test/psnr_crop": 30.0 - 100 * rms, "prior/test/psnr_crop": 25.0,
-               "time/fit_s": 60.0, "time/data_s": 60.0, "time/device": "a machine", **more}  # fmt: skip
-    (job.folder / "metrics.json").write_text(json.dumps(figures))
 
 
 # ------------------------------------------------------------------------------------------------ files
@@ -266,15 +236,6 @@ def test_jobs_are_spread_over_the_gpus_where_there_are_places_for_more(tmp_path,
 
 
 # ------------------------------------------------------------------------------------------------ tables of made-up figures
-def made_up(tmp_path) -> tuple[Experiment, list]:
-    found = experiment()
-    jobs = jobs_of(found, tmp_path)
-    for job in jobs:
-        scene = job.places[0]["scene"].name
-        if job.places[0]["method"].name == "box" and scene == "b":
-            continue  # it failed
-        write_metrics(job, rms=(0.010 if scene == "a" else 0.030) + 0.002 * job.seed, prior=0.020)
-    return found, jobs
 
 
 def test_a_table_has_means_and_spreads_over_seeds_and_the_mean_over_columns_that_all_have(tmp_path):
@@ -332,168 +293,6 @@ def test_the_page_says_where_its_figures_come_from_and_what_is_missing(tmp_path)
     assert lines[0] == "method,scene,seed,label,figure,value,run" and len(lines) == 1 + 3 * 2 * 2 * 2
     tex = (tmp_path / "results" / "made.tex").read_text()
     assert tex.count(r"\begin{tabular}{lccc}") == 2 and r"$\pm$" in tex and r"\textbf{" in tex
-
-
-@pytest.mark.parametrize("plot", ["lines", "map", None])
-def test_every_kind_of_picture_is_drawn_also_where_cells_are_missing(tmp_path, plot):
-    found, jobs = made_up(tmp_path / "runs")
-    write_results(replace(found, plot=plot), jobs, tmp_path / "results", "")
-    assert (tmp_path / "results" / "made.png").is_file() == (plot is not None)
-
-
-def test_a_map_has_the_figure_s_decimals_and_bars_say_where_they_begin(tmp_path):
-    found, jobs = made_up(tmp_path / "runs")
-    tables = {figure.label: table(found, records_of(jobs), figure) for figure in found.figures}
-    for place, figure in zip(draw(replace(found, plot="map"), tables).axes, found.figures):  # colour bars come after the maps
-        written = [text.get_text() for text in place.texts]
-        assert written and {len(text.partition(".")[2]) for text in written} == {figure.decimals}
-    close = {"method": {"a": Cell(98.0, None, 1)}, "other": {"a": Cell(99.0, None, 1)}}
-    ssim = Figure("SSIM x100", "test/ssim_crop", 100, 1, "most")
-    place = draw(replace(found, figures=(ssim,), plot="bars"), {"SSIM x100": close}).axes[0]
-    low, high = place.get_ylim()
-    assert 99 < high <= 100 and 90 < low < 98 and place.get_ylabel() == f"axis cut at {low:.4g}"
-    alone = {"method": {"a": Cell(1.0, None, 1)}, "other": {"a": Cell(30.0, None, 1)}}
-    place = draw(replace(found, figures=(replace(ssim, figure="test/psnr_crop"),), plot="bars"), {"SSIM x100": alone}).axes[0]
-    assert place.get_ylim()[0] == 0 and place.get_ylabel() == ""
-
-
-def test_a_method_of_which_nothing_was_run_takes_no_bar_and_no_colour(tmp_path):
-    """It had the first one's colour in the legend."""
-    found, _ = made_up(tmp_path / "runs")
-    figures = (Figure("a", "test/rms_m", 1, 1, "least"), Figure("b", "test/psnr_crop", 1, 1, "least"))
-    rows = {"first": {"x": Cell(1.0, None, 1)}, "not run": {"x": None}, "last": {"x": Cell(2.0, None, 1)}}
-    partly = rows | {"last": {"x": None}}
-    canvas = draw(replace(found, figures=figures, plot="bars"), {"a": partly, "b": rows})
-    assert [text.get_text() for text in canvas.legends[0].get_texts()] == ["first", "last"]
-    colours = [patch.get_facecolor() for place in canvas.axes for patch in place.patches]
-    assert len(colours) == 3 and colours[0] == colours[1] != colours[2]
-
-
-def test_every_method_of_the_paper_has_a_colour_of_its_own_in_every_picture():
-    """Whatever else is in the picture, and whether it is bars or lines."""
-    names = [option.name for option in load_experiment(PAPER, "table_generalisation").axes["method"]]
-    assert set(names) <= set(STYLES) and len({STYLES[name]["color"] for name in names}) == len(names)
-    assert not {style["color"] for style in STYLES.values()} & set(FURTHER)
-    value = Cell(2.0, None, 1)
-    few = {"box": {"a": value}, "ours": {"a": value}}
-    many = {"NeuMA": {"a": value}, "box": {"a": None}, "ours": {"a": value}, "other": {"a": value}}
-    figures = (Figure("rms", "test/rms_m", 1, 1, "least"),)
-    first, second = (draw(experiment(figures=figures), {"rms": rows}).axes[0] for rows in (few, many))
-    colours = [{bar.get_label(): bar[0].get_facecolor() for bar in place.containers} for place in (first, second)]
-    assert colours[0]["ours"] == colours[1]["ours"] and len(set(colours[1].values())) == 3
-    lines = draw(experiment(figures=figures, plot="lines", rows="scene", columns="method"),
-                 {"rms": {scene: {name: value for name in ("prior", "box", "ours")} for scene in "ab"}}).axes[0]  # fmt: skip
-    (ours,) = [line for line in lines.lines if line.get_label() == "ours"]
-    assert to_rgba(ours.get_color()) == colours[0]["ours"]
-
-
-def test_what_diverged_what_failed_and_what_was_not_run_differ():
-    cells = {"x": Cell(1.0, None, 1), "y": Cell(math.inf, None, 1), "z": Cell(math.nan, None, 0)}
-    rows = {"ours": cells, "box": {"x": None, "y": Cell(2.0, None, 1), "z": None}, "prior": dict.fromkeys("xyz")}
-    canvas = draw(experiment(figures=(Figure("rms", "test/rms_m", 1, 1, "least"),)), {"rms": rows})
-    (place,) = canvas.axes
-    assert [(round(float(line.get_xdata()[0])), line.get_marker()) for line in place.lines] == [(1, "x"), (2, "+")]
-    assert {line.get_color() for line in place.lines} == {style_of("ours")["color"]}
-    assert [text.get_text() for text in canvas.legends[0].get_texts()] == ["ours", "box", "diverged", "failed"]
-    assert canvas.get_supxlabel() == "gap: not run; not run: prior"
-    assert draw(experiment(figures=(Figure("rms", "test/rms_m"),)), {"rms": {"ours": {"x": None}}}) is None
-
-
-@pytest.mark.parametrize("plot", ["bars", "lines"])
-def test_every_axis_without_its_zero_says_so_and_errors_over_a_decade_are_logarithmic(plot):
-    figures = (Figure("PSNR", "test/psnr_crop", best="most"), Figure("wide", "test/rms_m", 1, 1, "least"),
-               Figure("rms", "test/rms_m", 1, 1, "least"))  # fmt: skip
-    sizes = {"PSNR": (25.0, 30.0, 31.0), "wide": (1.5, 20.0, 40.0), "rms": (5.0, 6.0, 7.0)}
-    tables = {label: {"prior": {"a": Cell(x, None, 1), "b": Cell(y, 0.5, 2)}, "ours": {"a": Cell(z, None, 1), "b": None}}
-              for label, (x, y, z) in sizes.items()}  # fmt: skip
-    made = experiment(figures=figures, plot=plot)
-    if plot == "lines":
-        made = replace(made, rows="scene", columns="method")
-        tables = {label: {column: {row: rows[row][column] for row in rows} for column in "ab"} for label, rows in tables.items()}
-    psnr, wide, rms = draw(made, tables).axes
-    assert 20 < psnr.get_ylim()[0] < 25 and psnr.get_ylabel() == f"axis cut at {psnr.get_ylim()[0]:.4g}"
-    assert wide.get_yscale() == "log" and wide.get_ylabel() == "logarithmic axis from 1"
-    assert rms.get_yscale() == "linear" and rms.get_ylim()[0] == 0 and rms.get_ylabel() == ""
-    if plot == "lines":  # a bar of an error for the one point with two seeds
-        assert [len(bar[2][0].get_segments()) for bar in psnr.containers] == [1]
-    most = (Figure("SSIM", "test/ssim_crop", 100, 1, "most"),)
-    high = {row: dict.fromkeys(cells, Cell(99.9, None, 1)) for row, cells in tables["rms"].items()}
-    (ssim,) = draw(replace(made, figures=most), {"SSIM": high}).axes
-    assert ssim.get_ylim()[1] <= 100 and ssim.get_ylabel().startswith("axis cut at 9")
-
-
-def test_a_map_is_lighter_where_it_is_better_and_frames_the_default_of_the_configuration():
-    made = load_experiment(PAPER, "figure_alpha")
-    defaults = yaml.safe_load((CONF / "adapter" / "mosa.yaml").read_text())["adapter"]
-    assert defaults["alpha_normal"] is None and MARKED["alpha", "alpha_normal"]["default"] == (defaults["alpha"], defaults["alpha"])
-    names = [option.name for option in made.axes["alpha"]]
-    cells = {row: {column: Cell(i + j, None, 1) for j, column in enumerate(names)} for i, row in enumerate(names)}
-    cells["0.30"] |= {"0.30": None, "0.20": Cell(-math.inf, None, 1)}
-    canvas = draw(made, {figure.label: cells for figure in made.figures})
-    psnr, rms = canvas.axes[:2]
-    for place in (psnr, rms):
-        assert [tuple(patch.get_xy()) for patch in place.patches] == [(0.52, 0.53), (1.52, 1.53)]
-        words = [text.get_text() for text in place.texts]
-        assert {"default", "the paper's", "diverged"} <= set(words) and len(words) == 2 + 24
-    shades = [place.images[0].cmap(place.images[0].norm(np.array([0.0, 7.0]))).sum(1) for place in (psnr, rms)]
-    assert shades[0][0] < shades[0][1] and shades[1][0] > shades[1][1]
-    assert canvas.get_supxlabel() == "white: not run"
-
-
-def test_many_bars_have_a_row_for_each_figure_and_no_picture_is_wider_than_a_page():
-    for bars_of_a_part, down in ((2, 2), (9, 4)):
-        rows = {name: {column: Cell(1.0, None, 1) for column in "abcdefghi"[:bars_of_a_part]} for name in ("ours", "NeuMA")}
-        figures = tuple(Figure(label, "test/rms_m", best="least") for label in "pqrs")
-        canvas = draw(experiment(figures=figures), dict.fromkeys("pqrs", rows))
-        canvas.draw_without_rendering()
-        assert len({round(place.get_position().y0, 3) for place in canvas.axes}) == down
-        assert canvas.get_figwidth() == 9
-
-
-def test_the_factors_of_all_bodies_have_one_range_about_one(tmp_path, monkeypatch):
-    found = narrowed(experiment(), {"method": ["ours"]}, (0,))
-    records = records_of(jobs_of(found, tmp_path))
-    rest = torch.rand(20, 3) - 0.5
-    factors = {"a": 1 + 0.1 * rest[:, 0], "b": 1 + 0.6 * rest[:, 1]}
-    model = SimpleNamespace(heterogeneity=None)
-    twins = [SimpleNamespace(body=SimpleNamespace(rest=rest, heterogeneity=True, model=lambda: model, factor=lambda _, f=f: f),
-                             config={"cfg": {"scene": {"name": "other"}}})
-             for f in (factors[record.place["scene"].name] for record in records)]  # fmt: skip
-    monkeypatch.setattr(analyses, "loaded", lambda _: zip(records, twins))
-    drawn = []
-    monkeypatch.setattr(analyses, "save", lambda canvas, path: drawn.append(canvas) or path)
-    ANALYSES["heterogeneity"](found, records, tmp_path / "law")
-    parts = [place.collections[0] for place in drawn[0].axes[:2]]
-    (limits,) = {part.get_clim() for part in parts}
-    assert sum(limits) == pytest.approx(2.0) and limits[1] >= float(factors["b"].max())
-    assert drawn[0].axes[-1].get_xlabel().startswith("factor on the stiffness, 1: as the calibrated law")
-    assert [drawn[0].axes[i].get_ylabel() for i in (0, 2)] == ["learned", "truth"]
-
-
-@pytest.mark.parametrize("columns", [["a"], ["a", "b"]])
-def test_the_rounding_of_an_isotropic_law_is_no_curve_and_a_response_of_zero_is_seen(tmp_path, monkeypatch, columns):
-    """Beside one with a ratio of 1.6 and alone; the ripples of each part have a range of their own, E in kPa begins at 0."""
-    found = narrowed(experiment(), {"method": ["ours"], "scene": columns}, (0,))
-    records = records_of(jobs_of(found, tmp_path))
-    laws = {"a": lambda n: 1e5 * (1 + 1e-4 * n[:, 0]), "b": lambda n: 1e5 * (1 + 0.6 * n[:, 0] ** 2)}
-    twins = [SimpleNamespace(body=record.place["scene"].name, config={"cfg": {"scene": {"name": "rabbit"}}}) for record in records]
-    monkeypatch.setattr(analyses, "loaded", lambda _: zip(records, twins))
-    monkeypatch.setattr(analyses, "redistribution", lambda body, n: (0.1 if body == "b" else 0.0) * n[:, 0].abs())
-    monkeypatch.setattr(analyses, "learned_modulus", lambda body, n: laws[body](n))
-    monkeypatch.setattr(analyses, "true_modulus", lambda *_: None)
-    drawn = []
-    monkeypatch.setattr(analyses, "save", lambda canvas, path: drawn.append(canvas) or path)
-    ANALYSES["directions"](found, records, tmp_path / "law")
-    places = np.array(drawn[0].axes).reshape(3, len(columns))
-    low, high = places[1, 0].get_ylim()
-    curve = places[1, 0].lines[0].get_ydata()
-    assert low <= 0.95 and 1.05 <= high < 1.2 and curve.max() - curve.min() < 0.01 * (high - low)
-    assert places[1, 0].get_ylabel() == f"E over its mean (axis cut at {low:.4g})"
-    low, high = places[0, 0].get_ylim()
-    assert low < -0.02 * high  # w of 0 lies beside the axis, not on it
-    for place in places[2]:
-        assert place.get_ylim()[0] == 0 and place.lines[0].get_ydata().mean() > 90 and place.get_ylabel() == "E [kPa]"
-    assert all(place.lines[0].get_color() == style_of("ours")["color"] for place in places.ravel())
 
 
 def test_results_that_cannot_be_written_leave_the_ones_before(tmp_path, monkeypatch):
@@ -604,149 +403,6 @@ def test_a_quick_variant_runs_to_its_table_and_is_not_run_again(cache, tmp_path,
     assert float(rows[0][4]) > 0 and float(rows[0][3]) >= 0
 
 
-# ------------------------------------------------------------------------------------------------ the page of results
-def cells(**rows) -> dict:
-    return {row: {"mean": None if value is None else Cell(*value)} for row, value in rows.items()}
-
-
-def test_a_claim_holds_only_by_more_than_the_spread_of_the_seeds():
-    found = experiment()
-    claim = Claim("ours is ahead", "rms [mm]", row="ours", against=("prior", "box"))
-    for rows, begins in (
-        (cells(ours=(10.0, 0.5, 3), prior=(20.0, 0.5, 3), box=(12.0, 0.5, 3)), "holds, 10.0 ± 0.5 against 20.0 ± 0.5 (prior)"),
-        (cells(ours=(10.0, 2.0, 3), prior=(20.0, 0.5, 3), box=(11.0, 2.0, 3)), "within the spread, "),
-        (cells(ours=(10.0, 0.1, 3), prior=(20.0, 0.5, 3), box=(9.0, 0.1, 3)), "does not hold, "),
-        (cells(ours=None, prior=(20.0, 0.5, 3), box=(9.0, 0.1, 3)), "not run"),
-    ):
-        assert verdict(found, claim, {"rms [mm]": rows}).startswith(begins)
-    one = verdict(found, claim, {"rms [mm]": cells(ours=(10.0, None, 1), prior=(20.0, None, 1), box=None)})
-    assert one == "holds against those that were run, 10.0 against 20.0 (prior); not run: box; one seed"
-    best = Claim("more is better", "PSNR", row="ours", against=("prior",))
-    assert verdict(found, best, {"PSNR": cells(ours=(30.0, None, 1), prior=(31.0, None, 1))}).startswith("does not hold")
-
-
-def of_columns(**rows) -> dict:
-    """Rows of figures in the columns a, b, c, of one seed."""
-    return {row: {column: None if value is None else Cell(value, None, 1) for column, value in zip("abc", values)}
-            for row, values in rows.items()}  # fmt: skip
-
-
-def test_rows_are_compared_where_both_were_run_and_that_is_said():
-    """A column in which the other one diverged is no part of the means, and counts as one in which it is worse."""
-    claim = Claim("ours is ahead", "rms [mm]", row="ours", against=("prior", "box"))
-    rows = of_columns(ours=(10.0, 12.0, 30.0), prior=(20.0, 22.0, 24.0), box=(15.0, None, math.inf))
-    assert verdict(experiment(), claim, {"rms [mm]": rows}) == (
-        "holds, 17.3 against 22.0 (prior; better in 2 of 3), 10.0 against 15.0 (box; better in 2 of 2; without b, c); one seed")
-    behind = rows | of_columns(box=(9.0, None, math.inf))
-    assert verdict(experiment(), claim, {"rms [mm]": behind}).startswith("does not hold, 17.3 against")
-    sds = {"ours": {"a": Cell(10.0, 3.0, 3), "b": Cell(10.0, 4.0, 3)}, "prior": {"a": Cell(12.0, 0.0, 3), "b": Cell(12.0, 0.0, 3)}}
-    assert verdict(experiment(), replace(claim, against=("prior",)), {"rms [mm]": sds}) == (
-        "within the spread, 10.0 ± 2.5 against 12.0 ± 0.0 (prior; better in 2 of 2)")  # of the mean sqrt(3^2 + 4^2) / 2
-
-
-def test_a_claim_of_every_column_names_those_in_which_it_fails():
-    claim = Claim("gains under each", "PSNR", row="ours", against=("prior",), each=True)
-    rows = of_columns(ours=(30.0, 28.0, -math.inf), prior=(29.0, 29.0, 25.0))
-    assert verdict(experiment(), claim, {"PSNR": rows}) == (
-        "does not hold, ahead in 1 of 3 (a); b: 28.00 against 29.00 (prior); c: diverged; one seed")
-    better = of_columns(ours=(30.0, 30.0, 26.0), prior=(29.0, 29.0, -math.inf))
-    assert verdict(experiment(), claim, {"PSNR": better}) == "holds, ahead in 3 of 3; one seed"
-    rows = of_columns(ours=(29.2, 31.0, 30.0), prior=(29.0, 30.0, 29.0))
-    near = verdict(experiment(), replace(claim, spread=0.5), {"PSNR": rows})
-    assert near == "does not hold, ahead in 2 of 3 (b, c); a: 29.20 against 29.00 (prior); one seed"
-    assert verdict(experiment(), claim, {"PSNR": of_columns(ours=(None, None, None), prior=(1.0, 1.0, 1.0))}) == "not run"
-
-
-def test_of_one_seed_a_difference_has_to_be_more_than_the_spread_that_is_given():
-    claim = Claim("helps", "PSNR", row="ours", against=("prior",), spread=0.3)
-    rows = {gain: cells(ours=(30.0 + gain, None, 1), prior=(30.0, None, 1)) for gain in (0.2, 0.4, -0.2, -0.4)}
-    said = {gain: verdict(experiment(), claim, {"PSNR": found}).partition(",")[0] for gain, found in rows.items()}
-    assert said == {0.2: "within the spread", 0.4: "holds", -0.2: "within the spread", -0.4: "does not hold"}
-
-
-def test_a_bound_excuses_what_the_posterior_says_is_not_determined():
-    claim = Claim("within 5 %", "PSNR", most=5.0, unless="rms [mm]")
-    rows = cells(a=(3.0, None, 1), b=(40.0, None, 1), c=(9.0, None, 1))
-    said = verdict(experiment(), claim, {"PSNR": rows, "rms [mm]": cells(a=(1.0, None, 1), b=(25.0, None, 1), c=(1.0, None, 1))})
-    assert said == ("does not hold, 1 of 3 within 5; not determined, and the posterior says so: b (40.0); beyond it: c (9.0)")
-    alone = {"PSNR": cells(b=(40.0, None, 1)), "rms [mm]": cells(b=(25.0, None, 1))}
-    assert verdict(experiment(), claim, alone).startswith("none is determined, 0 of 1")
-    both = {name: rows | cells(a=(3.0, None, 1)) for name, rows in alone.items()}
-    assert verdict(experiment(), claim, both).startswith("holds where it is determined, 1 of 2")
-    assert verdict(experiment(), claim, {}) == "not run"
-
-
-@pytest.mark.parametrize(("off", "sd", "determined"), [
-    (3648.5, 262.0, False),  # 37 times as much is 3.6 in the logarithm
-    (184.1, 34.9, True), (54.1, 28.0, True), (30.0, 16.0, True), (30.0, 19.0, False),
-])  # fmt: skip
-def test_a_deviation_of_a_modulus_is_one_of_its_logarithm(off, sd, determined):
-    found = replace(experiment(), figures=(Figure("mu [%]", "id/mu_relative_error", 100, 1),
-                                           Figure("sd of mu [%]", "posterior/mu_relative_sd", 100, 1)))  # fmt: skip
-    claim = Claim("within 5 %", "mu [%]", most=5.0, unless="sd of mu [%]")
-    said = verdict(found, claim, {"mu [%]": cells(a=(off, None, 1)), "sd of mu [%]": cells(a=(sd, None, 1))})
-    assert said.startswith("does not hold" if determined else "none is determined")
-
-
-def test_the_page_has_what_was_run_and_says_what_was_not(tmp_path):
-    found = narrowed(load_experiment(PAPER, "table_generalisation"), {"scene": ["rabbit", "peanut"]}, (0,))
-    jobs = [job for job in jobs_of(found, tmp_path / "runs")
-            if any(place["method"].name in ("ours", "NeuMA") for place in job.places)]  # fmt: skip
-    for job in jobs:
-        write_metrics(job, rms=0.010 if "adapter=operator" in job.overrides else 0.030)
-    write_results(found, jobs, tmp_path / "docs" / "results", "the command")
-    (tmp_path / "docs" / "results" / "law_from_motion.md").write_text("# A law\n\ntext\n")
-    assert run(arguments(["--page", "--results", str(tmp_path / "docs" / "results")])) == 0
-    text = (tmp_path / "docs" / "results.md").read_text()
-    assert "[A law](results/law_from_motion.md)." in text
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
-    glance = {row[0]: row[1:] for row in rows if len(row) == 5}
-    assert glance["Ablations of the paper's adapter and of its motion cues"] == ["not run", "", "4 not run", ""]
-    jobs_complete, _, papers, about_ours = glance["Generalisation to drops that were not seen"]
-    assert jobs_complete == "4 of 4" and papers == "2 not run" and about_ours == "2 hold against what was run"
-    for name in NAMES:
-        assert f"## {load_experiment(PAPER, name).title}" in text
-    assert "31.35 / 92.3" in text and "`the command`" in text and "](results/table_generalisation.png)" in text
-    row = next(line for line in text.splitlines() if line.startswith("| NCLaw"))
-    assert row.count("not run") >= 2
-    least = "our default has the smallest error of all"
-    assert f"{least}: **holds against those that were run, 10.0 against 20.0 (prior only; better in 2 of 2), " in text
-    assert "30.0 (NeuMA; better in 2 of 2); not run: " in text
-    assert "Here: not run. `mosa-experiment table_ablation`" in text
-    with pytest.raises(ConfigError, match="--results: expected a folder"):
-        run(arguments(["--page", "--results", str(tmp_path / "nothing")]))
-    (tmp_path / "docs" / "results" / "table_generalisation.json").write_text("{}")
-    with pytest.raises(DataError, match=r"table_generalisation\.json"):
-        run(arguments(["--page", "--results", str(tmp_path / "docs" / "results")]))
-
-
-@pytest.mark.parametrize(("count", "said"), [("3", True), ("0", False), (None, False)])
-def test_the_page_says_of_figures_that_the_program_has_changed_since(monkeypatch, count, said):
-    """Of no change, or of a commit that this checkout does not know, it says nothing."""
-    asked = []
-    monkeypatch.setattr(commits, "git", lambda *words: asked.append(words) or count)
-    found = older(["command: `mosa-experiment all`", "version 0.1.0, commit 0123456789ab, with changes", "seeds: 0"])
-    assert asked == [("rev-list", "--count", "0123456789ab..HEAD", "--", "mosa", "conf")]
-    assert found == ["**These figures are of an older commit, 0123456789ab:** 3 commits have changed the program (`mosa/`, "
-                     "`conf/`) since, up to when this page was made. What it gives now was not run."] * said
-    assert older(["version 0.1.0, commit unknown"]) == [] and len(asked) == 1
-
-
-def test_results_name_the_commits_that_their_runs_were_made_with(tmp_path):
-    """Not the one that collects them: the commonest first, and the others with how many they are."""
-    found, jobs = made_up(tmp_path)
-    complete = [job for job in jobs if job.finished]
-    assert made_by(complete) == f"commit {commits.commit()}"
-    for job, made in zip(complete, ("0123456789ab", "ba9876543210, with changes") + ("0123456789ab",) * 9):
-        (job.folder / "commit.txt").write_text(made + "\n")
-    assert made_by(complete) == "commit 0123456789ab (1 job of ba9876543210, with changes)"
-    page = write_results(found, jobs, tmp_path / "results", "the command").read_text()
-    assert "commit 0123456789ab (1 job of ba9876543210, with changes)" in page
-
-
-def test_the_commit_of_a_result_is_that_of_the_checkout():
-    assert re.fullmatch(r"unknown|[0-9a-f]{12}(, with changes)?", commits.commit())
-    assert commits.git("no-such-command") is None
 
 
 def test_a_claim_of_a_figure_or_row_that_is_not_there_is_a_mistake_of_the_file():

@@ -2,18 +2,18 @@
 
 import csv
 import json
+import sys
 from pathlib import Path
 
 import pytest
+from made_up import PAPER
 
-import mosa
 from mosa.errors import DataError
+from mosa.experiments import running
 from mosa.experiments.collecting import records_of
 from mosa.experiments.parameters import parameters, verdict
 from mosa.experiments.specification import jobs_of, load_experiment, narrowed
 from mosa.experiments.specimens import ANGLES, compression, plane
-
-PAPER = Path(mosa.__file__).parents[1] / "conf" / "experiment" / "paper"
 
 
 def pressed(folder: Path, **models) -> None:
@@ -42,6 +42,16 @@ def test_what_was_pressed_is_a_table_without_its_checkpoints(tmp_path):
     assert pictures[0].is_file()
     lines = list(csv.DictReader(open(pictures[0].with_suffix(".csv"))))
     assert [(line["method"], float(line["degrees"]), float(line["E_Pa"])) for line in lines][-2] == ("ours", 60.0, 1.26e5)
+
+
+def test_a_run_that_is_made_again_is_pressed_again(tmp_path, monkeypatch):
+    """What was measured of the law that was here before, and why it failed, are not said of the new one."""
+    _, (job,) = cylinder(tmp_path, ("ours",))
+    pressed(job.folder, **{"": ((1.0, 1.2, 1.0), 0.0)})
+    (job.folder / "failed.txt").write_text("SimulationDiverged")
+    monkeypatch.setattr(running, "command_of", lambda _: [sys.executable, "-c", ""])
+    running.begin(job, None).wait()
+    assert sorted(file.name for file in job.folder.iterdir()) == ["commit.txt", "screen.log"]
 
 
 def test_a_damaged_file_of_what_was_pressed_is_named(tmp_path):

@@ -373,7 +373,7 @@ def test_a_calibration_knows_what_a_grid_may_have_done_to_it():
     body = small_body(adapter=False)
     found = identification(body, [seen_on_a_coarser_grid(small_body(adapter=False))], "prior")
     run(found)
-    found.independent = lambda: 1.0  # all of what it counts, so that the grid alone is what widens
+    found.independent = lambda _: 1.0  # all of what it counts, so that the grid alone is what widens
     aware = found.posterior()
     found.settings = replace(found.settings, grid_error=0.0)
     unaware = found.posterior()

@@ -10,7 +10,7 @@ from torch import nn
 
 from mosa.errors import SimulationDiverged
 from mosa.modules import backbone_search
-from mosa.modules.backbone_search import FIRST, LAST, nearest_end, rollouts_of_search
+from mosa.modules.backbone_search import FIRST, LAST, moved, nearest_end, rollouts_of_search
 from mosa.modules.material import Material
 
 
@@ -75,6 +75,14 @@ def yielding(**numbers):
     made = small_body(adapter=False)
     made.material = Material("herschel_bulkley_hencky", numbers).double()
     return made
+
+
+def test_numbers_are_moved_alone_and_in_pairs_so_that_many_of_them_have_no_more_starts_than_can_be_tried():
+    assert moved(["E", "nu"]) == [{}]
+    two = moved(["mu", "kappa", "yield_stress", "viscosity"])
+    assert len(two) == 9 and {"yield_stress": -1.1, "viscosity": 1.6} in two and {"viscosity": -1.6} in two and {} in two
+    assert len(moved(["E", "nu", "fibre_stiffness", "fibre_1", "fibre_2"])) == 19
+    assert len(moved(["E", "nu", *(f"n{i}" for i in range(8))])) == 1 + 2 * 8 + 4 * 28  # all combinations: 6561
 
 
 def test_a_law_of_four_numbers_is_calibrated_nearer_than_by_a_search_in_one_after_the_other(monkeypatch):
