@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mosa.experiments.commits import commit
-from mosa.experiments.specification import COMMIT, FAILED, MINUTES, PRESSED, Job
+from mosa.experiments.specification import COMMIT, FAILED, MINUTES, PRESSED, Job, in_turn
 from mosa.whole_files import write_whole
 
 PROGRAM = "from mosa.commands.train import main; main()"
@@ -27,10 +27,10 @@ def command_of(job: Job) -> list[str]:
 def run_jobs(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: int) -> dict[str, str]:
     """Run what is not complete; {folder: reason} of the jobs that failed. devices: GPUs, [None] for the CPU.
 
-    Of jobs that share a reconstruction the first runs alone until it is made, and the others find it in the cache."""
-    waiting = [job for job in jobs if not job.finished]
+    Of jobs that share a reconstruction the first runs without the others until it is made, and they find it in the cache."""
+    waiting = in_turn([job for job in jobs if not job.finished], devices)
     known = {job.first for job in jobs if job.finished}
-    free = [device for device in devices for _ in range(side_by_side)]
+    free = dict.fromkeys(devices, side_by_side)
     running: dict[subprocess.Popen, tuple[Job, int | None, float]] = {}
     failed: dict[str, str] = {}
     done, total = 0, len(waiting)
@@ -38,7 +38,7 @@ def run_jobs(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: i
         while waiting or running:
             for process in [p for p in running if p.poll() is not None]:
                 job, device, began = running.pop(process)
-                free.append(device)
+                free[device] += side_by_side if job.alone else 1
                 known.add(job.first)
                 done += 1
                 if process.returncode != 0 or not job.finished:
@@ -51,10 +51,11 @@ def run_jobs(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: i
                 print(f"[{done}/{total}] {job.folder.name}: {outcome} after {minutes:.1f} min", flush=True)
             making = {job.first for job, _, _ in running.values() if not reconstructed(job)} - known
             ready = next((job for job in waiting if job.first not in making), None)
-            if free and ready is not None:
+            device = max(devices, key=free.get)  # of several the one with the fewest jobs
+            places = side_by_side if ready is not None and ready.alone else 1
+            if ready is not None and free[device] >= places:
                 waiting.remove(ready)
-                device = max(devices, key=free.count)  # of several the one with the fewest jobs
-                free.remove(device)
+                free[device] -= places
                 running[begin(ready, device)] = (ready, device, time.perf_counter())
             else:
                 time.sleep(WAIT)

@@ -76,7 +76,8 @@ class Claim:
 class Experiment:
     """rows, columns: axes of the table (every other one but the seed is a table of its own); printed: entry of printed.yaml; note:
     how the data differ from the paper's; minutes: of a job that runs alone, on cpu and gpu; analysis: a function of `analyses`, or
-    None; listed: whether the page of results shows the table of figures, which an analysis may say better; claims: for the page."""
+    None; listed: whether the page of results shows the table of figures, which an analysis may say better; alone: its jobs have
+    runs of their own, each with nothing beside it on its device; claims: for the page."""
 
     name: str
     title: str
@@ -93,13 +94,15 @@ class Experiment:
     analysis: str | None = None
     mean: bool = True
     listed: bool = True
+    alone: bool = False
     claims: tuple[Claim, ...] = ()
     quick: bool = False
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run of train.py. places: option by axis, of each cell that reads it; first: what it shares a reconstruction with."""
+    """One run of train.py. places: option by axis, of each cell that reads it; first: what it shares a reconstruction with; alone:
+    with nothing beside it on its device."""
 
     folder: Path
     overrides: tuple[str, ...]
@@ -107,6 +110,7 @@ class Job:
     places: tuple[dict[str, Option], ...]
     minutes: dict[str, float]
     first: str
+    alone: bool = False
 
     @property
     def finished(self) -> bool:
@@ -242,7 +246,7 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
         place = dict(zip(experiment.axes, options))
         for seed in experiment.seeds:
             overrides = (*experiment.common, *(each for option in options for each in option.overrides), *more, f"seed={seed}")
-            folder = runs / folder_name(overrides)
+            folder = runs / (ALONE * experiment.alone + folder_name(overrides))
             known = found.get(folder)
             if known is not None:
                 found[folder] = replace(known, places=(*known.places, place))
@@ -253,10 +257,12 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
             ]
             minutes = {device: value * math.prod(option.cost_on(device) for option in options)
                        for device, value in experiment.minutes.items()}
-            found[folder] = Job(folder, overrides, seed, (place,), minutes, " ".join([scene, *rest]))
+            found[folder] = Job(folder, overrides, seed, (place,), minutes, " ".join([scene, *rest]), experiment.alone)
     return list(found.values())
 
 
+ALONE = "alone-"
+"""Before the name of a folder whose run had its device to itself: what others share was run in company."""
 QUIET = ("logger", "evaluation.video")
 """Overrides that the name of a folder leaves to its digest."""
 
@@ -306,24 +312,42 @@ CROWD = 0.15
 H200 took 1.5 to 4.3."""
 
 
+def in_turn(jobs: Sequence[Job], devices: Sequence[int | None]) -> list[Job]:
+    """In the order in which they run: the longest first, so that none of them is waited for in the end; then what runs alone."""
+    device = device_kind(devices)
+    return sorted(jobs, key=lambda job: (job.alone, -job.minutes[device]))
+
+
+def device_kind(devices: Sequence[int | None]) -> str:
+    """cpu | gpu."""
+    return "cpu" if list(devices) == [None] else "gpu"
+
+
 def estimate(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: int) -> list[str]:
     """A line for each job and one for all of them, in the order and places that they run in (`running.run_jobs`). Minutes of jobs
     to come are scaled by those that are complete; a GPU's also by how many jobs it has at a time."""
-    device, slots = "cpu" if list(devices) == [None] else "gpu", len(devices) * side_by_side
+    device, slots = device_kind(devices), len(devices) * side_by_side
     taken = {job.folder: minutes_taken(job) for job in jobs}
-    done = [(taken[job.folder], job.minutes[device]) for job in jobs if taken[job.folder] is not None]
-    left = sum(1 for job in jobs if taken[job.folder] is None)
-    crowd = 1 + CROWD * (min(side_by_side, -(-left // len(devices))) - 1) if device == "gpu" and left else 1.0
-    scale = sum(t for t, _ in done) / sum(m for _, m in done) if done else crowd
+    left = [job for job in jobs if taken[job.folder] is None]
+    beside = min(side_by_side, -(-sum(not job.alone for job in left) // len(devices)))
+    crowd = 1 + CROWD * (beside - 1) if device == "gpu" and beside else 1.0
+    scale = {True: 1.0, False: crowd}  # of jobs that run alone, and of all others
+    for kind in scale:
+        done = [(taken[job.folder], job.minutes[device]) for job in jobs if taken[job.folder] is not None and job.alone == kind]
+        if done:
+            scale[kind] = sum(t for t, _ in done) / sum(m for _, m in done)
     lines, ends = [], [0.0] * slots
-    for job in jobs:
-        known = taken[job.folder]
-        expected = job.minutes[device] * scale
-        if known is None:
+    alone: list[float] = []  # of each device, the end of what ran alone there
+    for job in in_turn(jobs, devices):
+        known, expected = taken[job.folder], job.minutes[device] * scale[job.alone]
+        if known is None and job.alone:
+            alone = alone or [max(ends)] * len(devices)
+            alone[alone.index(min(alone))] += expected
+        elif known is None:
             ends[ends.index(min(ends))] += expected
         state = f"complete, {known:.1f} min" if known is not None else f"about {expected:.1f} min"
         lines.append(f"{job.folder.name}: {state}: {' '.join(job.overrides)}")
-    return [*lines, f"{len(jobs)} jobs, {left} to run, about {max(ends):.1f} minutes with {slots} side by side"]
+    return [*lines, f"{len(jobs)} jobs, {len(left)} to run, about {max(alone or ends):.1f} minutes with {slots} side by side"]
 
 
 def read_job(job: Job) -> dict[str, float | str] | None:

@@ -17,21 +17,19 @@ learned one, and images are rendered by the project's splats. The other particle
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
-from mosa.errors import ConfigError, SimulationDiverged
+from mosa.errors import ConfigError
 from mosa.modules.adapter_base import Adapter
 from mosa.modules.networks import TwoHiddenLayers, zero_outputs
+from mosa.modules.pair_dynamics import Interactions
 from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState
 from mosa.schema import WIDEST, number, whole
-from mosa.types import ParticleState, Rollout
 
 DAMPING = 0.1
 """Of d where the network answers zero: about a twentieth of critical for a bond."""
@@ -59,6 +57,10 @@ class InteractionNetwork(Adapter):
         self.net = TwoHiddenLayers(3, 2, hidden)
         zero_outputs(self.net[-1])
         self.register_buffer("scale", torch.tensor(SCALE), persistent=False)
+        self._dynamics: tuple[float, object, float, Interactions] | None = None  # the last one, with what it was asked for
+
+    def __getstate__(self) -> dict:
+        return {**super().__getstate__(), "_dynamics": None}  # it holds graphs, which can be neither copied nor pickled
 
     def settle(self, rest: Tensor, volume: Tensor) -> None:
         """Choose nodes and bonds of a body: rest (N, 3) [m], volume (N,) [m^3]. Errors: ConfigError for too few particles."""
@@ -90,14 +92,15 @@ class InteractionNetwork(Adapter):
         self.fastest = float(np.sqrt(2 * rate.max()))  # bound of the nodes' frequencies, times sqrt(E_ref/density)
         self.radius = 0.5 * float(V.mean()) ** (1 / 3)
 
-    def tension(self, e: Tensor, rate: Tensor, mean: Tensor) -> Tensor:
+    def tension(self, e: Tensor, rate: Tensor, mean: Tensor, net: Callable[[Tensor], Tensor]) -> Tensor:
         """(B,) f/(E_ref a) of bonds; e, rate, mean: (B,) strain, its rate over c and the mean strain around."""
-        raw = self.net(self.scale * torch.stack([e, rate, mean], -1))
+        raw = net(self.scale * torch.stack([e, rate, mean], -1))
         bounded = torch.tanh(raw)
         return e * torch.exp(self.stiffer * bounded[:, 0]) + DAMPING * torch.exp(bounded[:, 1]) * rate
 
-    def forces(self, x: Tensor, v: Tensor, density: float) -> Tensor:
-        """(M, 3) [N] on the nodes at x (M, 3) [m] with velocities v (M, 3) [m/s]; density [kg/m^3]."""
+    def forces(self, x: Tensor, v: Tensor, density: float, net: Callable[[Tensor], Tensor] | None = None) -> Tensor:
+        """(M, 3) [N] on the nodes at x (M, 3) [m] with velocities v (M, 3) [m/s]; density [kg/m^3]; net: in place of the
+        network, with other weights."""
         d = x[self.j] - x[self.i]
         r = d.norm(dim=-1)
         n = d / r[:, None]
@@ -105,7 +108,8 @@ class InteractionNetwork(Adapter):
         rate = ((v[self.j] - v[self.i]) * n).sum(-1) * torch.sqrt(density / self.E_ref)
         zero = torch.zeros(len(x), dtype=x.dtype, device=x.device)
         around = (zero.index_add(0, self.i, e).index_add(0, self.j, e)) / self.degree
-        f = (self.E_ref * self.area * self.tension(e, rate, 0.5 * (around[self.i] + around[self.j])))[:, None] * n
+        mean = 0.5 * (around[self.i] + around[self.j])
+        f = (self.E_ref * self.area * self.tension(e, rate, mean, self.net if net is None else net))[:, None] * n
         return torch.zeros_like(x).index_add(0, self.i, f).index_add(0, self.j, -f)
 
     def follow_nodes(self, x: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -121,85 +125,13 @@ class InteractionNetwork(Adapter):
     def simulator(self, density: float, world, frame_dt: float) -> Interactions:
         """What rolls the nodes out in a world, in place of the body's `Simulator`. Errors: ConfigError."""
         self.check_on()
-        return Interactions(self, density, world, frame_dt)
+        last = self._dynamics
+        if last is None or (last[0], last[2]) != (density, frame_dt) or last[1] is not world:
+            self._dynamics = last = density, world, frame_dt, Interactions(self, density, world, frame_dt)
+        return last[3]
 
     def forward(self, state: MaterialState) -> AdapterOperator:
         raise ConfigError("adapter=interaction: pair forces have no stress; expected a rollout by `Body.simulate`")
-
-
-class Interactions:
-    """Nodes under their pair forces, gravity and a ground; symplectic Euler. `substeps` of each frame of frame_dt [s]."""
-
-    def __init__(self, network: InteractionNetwork, density: float, world, frame_dt: float) -> None:
-        if world.planes or world.colliders:
-            raise ConfigError("adapter=interaction: expected a world with a ground alone, found world.walls or world.colliders")
-        fastest = network.fastest * math.sqrt(float(network.E_ref) / density) * math.exp(0.5 * network.stiffer)
-        self.substeps = math.ceil(frame_dt * fastest)  # half of the limit of stability, 2/fastest, for bonds at their stiffest
-        self.network, self.density, self.world, self.frame_dt = network, density, world, frame_dt
-
-    def rollout(
-        self, state: ParticleState, *, frames: int, parameters=None, volume=None, density=None, adapter=None, stride=None,
-        collect: Callable | None = None, motions=(), progress: Callable[[int], None] | None = None, started: bool = False,
-        start_time: float = 0.0,
-    ) -> Rollout:  # fmt: skip
-        """As `Simulator.rollout`; what concerns a law or a grid is not read. Errors: SimulationDiverged naming the frame."""
-        if state.x.ndim == 3:
-            raise ConfigError("adapter=interaction: expected one body at a time, found many worlds")
-        network = self.network
-        x, v = state.x[network.nodes], state.v[network.nodes]
-        C = state.C_affine
-        recorded = [(state.x, state.v, state.F)]
-        for frame in range(1, frames):
-            if torch.is_grad_enabled():
-                x, v = checkpoint(self.frame, x, v, use_reentrant=False)
-            else:
-                x, v = self.frame(x, v)
-            if not bool(torch.isfinite(x).all()):
-                raise SimulationDiverged(f"adapter=interaction: a position is not finite in frame {frame}; lower "
-                                         "fit.joint.lr_adapter")
-            recorded.append(network.follow_nodes(x, v))
-            if progress is not None:
-                progress(frame)
-        if collect is not None:
-            network.note_stress(x.new_zeros(1, 6))
-            collect(network.statistics())
-        xs, vs, Fs = (torch.stack(values) for values in zip(*recorded))
-        times = self.frame_dt * torch.arange(frames, dtype=xs.dtype, device=xs.device)
-        a, b, c = Fs.detach().unbind(-2)
-        inverted = int(((a * torch.linalg.cross(b, c)).sum(-1) <= 0).sum())
-        final = ParticleState(xs[-1], vs[-1], C, Fs[-1], Fs[-1])
-        return Rollout(x=xs, v=vs, F=Fs, F_tot=Fs, times=times, final=final, inverted=inverted, reactions=None,
-                       counts=(self.substeps,) * (frames - 1))
-
-    def stepper(self, *_, **__) -> None:
-        raise ConfigError("adapter=interaction: expected a whole rollout (Twin.simulate); its nodes are not advanced step by step")
-
-    def frame(self, x: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """(x, v) (M, 3) of the nodes one frame later."""
-        network, dt = self.network, self.frame_dt / self.substeps
-        gravity = self.world.gravity.to(x)
-        mass = self.density * network.node_volume[:, None]
-        for _ in range(self.substeps):
-            v = v + dt * (network.forces(x, v, self.density) / mass + gravity)
-            if self.world.ground is not None:
-                v = self.contact(x, v)
-            x = x + dt * v
-        return x, v
-
-    def contact(self, x: Tensor, v: Tensor) -> Tensor:
-        """Velocities after the ground, as a grid node's (`contact/planes.py`), but that a node may leave it in every mode: on a
-        grid the particles leave sticky nodes, which are no part of the body."""
-        ground, up = self.world.ground, self.world.up.to(x)
-        normal = (v @ up)[:, None]
-        touching = ((x @ up) - ground.height <= self.network.radius)[:, None] & (normal < 0)
-        tangent = v - normal * up
-        if ground.mode == "sticky":
-            return torch.where(touching, torch.zeros_like(v), v)
-        if ground.mode == "slip":
-            return torch.where(touching, tangent, v)
-        size = (tangent.square().sum(-1, keepdim=True) + 1e-12).sqrt()
-        kept = (1 + ground.friction * normal / size).clamp(min=0)
-        return torch.where(touching, kept * tangent, v)
 
 
 def spread(X: np.ndarray, count: int) -> np.ndarray:

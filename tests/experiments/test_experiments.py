@@ -32,6 +32,7 @@ from mosa.experiments.specification import (
     claim_of,
     estimate,
     folder_name,
+    in_turn,
     jobs_of,
     load_experiment,
     minutes_taken,
@@ -168,6 +169,16 @@ def test_the_estimate_knows_the_longest_job_and_what_shares_a_gpu(tmp_path):
     assert "about 3.0 minutes" in estimate(one, [None], 1)[-1] and "about 5.0 minutes" in estimate(one, [0], 1)[-1]
 
 
+def test_what_runs_alone_comes_last_and_without_a_crowd(tmp_path):
+    timed = experiment(name="timed", alone=True, seeds=(0,))
+    both = [*jobs_of(timed, tmp_path), *jobs_of(experiment(), tmp_path)]
+    assert len({job.folder for job in both}) == 12  # none is shared with what runs in company
+    assert [(job.alone, job.minutes["gpu"]) for job in in_turn(both, [0])] == (
+        [(False, 2.0)] * 4 + [(False, 1.0)] * 4 + [(True, 2.0)] * 2 + [(True, 1.0)] * 2)  # fmt: skip
+    crowded = 2 * (1 + 3 * CROWD)
+    assert f"about {crowded + 3:.1f} minutes with 8" in estimate(both, [0, 1], 4)[-1]
+
+
 FAKE = """
 import json, os, pathlib, sys, time
 folder = pathlib.Path(sys.argv[1])
@@ -233,6 +244,20 @@ def test_jobs_are_spread_over_the_gpus_where_there_are_places_for_more(tmp_path,
     assert running.run_jobs(jobs, [0, 1], 4) == {}
     taken = [json.loads((job.folder / "metrics.json").read_text())["gpu"] for job in jobs]
     assert sorted(taken) == ["0", "0", "1", "1"]
+
+
+def test_a_job_that_runs_alone_has_its_device_to_itself(tmp_path, monkeypatch):
+    monkeypatch.setattr(running, "command_of", lambda job: [sys.executable, "-c", FAKE, str(job.folder)])
+    scenes = {"scene": tuple(Option(name, (f"scene={name}",)) for name in "abcd"), "method": (Option("ours", ()),)}
+    company, timed = (jobs_of(experiment(axes=scenes, seeds=(0,), alone=alone), tmp_path) for alone in (False, True))
+    assert running.run_jobs([*timed, *company], [None], 3) == {}
+    now, most = [], {"alone": 0, "in company": 0}
+    for line in (tmp_path / "log.txt").read_text().splitlines():
+        word, name = line.split()
+        now.append(name) if word == "begin" else now.remove(name)
+        alone = any(each.startswith("alone") for each in now)
+        most["alone" if alone else "in company"] = max(most["alone" if alone else "in company"], len(now))
+    assert most == {"alone": 1, "in company": 3}
 
 
 # ------------------------------------------------------------------------------------------------ tables of made-up figures

@@ -1,5 +1,6 @@
 """Baselines of the literature: each has the property that its own paper is about, starts where it says and loads again."""
 
+import copy
 import inspect
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from mosa.modules.interaction import InteractionNetwork
 from mosa.modules.material import Material, material_states
 from mosa.modules.nclaw import NeuralLaw, invariants, matrix_of, polar_rotation, pretrain, vech_of
 from mosa.modules.neuma import LowRankLaw
+from mosa.modules.pair_dynamics import Frame
 from mosa.physics.contact.planes import Plane
 
 CONF = Path(__file__).parents[2] / "conf"
@@ -220,6 +222,61 @@ def test_its_rollout_has_gradients():
     rollout = body.simulate(start(), WORLD, 6, FRAME_DT)
     rollout.x[-1].square().sum().backward()
     assert body.adapter.net[-1].weight.grad.abs().max() > 0
+
+
+def rolled(body: Body, device: str, rollouts: int) -> list[torch.Tensor]:
+    """Positions and gradients of the last of several rollouts, the weights stepped after each: on CUDA the last are graphs."""
+    body, world = body.to(device), replace(WORLD, **{name: getattr(WORLD, name).to(device) for name in ("gravity", "up", "box")})
+    for _ in range(rollouts):
+        first = start()
+        first = type(first)(*(t.to(device).requires_grad_() for t in vars(first).values()))
+        weights = list(body.adapter.net.parameters())
+        rollout = body.simulate(first, world, 6, FRAME_DT)
+        found = torch.autograd.grad(rollout.x.square().sum() + rollout.F.square().sum(), [first.velocity, *weights])
+        with torch.no_grad():
+            for weight, gradient in zip(weights, found[1:]):
+                weight -= 0.01 * gradient / (gradient.norm() + 1e-12)
+    return [t.detach().cpu() for t in (rollout.x, *found)]
+
+
+def test_the_adjoint_of_its_frames_is_that_of_their_substeps():
+    body = adapted(InteractionNetwork(nodes=40, neighbours=8))
+    x, v = torch.nn.Parameter(lattice()[body.adapter.nodes]), torch.full((40, 3), 0.1).double().requires_grad_()
+    dynamics = body.adapter.simulator(1000.0, WORLD, FRAME_DT)
+    dynamics.substeps = 5
+    weights = tuple(body.adapter.net.parameters())
+    passes = dynamics.passes(x)
+    moved = Frame.apply(passes, *Frame.apply(passes, x, v, *weights), *weights)
+    around = passes.gravity, passes.up, body.adapter.net
+    there = dynamics.frame(*dynamics.frame(x, v, *around), *around)
+    torch.testing.assert_close(moved, there, rtol=0, atol=0)
+    found, expected = (torch.autograd.grad(each[0].square().sum() + each[1].sum(), [x, v, *weights]) for each in (moved, there))
+    torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-12)
+
+
+def test_weights_that_change_before_the_adjoint_are_an_error():
+    body = adapted(InteractionNetwork(nodes=40, neighbours=8))
+    rollout = body.simulate(start(), WORLD, 3, FRAME_DT)
+    with torch.no_grad():
+        body.adapter.net[-1].weight.add_(0.1)
+    with pytest.raises(RuntimeError, match="inplace"):
+        rollout.x[-1].square().sum().backward()
+
+
+def test_a_body_with_pair_forces_is_copied_and_moves_alike():
+    body = adapted(InteractionNetwork(nodes=40, neighbours=8))
+    with torch.no_grad():
+        here = body.simulate(start(), WORLD, 3, FRAME_DT)
+        there = copy.deepcopy(body).simulate(start(), WORLD, 3, FRAME_DT)
+    torch.testing.assert_close(here.x, there.x, rtol=0, atol=0)
+
+
+@pytest.mark.gpu
+def test_pair_forces_on_cuda_as_on_a_cpu():
+    body = adapted(InteractionNetwork(nodes=40, neighbours=8))
+    found, expected = (rolled(copy.deepcopy(body), device, 4) for device in ("cuda", "cpu"))
+    for here, there in zip(found, expected):
+        assert (here - there).abs().max() <= 1e-8 * max(1.0, float(there.abs().max()))
 
 
 def test_walls_and_colliders_are_refused():
