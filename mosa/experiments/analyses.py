@@ -36,7 +36,7 @@ MOTIONS = {"": "rollout.npz", "prior/": "prior.npz"}
 def errors_by_frame(record: Record) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """{held-out sequence: (times (T,) [s], root mean square distance of the particles from the true motion (T,) [m])}."""
     folder, name = record.job.folder, MOTIONS.get(prefix(record))
-    if name is None or not (folder / name).is_file() or not (folder / "truth.npz").is_file():
+    if record.figures is None or name is None or not (folder / name).is_file() or not (folder / "truth.npz").is_file():
         return {}
     found = {}
     with np.load(folder / name) as motions, np.load(folder / "truth.npz") as truth:

@@ -37,11 +37,14 @@ def pressed_file(record: Record) -> Path:
 
 
 def first_seeds(records: Sequence[Record], prefixes: Sequence[str], files: Sequence[Callable[[Record], Path]]) -> Iterator[Record]:
-    """The records of these models, of several seeds the first that has one of the files."""
+    """The records of these models, of several seeds the first that is complete and has one of the files: what a run had learned by
+    the time that it was stopped is no result."""
     seen = set()
     for record in records:
         key = tuple(option.name for option in record.place.values())
-        if prefix(record) in prefixes and key not in seen and any(file(record).is_file() for file in files):
+        if record.figures is None or prefix(record) not in prefixes or key in seen:
+            continue
+        if any(file(record).is_file() for file in files):
             seen.add(key)
             yield record
 

@@ -10,6 +10,7 @@ from made_up import PAPER
 
 from mosa.errors import DataError
 from mosa.experiments import running
+from mosa.experiments.analyses import directions, heterogeneity
 from mosa.experiments.collecting import records_of
 from mosa.experiments.parameters import parameters, verdict
 from mosa.experiments.specification import jobs_of, load_experiment, narrowed
@@ -17,8 +18,9 @@ from mosa.experiments.specimens import ANGLES, compression, plane
 
 
 def pressed(folder: Path, **models) -> None:
-    """As `measured` leaves it: E of 100 kPa times what is given, of a truth of 100, 120 and 100 kPa."""
+    """As `measured` leaves it for a complete run: E of 100 kPa times what is given, of a truth of 100, 120 and 100 kPa."""
     folder.mkdir(parents=True, exist_ok=True)
+    (folder / "metrics.json").write_text(json.dumps({"test/rms_m": 0.01, "prior/test/rms_m": 0.02}))
     kept = {"degrees": [0.0, 60.0, 120.0], "truth_Pa": [1e5, 1.2e5, 1e5], "models": {
         name: None if found is None else {"modulus_Pa": [1e5 * f for f in found[0]], "force_off": found[1]}
         for name, found in models.items()}}  # fmt: skip
@@ -44,6 +46,17 @@ def test_what_was_pressed_is_a_table_without_its_checkpoints(tmp_path):
     assert [(line["method"], float(line["degrees"]), float(line["E_Pa"])) for line in lines][-2] == ("ours", 60.0, 1.26e5)
 
 
+def test_of_a_run_that_was_stopped_nothing_is_measured(tmp_path):
+    """Its checkpoint holds what the law was on its way."""
+    found, jobs = cylinder(tmp_path, ("ours",))
+    pressed(jobs[0].folder, **{"": ((1.0, 1.2, 1.0), 0.0)})
+    (jobs[0].folder / "metrics.json").unlink()
+    (jobs[0].folder / "checkpoints").mkdir()
+    (jobs[0].folder / "checkpoints" / "last.ckpt").touch()
+    for analysis in (compression, directions, heterogeneity):
+        assert analysis(found, records_of(jobs), tmp_path / "figure") == ("", [])
+
+
 def test_a_run_that_is_made_again_is_pressed_again(tmp_path, monkeypatch):
     """What was measured of the law that was here before, and why it failed, are not said of the new one."""
     _, (job,) = cylinder(tmp_path, ("ours",))
@@ -51,12 +64,12 @@ def test_a_run_that_is_made_again_is_pressed_again(tmp_path, monkeypatch):
     (job.folder / "failed.txt").write_text("SimulationDiverged")
     monkeypatch.setattr(running, "command_of", lambda _: [sys.executable, "-c", ""])
     running.begin(job, None).wait()
-    assert sorted(file.name for file in job.folder.iterdir()) == ["commit.txt", "screen.log"]
+    assert sorted(file.name for file in job.folder.iterdir()) == ["commit.txt", "metrics.json", "screen.log"]
 
 
 def test_a_damaged_file_of_what_was_pressed_is_named(tmp_path):
     found, jobs = cylinder(tmp_path, ("ours",))
-    jobs[0].folder.mkdir(parents=True)
+    pressed(jobs[0].folder)
     (jobs[0].folder / "pressed.json").write_text("{}")
     with pytest.raises(DataError, match=r"pressed\.json.*remove it"):
         compression(found, records_of(jobs), tmp_path / "figure")
