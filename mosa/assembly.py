@@ -22,6 +22,7 @@ from mosa.modules.body import Body, Start, World
 from mosa.modules.carried_splats import CarriedSplats
 from mosa.modules.lit_mosa import LitMosa
 from mosa.modules.takes import Take
+from mosa.physics.constitutive.laws import law_named
 from mosa.progress import tqdm
 from mosa.reconstruction.moved import SecondLook
 from mosa.reconstruction.pipeline import follow, reconstruct, spacing_for, stored
@@ -174,8 +175,10 @@ class Run:
 
     def second_look(self, scene: Scene, reconstruction: Reconstruction) -> SecondLook | None:
         """Finds the cues of a sequence about a prediction, where reconstruction.informed asks for it."""
-        settings = self.reconstruction_settings
-        return SecondLook(scene, reconstruction, settings, self.cfg.seed, self.device) if settings.looks_again else None
+        settings, plastic = self.reconstruction_settings, law_named(self.body.material.law).plastic
+        if not settings.looks_again:
+            return None
+        return SecondLook(scene, reconstruction, settings, self.cfg.seed, self.device, plastic=plastic)
 
 
 def scenes(cfg: DictConfig) -> tuple[Scene, list[Scene]]:

@@ -40,7 +40,8 @@ class InformedSettings:
     weights of the energies, counted from the prediction, as in `DynamicSettings`; response: views of every frame from which it is
     found how much of the prediction stays in what is seen (`response`), 0 for not at all; carriers: Gaussians compared with
     the images: `fitted`, those that were fitted to all frames, in their light (`carried`), where there are any; `first`, those of
-    the first motion."""
+    the first motion; `auto`, these of a body that yields or flows, else the fitted ones. Gaussians that were fitted as the first
+    motion carried them hold a body to that motion, which of a liquid may be a tenth of a metre off."""
 
     iterations: int = knob(80, whole(0))
     views: int = knob(1, COUNT)
@@ -48,7 +49,7 @@ class InformedSettings:
     elastic: float = knob(0.3, WEIGHT)
     bending: float = knob(1.0, WEIGHT)
     response: int = knob(4, whole(0))
-    carriers: str = knob("fitted", one_of("fitted", "first"))
+    carriers: str = knob("auto", one_of("auto", "fitted", "first"))
 
     def __post_init__(self) -> None:
         check_knobs(self, "reconstruction.informed")
