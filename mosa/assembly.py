@@ -175,10 +175,11 @@ class Run:
 
     def second_look(self, scene: Scene, reconstruction: Reconstruction) -> SecondLook | None:
         """Finds the cues of a sequence about a prediction, where reconstruction.informed asks for it."""
-        settings, plastic = self.reconstruction_settings, law_named(self.body.material.law).plastic
+        settings = self.reconstruction_settings
         if not settings.looks_again:
             return None
-        return SecondLook(scene, reconstruction, settings, self.cfg.seed, self.device, plastic=plastic)
+        return SecondLook(scene, reconstruction, settings, self.cfg.seed, self.device,
+                          plastic=lambda: law_named(self.body.material.law).plastic)
 
 
 def scenes(cfg: DictConfig) -> tuple[Scene, list[Scene]]:

@@ -6,7 +6,10 @@ import argparse
 import shlex
 import signal
 import sys
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mosa.commands import configuration
 from mosa.errors import ConfigError, MosaError
@@ -14,12 +17,16 @@ from mosa.refused import explained
 from mosa.screen import outlived
 from mosa.threads import settle_threads
 
+if TYPE_CHECKING:
+    from mosa.experiments.specification import Job
+
 RESULTS = Path("docs/results")
 
 
 def arguments(words: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="mosa-experiment", description=__doc__)
-    parser.add_argument("names", nargs="*", metavar="NAME", help="experiments, or all; none: list them")
+    parser.add_argument("names", nargs="*", metavar="NAME",
+                        help="experiments, or all; the jobs of what is named first begin first; none: list them")
     parser.add_argument("--quick", action="store_true", help="the small variant, minutes on two cores")
     parser.add_argument("--dry-run", action="store_true", help="list the jobs with the estimated time, run nothing")
     parser.add_argument("--collect", action="store_true", help="run nothing, write the results of the jobs that are complete")
@@ -76,7 +83,6 @@ def interrupt(*_) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Exit code: 1 where jobs failed. Errors: ConfigError naming argument or file."""
-    from mosa.experiments.running import run_jobs
     from mosa.experiments.specification import estimate, experiment_names, jobs_of, load_experiment, narrowed, pairs, total_minutes
 
     folder = Path(configuration()) / "experiment" / "paper"
@@ -90,27 +96,35 @@ def run(options: argparse.Namespace) -> int:
     devices = [None] if options.devices is None else whole_numbers("--devices", options.devices)
     if options.jobs < 1:
         raise ConfigError(f"--jobs: expected at least 1, found {options.jobs}")
-    names = experiment_names(folder) if options.names == ["all"] else options.names
-    experiments = [load_experiment(folder, name, quick=options.quick) for name in names]
+    turns: dict[str, int] = {}
+    for turn, word in enumerate(options.names):
+        for name in experiment_names(folder) if word == "all" else [word]:
+            turns.setdefault(name, turn)
+    experiments = [load_experiment(folder, name, quick=options.quick) for name in turns]
     seeds = None if options.seeds is None else tuple(whole_numbers("--seeds", options.seeds))
     experiments = [
         narrowed(e, pairs(options.only, experiments), seeds) for e in experiments
     ]
     more = [*options.overrides, *(["trainer=gpu"] if devices != [None] else [])]
     planned = {e.name: jobs_of(e, options.runs, more) for e in experiments}
-    jobs = list({job.folder: job for found in planned.values() for job in found}.values())
+    wanted: dict[Path, Job] = {}
+    for name, found in planned.items():
+        for job in found:
+            wanted.setdefault(job.folder, replace(job, turn=turns[name]))
+    jobs = list(wanted.values())
     check_overrides(options.overrides, list(jobs[0].overrides) if jobs else [])
-    for line in estimate(jobs, devices, options.jobs):
+    lines, minutes = estimate(jobs, devices, options.jobs)
+    for line in lines:
         print(line, flush=True)
     results = options.results or (options.runs / "results" if options.quick else RESULTS)
     if options.dry_run:
         return 0
     writable("--runs", options.runs)
     writable("--results", results)
-    failed = {} if options.collect else run_jobs(jobs, devices, options.jobs)
+    command = shown(options)
+    failed = {} if options.collect else run_counted(options, jobs, devices, minutes)
     from mosa.experiments.writing import write_results
 
-    command = shown(options)
     for experiment in experiments:
         page = write_results(experiment, planned[experiment.name], results, command)
         print(f"{experiment.name}: {page}, {total_minutes(planned[experiment.name]):.1f} minutes of jobs")
@@ -119,6 +133,23 @@ def run(options: argparse.Namespace) -> int:
     for where, reason in failed.items():
         print(f"failed: {where}: {reason}", file=sys.stderr)
     return 1 if failed else 0
+
+
+def run_counted(options: argparse.Namespace, jobs: Sequence[Job], devices: Sequence[int | None], minutes: float) -> dict[str, str]:
+    """`run_jobs`, with a row in the runs' `goes.csv` and a last line that says how long this and earlier goes have taken."""
+    from mosa.experiments.commits import commit
+    from mosa.experiments.goes import Clock, Go, now, said_of
+    from mosa.experiments.running import run_jobs
+
+    left = sum(not job.finished for job in jobs)
+    if not left:
+        return {}
+    clock = Clock(options.runs, Go(now(), shown(options), commit(), len(devices), options.jobs, left, round(minutes, 1)))
+    try:
+        return run_jobs(jobs, devices, options.jobs, clock.ended)
+    finally:
+        clock.write()
+        print(said_of([*clock.before, clock.go]), flush=True)
 
 
 def write_the_page(folder: Path, options: argparse.Namespace) -> Path:

@@ -3,52 +3,56 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 from mosa.experiments.commits import commit
+from mosa.experiments.processes import begun
 from mosa.experiments.specification import COMMIT, FAILED, MINUTES, PRESSED, Job, in_turn
 from mosa.whole_files import write_whole
 
-PROGRAM = "from mosa.commands.train import main; main()"
+PROGRAM = "mosa.commands.train:main"
 WAIT = 0.2
 """Seconds between looks at the running jobs."""
 
 
-def command_of(job: Job) -> list[str]:
-    """A run with the job's overrides in its folder, which goes on from a checkpoint that it finds there."""
+def words_of(job: Job) -> list[str]:
+    """Of a run with the job's overrides in its folder, which goes on from a checkpoint that it finds there."""
     folder = str(job.folder.resolve()).replace("'", "\\'")
-    return [sys.executable, "-c", PROGRAM, *job.overrides, "resume=auto", f"hydra.run.dir='{folder}'"]
+    return [*job.overrides, "resume=auto", f"hydra.run.dir='{folder}'"]
 
 
-def run_jobs(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: int) -> dict[str, str]:
-    """Run what is not complete; {folder: reason} of the jobs that failed. devices: GPUs, [None] for the CPU.
+def run_jobs(
+    jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: int, ended: Callable[[bool], None] = lambda failed: None
+) -> dict[str, str]:
+    """Run what is not complete; {folder: reason} of the jobs that failed. devices: GPUs, [None] for the CPU; ended: told of each
+    job whether it failed.
 
     Of jobs that share a reconstruction the first runs without the others until it is made, and they find it in the cache."""
     waiting = in_turn([job for job in jobs if not job.finished], devices)
     known = {job.first for job in jobs if job.finished}
     free = dict.fromkeys(devices, side_by_side)
-    running: dict[subprocess.Popen, tuple[Job, int | None, float]] = {}
+    running: dict[BaseProcess, tuple[Job, int | None, float]] = {}
     failed: dict[str, str] = {}
     done, total = 0, len(waiting)
     try:
         while waiting or running:
-            for process in [p for p in running if p.poll() is not None]:
+            for process in [p for p in running if p.exitcode is not None]:
                 job, device, began = running.pop(process)
                 free[device] += side_by_side if job.alone else 1
                 known.add(job.first)
                 done += 1
-                if process.returncode != 0 or not job.finished:
-                    failed[job.folder.name] = reason(job, process.returncode)
+                if process.exitcode != 0 or not job.finished:
+                    failed[job.folder.name] = reason(job, process.exitcode)
                     write_whole(job.folder / FAILED, failed[job.folder.name] + "\n")
                 outcome = "failed" if job.folder.name in failed else "complete"
                 minutes = (time.perf_counter() - began) / 60
                 if outcome == "complete":
                     write_whole(job.folder / MINUTES, f"{minutes:.3f}\n")
                 print(f"[{done}/{total}] {job.folder.name}: {outcome} after {minutes:.1f} min", flush=True)
+                ended(outcome == "failed")
             making = {job.first for job, _, _ in running.values() if not reconstructed(job)} - known
             ready = next((job for job in waiting if job.first not in making), None)
             device = max(devices, key=free.get)  # of several the one with the fewest jobs
@@ -63,11 +67,11 @@ def run_jobs(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: i
         for process in running:  # Ctrl-C: each writes its checkpoint and ends
             process.terminate()
         for process in running:
-            process.wait()
+            process.join()
     return failed
 
 
-def begin(job: Job, device: int | None) -> subprocess.Popen:
+def begin(job: Job, device: int | None) -> BaseProcess:
     job.folder.mkdir(parents=True, exist_ok=True)
     for name in (FAILED, PRESSED):  # of the run that was here before
         (job.folder / name).unlink(missing_ok=True)
@@ -77,8 +81,7 @@ def begin(job: Job, device: int | None) -> subprocess.Popen:
     if device is not None:
         listed = [part for part in environment.get("CUDA_VISIBLE_DEVICES", "").split(",") if part]
         environment["CUDA_VISIBLE_DEVICES"] = listed[device] if device < len(listed) else str(device)
-    with open(job.folder / "screen.log", "wb") as screen:
-        return subprocess.Popen(command_of(job), stdout=screen, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, env=environment)
+    return begun(PROGRAM, words_of(job), job.folder / "screen.log", environment)
 
 
 def reconstructed(job: Job) -> bool:

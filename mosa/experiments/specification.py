@@ -102,7 +102,7 @@ class Experiment:
 @dataclass(frozen=True)
 class Job:
     """One run of train.py. places: option by axis, of each cell that reads it; first: what it shares a reconstruction with; alone:
-    with nothing beside it on its device."""
+    with nothing beside it on its device; turn: those with a lower one begin before it."""
 
     folder: Path
     overrides: tuple[str, ...]
@@ -111,6 +111,7 @@ class Job:
     minutes: dict[str, float]
     first: str
     alone: bool = False
+    turn: int = 0
 
     @property
     def finished(self) -> bool:
@@ -263,7 +264,7 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
 
 ALONE = "alone-"
 """Before the name of a folder whose run had its device to itself: what others share was run in company."""
-QUIET = ("logger", "evaluation.video")
+QUIET = ("logger", "evaluation.video", "evaluation.assignment")
 """Overrides that the name of a folder leaves to its digest."""
 
 
@@ -313,9 +314,10 @@ H200 took 1.5 to 4.3."""
 
 
 def in_turn(jobs: Sequence[Job], devices: Sequence[int | None]) -> list[Job]:
-    """In the order in which they run: the longest first, so that none of them is waited for in the end; then what runs alone."""
+    """In the order in which they run: that of their turns, of one turn the longest first, so that none of them is waited for in the
+    end; then what runs alone."""
     device = device_kind(devices)
-    return sorted(jobs, key=lambda job: (job.alone, -job.minutes[device]))
+    return sorted(jobs, key=lambda job: (job.alone, job.turn, -job.minutes[device]))
 
 
 def device_kind(devices: Sequence[int | None]) -> str:
@@ -323,9 +325,10 @@ def device_kind(devices: Sequence[int | None]) -> str:
     return "cpu" if list(devices) == [None] else "gpu"
 
 
-def estimate(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: int) -> list[str]:
-    """A line for each job and one for all of them, in the order and places that they run in (`running.run_jobs`). Minutes of jobs
-    to come are scaled by those that are complete; a GPU's also by how many jobs it has at a time."""
+def estimate(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: int) -> tuple[list[str], float]:
+    """A line for each job and one for all of them, in the order and places that they run in (`running.run_jobs`), and the minutes
+    until they are complete. Minutes of jobs to come are scaled by those that are complete; a GPU's also by how many jobs it has at
+    a time."""
     device, slots = device_kind(devices), len(devices) * side_by_side
     taken = {job.folder: minutes_taken(job) for job in jobs}
     left = [job for job in jobs if taken[job.folder] is None]
@@ -347,7 +350,8 @@ def estimate(jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: i
             ends[ends.index(min(ends))] += expected
         state = f"complete, {known:.1f} min" if known is not None else f"about {expected:.1f} min"
         lines.append(f"{job.folder.name}: {state}: {' '.join(job.overrides)}")
-    return [*lines, f"{len(jobs)} jobs, {len(left)} to run, about {max(alone or ends):.1f} minutes with {slots} side by side"]
+    minutes = max(alone or ends)
+    return [*lines, f"{len(jobs)} jobs, {len(left)} to run, about {minutes:.1f} minutes with {slots} side by side"], minutes
 
 
 def read_job(job: Job) -> dict[str, float | str] | None:

@@ -110,7 +110,8 @@ class SecondLook:
     """The cues of a sequence once more, about what a simulation predicts (`informed`). Nothing is cached: the prediction is a run's
     own.
 
-    reconstruction: of `scene`; seed: of the order in which views are drawn; plastic: whether the body yields or flows.
+    reconstruction: of `scene`; seed: of the order in which views are drawn; plastic: whether the body yields or flows,
+    asked when images are first looked at (which law a body has may be found by its fit).
     """
 
     scene: Scene
@@ -119,7 +120,7 @@ class SecondLook:
     seed: int = 0
     device: torch.device | str = "cpu"
     progress: bool = True
-    plastic: bool = False
+    plastic: Callable[[], bool] = lambda: False
 
     def about(self, predicted: Tensor, seen: Tensor | None = None) -> MotionCues:
         """predicted: (T, N, 3) [m] of the particles in the training frames; seen: what was found of them before, None for the
@@ -173,7 +174,7 @@ class SecondLook:
         """What is compared with the images."""
         parts, appearance = self.reconstruction.moving, self.reconstruction.appearance
         carriers = self.settings.informed.carriers
-        first = carriers == "first" or (carriers == "auto" and self.plastic)
+        first = carriers == "first" or (carriers == "auto" and self.plastic())
         if first or appearance is None or appearance.light is None:
             return parts.carried
         appearance = appearance.to(self.device)

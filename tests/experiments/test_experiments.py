@@ -1,11 +1,11 @@
 """The harness of the paper's tables: files that compose, jobs made once, tables of made-up figures, and one experiment for real."""
 
 import errno
+import hashlib
 import json
 import math
 import os
 import re
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from mosa import whole_files
 from mosa.commands.experiment import arguments, run, shown
 from mosa.config import rehearse
 from mosa.errors import ConfigError, DataError
-from mosa.experiments import running, specimens
+from mosa.experiments import processes, running, specimens
 from mosa.experiments.analyses import ANALYSES
 from mosa.experiments.collecting import Cell, best_of, records_of, table
 from mosa.experiments.page import read_tables
@@ -153,20 +153,20 @@ def test_what_is_said_of_one_experiment_holds_for_that_one(tmp_path):
 
 def test_the_estimate_learns_from_the_jobs_that_are_complete(tmp_path):
     jobs = jobs_of(experiment(), tmp_path)
-    assert estimate(jobs, [None], 1)[-1] == "8 jobs, 8 to run, about 36.0 minutes with 1 side by side"  # 4 of 3, 4 of 6
-    assert "about 6.0 minutes with 2" in estimate(jobs, [0, 1], 1)[-1]
+    assert estimate(jobs, [None], 1)[0][-1] == "8 jobs, 8 to run, about 36.0 minutes with 1 side by side"  # 4 of 3, 4 of 6
+    assert "about 6.0 minutes with 2" in estimate(jobs, [0, 1], 1)[0][-1]
     write_metrics(jobs[0], **{"time/fit_s": 300.0})  # six minutes in place of three
-    assert estimate(jobs, [None], 1)[-1] == "8 jobs, 7 to run, about 66.0 minutes with 1 side by side"
+    assert estimate(jobs, [None], 1)[0][-1] == "8 jobs, 7 to run, about 66.0 minutes with 1 side by side"
 
 
 def test_the_estimate_knows_the_longest_job_and_what_shares_a_gpu(tmp_path):
     jobs = jobs_of(experiment(), tmp_path)
-    assert "about 6.0 minutes with 8" in estimate(jobs, [None], 8)[-1]  # none is shorter for the others
-    assert f"about {2 * (1 + 3 * CROWD):.1f} minutes with 8" in estimate(jobs, [0, 1], 4)[-1]
-    assert f"about {2 * (1 + 3 * CROWD):.1f} minutes with 40" in estimate(jobs, [0, 1], 20)[-1]  # there are four on each
+    assert "about 6.0 minutes with 8" in estimate(jobs, [None], 8)[0][-1]  # none is shorter for the others
+    assert f"about {2 * (1 + 3 * CROWD):.1f} minutes with 8" in estimate(jobs, [0, 1], 4)[0][-1]
+    assert f"about {2 * (1 + 3 * CROWD):.1f} minutes with 40" in estimate(jobs, [0, 1], 20)[0][-1]  # there are four on each
     own = experiment(axes={**experiment().axes, "method": (Option("box", ("adapter=direct",), cost={"gpu": 5.0}),)})
     one = jobs_of(narrowed(own, {"scene": ["a"]}, (0,)), tmp_path / "own")
-    assert "about 3.0 minutes" in estimate(one, [None], 1)[-1] and "about 5.0 minutes" in estimate(one, [0], 1)[-1]
+    assert "about 3.0 minutes" in estimate(one, [None], 1)[0][-1] and "about 5.0 minutes" in estimate(one, [0], 1)[0][-1]
 
 
 def test_what_runs_alone_comes_last_and_without_a_crowd(tmp_path):
@@ -176,27 +176,49 @@ def test_what_runs_alone_comes_last_and_without_a_crowd(tmp_path):
     assert [(job.alone, job.minutes["gpu"]) for job in in_turn(both, [0])] == (
         [(False, 2.0)] * 4 + [(False, 1.0)] * 4 + [(True, 2.0)] * 2 + [(True, 1.0)] * 2)  # fmt: skip
     crowded = 2 * (1 + 3 * CROWD)
-    assert f"about {crowded + 3:.1f} minutes with 8" in estimate(both, [0, 1], 4)[-1]
+    assert f"about {crowded + 3:.1f} minutes with 8" in estimate(both, [0, 1], 4)[0][-1]
+
+
+def test_the_jobs_of_what_is_named_first_begin_first_and_those_of_one_word_the_longest_first(tmp_path):
+    jobs = [replace(job, turn=int(job.seed == 0)) for job in jobs_of(experiment(), tmp_path)]
+    order = [(job.seed, job.minutes["gpu"]) for job in in_turn(jobs, [0])]
+    assert order == [(seed, minutes) for seed in (1, 0) for minutes in (2.0, 2.0, 1.0, 1.0)]
 
 
 FAKE = """
 import json, os, pathlib, sys, time
-folder = pathlib.Path(sys.argv[1])
-log = folder.parent / "log.txt"
-with open(log, "a") as file:
-    file.write(f"begin {folder.name}\\n")
-time.sleep(0.3)
-with open(log, "a") as file:
-    file.write(f"end {folder.name}\\n")
-if "direct" in folder.name:
-    print("ConfigError: it broke")
-    sys.exit(2)
-(folder / "metrics.json").write_text(json.dumps({"gpu": os.environ.get("CUDA_VISIBLE_DEVICES", "")}))
+
+def main():
+    folder = pathlib.Path(sys.argv[-1].removeprefix("hydra.run.dir=").strip("'"))
+    log = folder.parent / "log.txt"
+    with open(log, "a") as file:
+        file.write(f"begin {folder.name}\\n")
+    time.sleep(0.3)
+    with open(log, "a") as file:
+        file.write(f"end {folder.name}\\n")
+    if "direct" in folder.name:
+        print("ConfigError: it broke")
+        sys.exit(2)
+    (folder / "metrics.json").write_text(json.dumps({"gpu": os.environ.get("CUDA_VISIBLE_DEVICES", "")}))
 """
 
 
-def test_jobs_run_side_by_side_once_and_the_first_of_a_reconstruction_alone(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(running, "command_of", lambda job: [sys.executable, "-c", FAKE, str(job.folder)])
+@pytest.fixture
+def fake(tmp_path, monkeypatch):
+    """Makes another program than train.py what a job runs; a name of its own each, as a process imports it by its name."""
+
+    def made(code: str = FAKE) -> None:
+        name = f"fake_job_{hashlib.sha256(code.encode()).hexdigest()[:8]}"
+        (tmp_path / f"{name}.py").write_text(code)
+        monkeypatch.syspath_prepend(str(tmp_path))
+        monkeypatch.setattr(processes, "PRELOADED", [])
+        monkeypatch.setattr(running, "PROGRAM", f"{name}:main")
+
+    return made
+
+
+def test_jobs_run_side_by_side_once_and_the_first_of_a_reconstruction_alone(tmp_path, fake, capsys):
+    fake()
     jobs = jobs_of(experiment(), tmp_path)
     failed = running.run_jobs(jobs, [None], 4)
     assert len(failed) == 4 and set(failed.values()) == {"ConfigError: it broke"}
@@ -216,9 +238,9 @@ def test_jobs_run_side_by_side_once_and_the_first_of_a_reconstruction_alone(tmp_
     assert (tmp_path / "log.txt").read_text().count("begin") == 4  # those that failed, no other
 
 
-def test_what_shares_a_reconstruction_begins_when_that_is_made(tmp_path, monkeypatch):
+def test_what_shares_a_reconstruction_begins_when_that_is_made(tmp_path, fake):
     said = FAKE.replace("time.sleep(0.3)", "time.sleep(0.2); print('reconstruction took 1 s', flush=True); time.sleep(1.5)")
-    monkeypatch.setattr(running, "command_of", lambda job: [sys.executable, "-c", said, str(job.folder)])
+    fake(said)
     jobs = jobs_of(narrowed(experiment(), {"scene": ["a"]}, (0,)), tmp_path)
     assert len(jobs) == 2
     running.run_jobs(jobs, [None], 2)
@@ -228,16 +250,16 @@ def test_what_shares_a_reconstruction_begins_when_that_is_made(tmp_path, monkeyp
     assert len(taken) == 1 and taken[0] > 1.5 / 60  # one of them fails
 
 
-def test_every_gpu_has_its_own_jobs(tmp_path, monkeypatch):
-    monkeypatch.setattr(running, "command_of", lambda job: [sys.executable, "-c", FAKE, str(job.folder)])
+def test_every_gpu_has_its_own_jobs(tmp_path, fake, monkeypatch):
+    fake()
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,7")
     jobs = [job for job in jobs_of(experiment(), tmp_path) if "operator" in job.folder.name]
     assert running.run_jobs(jobs, [0, 1], 1) == {}
     assert {json.loads((job.folder / "metrics.json").read_text())["gpu"] for job in jobs} == {"4", "7"}
 
 
-def test_jobs_are_spread_over_the_gpus_where_there_are_places_for_more(tmp_path, monkeypatch):
-    monkeypatch.setattr(running, "command_of", lambda job: [sys.executable, "-c", FAKE, str(job.folder)])
+def test_jobs_are_spread_over_the_gpus_where_there_are_places_for_more(tmp_path, fake, monkeypatch):
+    fake()
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     scenes = tuple(Option(name, (f"scene={name}",)) for name in "abcd")
     jobs = jobs_of(experiment(axes={"method": (Option("ours", ("adapter=operator",)),), "scene": scenes}, seeds=(0,)), tmp_path)
@@ -246,8 +268,8 @@ def test_jobs_are_spread_over_the_gpus_where_there_are_places_for_more(tmp_path,
     assert sorted(taken) == ["0", "0", "1", "1"]
 
 
-def test_a_job_that_runs_alone_has_its_device_to_itself(tmp_path, monkeypatch):
-    monkeypatch.setattr(running, "command_of", lambda job: [sys.executable, "-c", FAKE, str(job.folder)])
+def test_a_job_that_runs_alone_has_its_device_to_itself(tmp_path, fake):
+    fake()
     scenes = {"scene": tuple(Option(name, (f"scene={name}",)) for name in "abcd"), "method": (Option("ours", ()),)}
     company, timed = (jobs_of(experiment(axes=scenes, seeds=(0,), alone=alone), tmp_path) for alone in (False, True))
     assert running.run_jobs([*timed, *company], [None], 3) == {}

@@ -2,14 +2,13 @@
 
 import csv
 import json
-import sys
 from pathlib import Path
 
 import pytest
 from made_up import PAPER
 
 from mosa.errors import DataError
-from mosa.experiments import running
+from mosa.experiments import processes, running
 from mosa.experiments.analyses import directions, heterogeneity
 from mosa.experiments.collecting import records_of
 from mosa.experiments.parameters import parameters, verdict
@@ -62,8 +61,9 @@ def test_a_run_that_is_made_again_is_pressed_again(tmp_path, monkeypatch):
     _, (job,) = cylinder(tmp_path, ("ours",))
     pressed(job.folder, **{"": ((1.0, 1.2, 1.0), 0.0)})
     (job.folder / "failed.txt").write_text("SimulationDiverged")
-    monkeypatch.setattr(running, "command_of", lambda _: [sys.executable, "-c", ""])
-    running.begin(job, None).wait()
+    monkeypatch.setattr(processes, "PRELOADED", [])
+    monkeypatch.setattr(running, "PROGRAM", "gc:collect")
+    running.begin(job, None).join()
     assert sorted(file.name for file in job.folder.iterdir()) == ["commit.txt", "metrics.json", "screen.log"]
 
 

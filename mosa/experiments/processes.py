@@ -1,0 +1,41 @@
+"""Processes of jobs that begin with the program imported. Its libraries take 6 to 12 s of a core to import, as much as a tenth of
+what a small job takes on a GPU: a server imports them once, and every job is a fork of it."""
+
+from __future__ import annotations
+
+import importlib
+import multiprocessing
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+PRELOADED = ["mosa.pipeline"]
+"""What the server imports. None of it may begin Warp or CUDA, with which a process cannot be forked
+(`tests/experiments/test_processes.py`)."""
+
+
+def begun(program: str, words: Sequence[str], screen: Path, environment: Mapping[str, str]) -> BaseProcess:
+    """A process of `program`, a "module:function", with its words on the command line and its output in the file `screen`.
+    environment: all of it. On a system that cannot fork it imports for itself."""
+    server = "forkserver" in multiprocessing.get_all_start_methods()
+    context = multiprocessing.get_context("forkserver" if server else "spawn")
+    if server:
+        context.set_forkserver_preload(PRELOADED)  # which counts for the first process
+    process = context.Process(target=work, args=(program, list(words), str(screen), dict(environment)))
+    process.start()
+    return process
+
+
+def work(program: str, words: list[str], screen: str, environment: dict[str, str]) -> None:
+    """What a process of `begun` does."""
+    os.environ.clear()
+    os.environ.update(environment)
+    written = os.open(screen, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+    for number in (1, 2):
+        os.dup2(written, number)
+    os.close(written)
+    where, _, function = program.partition(":")
+    sys.argv = [where, *words]
+    getattr(importlib.import_module(where), function)()
