@@ -308,9 +308,9 @@ def total_minutes(jobs: Sequence[Job]) -> float:
     return sum(minutes_taken(job) or 0.0 for job in jobs)
 
 
-CROWD = 0.15
-"""By how much each further job on a GPU makes all of them slower: of what takes 1.0 to 1.6 minutes alone, twelve side by side on an
-H200 took 1.5 to 4.3."""
+CROWD = 0.08
+"""By how much each further job on a GPU makes all of them slower: of what takes 1.2 minutes alone, fourteen side by side on an H100
+with sixteen cores, under MPS, took 2.0 to 2.4."""
 
 
 def in_turn(jobs: Sequence[Job], devices: Sequence[int | None]) -> list[Job]:
