@@ -1,5 +1,5 @@
-"""Processes of jobs that begin with the program imported. Its libraries take 6 to 12 s of a core to import, as much as a tenth of
-what a small job takes on a GPU: a server imports them once, and every job is a fork of it."""
+"""Processes of jobs that begin with the libraries imported. That takes 6 to 15 s of a core, as much as a tenth of what a small job
+takes on a GPU: a server imports them once, and every job is a fork of it."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from collections.abc import Mapping, Sequence
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-PRELOADED = ["mosa.pipeline"]
-"""What the server imports. None of it may begin Warp or CUDA, with which a process cannot be forked
-(`tests/experiments/test_processes.py`)."""
+PRELOADED = ["lightning", "kornia", "cv2", "hydra", "imageio", "torch.utils.tensorboard", "warp"]
+"""What the server imports: libraries that train.py imports, but no part of mosa, which begins Warp. With Warp or CUDA begun, or with
+threads, a process cannot be forked (`tests/experiments/test_processes.py`)."""
 
 
 def begun(program: str, words: Sequence[str], screen: Path, environment: Mapping[str, str]) -> BaseProcess:

@@ -1,4 +1,4 @@
-"""Jobs are forks of a server that has the program imported."""
+"""Jobs are forks of a server that has the libraries imported."""
 
 import os
 import subprocess
