@@ -272,7 +272,7 @@ def degraded(found: dict[str, float], stored: dict[str, float]) -> list[str]:
     return [name for name, value in stored.items() if not found.get(name, float("inf")) <= ALLOWED * value]
 
 
-def check(attempts: int = 3) -> tuple[dict[str, float], dict[str, float], list[str]]:
+def check(attempts: int = 8) -> tuple[dict[str, float], dict[str, float], list[str]]:
     """(ratios found, stored, names of degraded ones). Rounds are added while one looks degraded, `attempts` times at most."""
     stored = json.loads(STORED.read_text())["ratios"]
     measurement = Check()

@@ -12,8 +12,8 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 PRELOADED = ["lightning", "kornia", "cv2", "hydra", "imageio", "torch.utils.tensorboard", "warp"]
-"""What the server imports: libraries that train.py imports, but no part of mosa, which begins Warp. With Warp or CUDA begun, or with
-threads, a process cannot be forked (`tests/experiments/test_processes.py`)."""
+"""What the server imports: libraries that train.py imports, but no part of mosa, which begins Warp. With Warp or CUDA begun, or
+with threads, a process cannot be forked (`tests/experiments/test_processes.py`)."""
 
 
 def begun(program: str, words: Sequence[str], screen: Path, environment: Mapping[str, str]) -> BaseProcess:
@@ -23,6 +23,7 @@ def begun(program: str, words: Sequence[str], screen: Path, environment: Mapping
     context = multiprocessing.get_context("forkserver" if server else "spawn")
     if server:
         context.set_forkserver_preload(PRELOADED)  # which counts for the first process
+    screen.write_bytes(b"")  # whoever reads it finds nothing of a run that was there before
     process = context.Process(target=work, args=(program, list(words), str(screen), dict(environment)))
     process.start()
     return process

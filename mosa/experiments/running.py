@@ -30,9 +30,10 @@ def run_jobs(
     """Run what is not complete; {folder: reason} of the jobs that failed. devices: GPUs, [None] for the CPU; ended: told of each
     job whether it failed.
 
-    Of jobs that share a reconstruction the first runs without the others until it is made, and they find it in the cache."""
+    Of jobs that share their films, or a reconstruction, the first runs without the others until these are made, and they find them
+    in the cache."""
     waiting = in_turn([job for job in jobs if not job.finished], devices)
-    known = {job.first for job in jobs if job.finished}
+    known = {made for job in jobs if job.finished for made in (job.film, job.first)}
     free = dict.fromkeys(devices, side_by_side)
     running: dict[BaseProcess, tuple[Job, int | None, float]] = {}
     failed: dict[str, str] = {}
@@ -42,7 +43,7 @@ def run_jobs(
             for process in [p for p in running if p.exitcode is not None]:
                 job, device, began = running.pop(process)
                 free[device] += side_by_side if job.alone else 1
-                known.add(job.first)
+                known |= {job.film, job.first}
                 done += 1
                 if process.exitcode != 0 or not job.finished:
                     failed[job.folder.name] = reason(job, process.exitcode)
@@ -53,8 +54,8 @@ def run_jobs(
                     write_whole(job.folder / MINUTES, f"{minutes:.3f}\n")
                 print(f"[{done}/{total}] {job.folder.name}: {outcome} after {minutes:.1f} min", flush=True)
                 ended(outcome == "failed")
-            making = {job.first for job, _, _ in running.values() if not reconstructed(job)} - known
-            ready = next((job for job in waiting if job.first not in making), None)
+            making = {what for job, _, _ in running.values() for what in in_making(job)} - known
+            ready = next((job for job in waiting if not {job.film, job.first} & making), None)
             device = max(devices, key=free.get)  # of several the one with the fewest jobs
             places = side_by_side if ready is not None and ready.alone else 1
             if ready is not None and free[device] >= places:
@@ -84,10 +85,11 @@ def begin(job: Job, device: int | None) -> BaseProcess:
     return begun(PROGRAM, words_of(job), job.folder / "screen.log", environment)
 
 
-def reconstructed(job: Job) -> bool:
-    """Whether a running job has its films and its reconstruction, which are then in the cache."""
+def in_making(job: Job) -> set[str]:
+    """What a running job shares with others and does not have yet: its films, its reconstruction."""
     screen = job.folder / "screen.log"
-    return screen.is_file() and "reconstruction took" in screen.read_text(errors="replace")
+    said = screen.read_text(errors="replace") if screen.is_file() else ""
+    return {what for what, stage in ((job.film, "data"), (job.first, "reconstruction")) if f"{stage} took" not in said}
 
 
 def reason(job: Job, code: int) -> str:

@@ -101,14 +101,15 @@ class Experiment:
 
 @dataclass(frozen=True)
 class Job:
-    """One run of train.py. places: option by axis, of each cell that reads it; first: what it shares a reconstruction with; alone:
-    with nothing beside it on its device; turn: those with a lower one begin before it."""
+    """One run of train.py. places: option by axis, of each cell that reads it; film: what it shares its films with; first: a
+    reconstruction; alone: with nothing beside it on its device; turn: those with a lower one begin before it."""
 
     folder: Path
     overrides: tuple[str, ...]
     seed: int
     places: tuple[dict[str, Option], ...]
     minutes: dict[str, float]
+    film: str
     first: str
     alone: bool = False
     turn: int = 0
@@ -252,19 +253,17 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
             if known is not None:
                 found[folder] = replace(known, places=(*known.places, place))
                 continue
-            scene = next((each for each in overrides if each.startswith(("scene=", "experiment="))), "")
-            rest = [
-                each for each in overrides if each.split(".")[0].split("=")[0] in ("scene", "reconstruction", "seed", "simulation")
-            ]
+            film = " ".join(each for each in overrides if each.split(".")[0].split("=")[0] in ("scene", "experiment"))
+            rest = [each for each in overrides if each.split(".")[0].split("=")[0] in ("reconstruction", "seed", "simulation")]
             minutes = {device: value * math.prod(option.cost_on(device) for option in options)
                        for device, value in experiment.minutes.items()}
-            found[folder] = Job(folder, overrides, seed, (place,), minutes, " ".join([scene, *rest]), experiment.alone)
+            found[folder] = Job(folder, overrides, seed, (place,), minutes, film, " ".join([film, *rest]), experiment.alone)
     return list(found.values())
 
 
 ALONE = "alone-"
 """Before the name of a folder whose run had its device to itself: what others share was run in company."""
-QUIET = ("logger", "evaluation.video", "evaluation.assignment")
+QUIET = ("logger", "evaluation.video", "evaluation.assignment", "evaluation.floor")
 """Overrides that the name of a folder leaves to its digest."""
 
 
@@ -308,9 +307,9 @@ def total_minutes(jobs: Sequence[Job]) -> float:
     return sum(minutes_taken(job) or 0.0 for job in jobs)
 
 
-CROWD = 0.08
-"""By how much each further job on a GPU makes all of them slower: of what takes 1.2 minutes alone, fourteen side by side on an H100
-with sixteen cores, under MPS, took 2.0 to 2.4."""
+CROWD = 0.065
+"""By how much each further job on a GPU makes all of them slower: of what takes half a minute alone, fourteen side by side on an
+H100 with sixteen cores, under MPS, took 0.9 to 1.0."""
 
 
 def in_turn(jobs: Sequence[Job], devices: Sequence[int | None]) -> list[Job]:

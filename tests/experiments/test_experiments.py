@@ -239,8 +239,8 @@ def test_jobs_run_side_by_side_once_and_the_first_of_a_reconstruction_alone(tmp_
 
 
 def test_what_shares_a_reconstruction_begins_when_that_is_made(tmp_path, fake):
-    said = FAKE.replace("time.sleep(0.3)", "time.sleep(0.2); print('reconstruction took 1 s', flush=True); time.sleep(1.5)")
-    fake(said)
+    said = "print('data took 1 s\\nreconstruction took 1 s', flush=True)"
+    fake(FAKE.replace("time.sleep(0.3)", f"time.sleep(0.2); {said}; time.sleep(1.5)"))
     jobs = jobs_of(narrowed(experiment(), {"scene": ["a"]}, (0,)), tmp_path)
     assert len(jobs) == 2
     running.run_jobs(jobs, [None], 2)
@@ -248,6 +248,19 @@ def test_what_shares_a_reconstruction_begins_when_that_is_made(tmp_path, fake):
     assert words == ["begin", "begin", "end", "end"]
     taken = [float((job.folder / "minutes.txt").read_text()) for job in jobs if job.finished]
     assert len(taken) == 1 and taken[0] > 1.5 / 60  # one of them fails
+
+
+def test_what_shares_films_begins_when_these_are_made_and_reconstructs_for_itself(tmp_path, fake):
+    """Two seeds of a scene have the same films; each would make all of them."""
+    fake(FAKE.replace("time.sleep(0.3)", """time.sleep(0.6)
+    open(log, "a").write("filmed it\\n")
+    print("data took 1 s", flush=True)
+    time.sleep(1.5)"""))
+    jobs = jobs_of(narrowed(experiment(), {"scene": ["a"], "method": ["ours"]}, (0, 1)), tmp_path)
+    assert jobs[0].film == jobs[1].film and jobs[0].first != jobs[1].first
+    running.run_jobs(jobs, [None], 2)
+    words = [line.split()[0] for line in (tmp_path / "log.txt").read_text().splitlines()]
+    assert words == ["begin", "filmed", "begin", "filmed", "end", "end"]
 
 
 def test_every_gpu_has_its_own_jobs(tmp_path, fake, monkeypatch):
