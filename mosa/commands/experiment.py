@@ -6,7 +6,7 @@ import argparse
 import shlex
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -121,13 +121,19 @@ def run(options: argparse.Namespace) -> int:
         return 0
     writable("--runs", options.runs)
     writable("--results", results)
-    command = shown(options)
-    failed = {} if options.collect else run_counted(options, jobs, devices, minutes)
-    from mosa.experiments.writing import write_results
+    from mosa.experiments.writer import Writer
 
-    for experiment in experiments:
-        page = write_results(experiment, planned[experiment.name], results, command)
-        print(f"{experiment.name}: {page}, {total_minutes(planned[experiment.name]):.1f} minutes of jobs")
+    by_name, command = {experiment.name: experiment for experiment in experiments}, shown(options)
+
+    def write(name: str) -> None:
+        from mosa.experiments.writing import write_results  # which imports the simulator: jobs do not wait for it
+
+        page = write_results(by_name[name], planned[name], results, command)
+        print(f"{name}: {page}, {total_minutes(planned[name]):.1f} minutes of jobs", flush=True)
+
+    with Writer(planned, write) as writer:
+        failed = {} if options.collect else run_counted(options, jobs, devices, minutes, writer.ended)
+        writer.finish()
     if options.page:
         print(write_the_page(folder, options))
     for where, reason in failed.items():
@@ -135,8 +141,16 @@ def run(options: argparse.Namespace) -> int:
     return 1 if failed else 0
 
 
-def run_counted(options: argparse.Namespace, jobs: Sequence[Job], devices: Sequence[int | None], minutes: float) -> dict[str, str]:
-    """`run_jobs`, with a row in the runs' `goes.csv` and a last line that says how long this and earlier goes have taken."""
+def run_counted(
+    options: argparse.Namespace,
+    jobs: Sequence[Job],
+    devices: Sequence[int | None],
+    minutes: float,
+    ended: Callable[[Job], None],
+) -> dict[str, str]:
+    """`run_jobs`, with a row in the runs' `goes.csv` and a last line that says how long this and earlier goes have taken.
+
+    minutes: as estimated; ended: told of each job that has, whether it failed or not."""
     from mosa.experiments.commits import commit
     from mosa.experiments.goes import Clock, Go, now, said_of
     from mosa.experiments.running import run_jobs
@@ -145,8 +159,13 @@ def run_counted(options: argparse.Namespace, jobs: Sequence[Job], devices: Seque
     if not left:
         return {}
     clock = Clock(options.runs, Go(now(), shown(options), commit(), len(devices), options.jobs, left, round(minutes, 1)))
+
+    def told(job: Job, job_failed: bool) -> None:
+        clock.ended(job_failed)
+        ended(job)
+
     try:
-        return run_jobs(jobs, devices, options.jobs, clock.ended)
+        return run_jobs(jobs, devices, options.jobs, told)
     finally:
         clock.write()
         print(said_of([*clock.before, clock.go]), flush=True)

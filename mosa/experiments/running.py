@@ -25,7 +25,10 @@ def words_of(job: Job) -> list[str]:
 
 
 def run_jobs(
-    jobs: Sequence[Job], devices: Sequence[int | None], side_by_side: int, ended: Callable[[bool], None] = lambda failed: None
+    jobs: Sequence[Job],
+    devices: Sequence[int | None],
+    side_by_side: int,
+    ended: Callable[[Job, bool], None] = lambda job, failed: None,
 ) -> dict[str, str]:
     """Run what is not complete; {folder: reason} of the jobs that failed. devices: GPUs, [None] for the CPU; ended: told of each
     job whether it failed.
@@ -53,7 +56,7 @@ def run_jobs(
                 if outcome == "complete":
                     write_whole(job.folder / MINUTES, f"{minutes:.3f}\n")
                 print(f"[{done}/{total}] {job.folder.name}: {outcome} after {minutes:.1f} min", flush=True)
-                ended(outcome == "failed")
+                ended(job, outcome == "failed")
             making = {what for job, _, _ in running.values() for what in in_making(job)} - known
             ready = next((job for job in waiting if not {job.film, job.first} & making), None)
             device = max(devices, key=free.get)  # of several the one with the fewest jobs
