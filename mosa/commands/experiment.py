@@ -167,8 +167,7 @@ def run_counted(
     try:
         return run_jobs(jobs, devices, options.jobs, told)
     finally:
-        clock.write()
-        print(said_of([*clock.before, clock.go]), flush=True)
+        print(said_of(clock.write()), flush=True)
 
 
 def write_the_page(folder: Path, options: argparse.Namespace) -> Path:

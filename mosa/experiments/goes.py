@@ -34,11 +34,12 @@ class Go:
 
 
 class Clock:
-    """Keeps the row of the go that runs now up to date, so that one which is killed has its row too."""
+    """Keeps the row of the go that runs now up to date, so that one which is killed has its row too. Rows of other commands that
+    run in the same folder meanwhile are kept as they are."""
 
     def __init__(self, runs: Path, go: Go) -> None:
-        self.file, self.go, self.before = runs / GOES, go, read_goes(runs)
-        self.start = time.perf_counter()
+        self.runs, self.go, self.start = runs, go, time.perf_counter()
+        read_goes(runs)  # a damaged file is said before any job runs
 
     def ended(self, failed: bool) -> None:
         """A job has."""
@@ -46,11 +47,15 @@ class Clock:
         self.go.complete += not failed
         self.write()
 
-    def write(self) -> None:
+    def write(self) -> list[Go]:
+        """All goes, this one last."""
         self.go.minutes = round((time.perf_counter() - self.start) / 60, 3)
+        own = self.go.began, self.go.command
+        goes = [*(go for go in read_goes(self.runs) if (go.began, go.command) != own), self.go]
         text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([[f.name for f in fields(Go)], *map(astuple, [*self.before, self.go])])
-        write_whole(self.file, text.getvalue())
+        csv.writer(text, lineterminator="\n").writerows([[f.name for f in fields(Go)], *map(astuple, goes)])
+        write_whole(self.runs / GOES, text.getvalue())
+        return goes
 
 
 def now() -> str:
