@@ -6,7 +6,8 @@ import argparse
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -148,7 +149,7 @@ def run_counted(
     minutes: float,
     ended: Callable[[Job], None],
 ) -> dict[str, str]:
-    """`run_jobs`, with a row in the runs' `goes.csv` and a last line that says how long this and earlier goes have taken.
+    """`run_jobs`, with a row in the runs' `goes.csv` and a line at its end that says how long this and earlier goes have taken.
 
     minutes: as estimated; ended: told of each job that has, whether it failed or not."""
     from mosa.experiments.commits import commit
@@ -161,13 +162,24 @@ def run_counted(
     clock = Clock(options.runs, Go(now(), shown(options), commit(), len(devices), options.jobs, left, round(minutes, 1)))
 
     def told(job: Job, job_failed: bool) -> None:
-        clock.ended(job_failed)
+        with only_said():
+            clock.ended(job_failed)
         ended(job)
 
     try:
         return run_jobs(jobs, devices, options.jobs, told)
     finally:
-        print(said_of(clock.write()), flush=True)
+        with only_said():
+            print(said_of(clock.write()), flush=True)
+
+
+@contextmanager
+def only_said() -> Iterator[None]:
+    """What goes wrong in keeping count is a line on the screen: it ends no jobs."""
+    try:
+        yield
+    except (MosaError, OSError) as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
 
 
 def write_the_page(folder: Path, options: argparse.Namespace) -> Path:

@@ -71,15 +71,15 @@ def read_goes(runs: Path) -> list[Go]:
     try:
         with open(file, newline="") as lines:
             return [Go(**{name: types.get(name, str)(value) for name, value in row.items()}) for row in csv.DictReader(lines)]
-    except (TypeError, ValueError, OSError) as error:
+    except (TypeError, ValueError, OSError, csv.Error) as error:
         raise DataError(f"{file}: expected a row for each time that jobs were run, found what cannot be read ({error}); "
                         "remove it, and times are counted from then on") from error
 
 
 def said_of(goes: Sequence[Go]) -> str:
     """One line; of GPUs the hours of all of them together."""
-    hours, expected = sum(go.minutes * go.devices for go in goes) / 60, goes[0].expected * goes[0].devices / 60
-    jobs = sum(go.complete for go in goes)
+    first = min(goes, key=lambda go: go.began)
+    hours, jobs = sum(go.minutes * go.devices for go in goes) / 60, sum(go.complete for go in goes)
     times = "one go" if len(goes) == 1 else f"{len(goes)} goes"
-    return (f"{jobs} jobs in {times}: {hours:.2f} hours of a device; the first go began with {goes[0].jobs} to run and "
-            f"expected {expected:.2f} for them")
+    return (f"{jobs} jobs in {times}: {hours:.2f} hours of a device; the first go began with {first.jobs} to run and "
+            f"expected {first.expected * first.devices / 60:.2f} for them")

@@ -6,14 +6,14 @@ from __future__ import annotations
 import importlib
 import multiprocessing
 import os
+import signal
 import sys
 from collections.abc import Mapping, Sequence
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-PRELOADED = ["lightning", "kornia", "cv2", "hydra", "imageio", "torch.utils.tensorboard", "warp"]
-"""What the server imports: libraries that train.py imports, but no part of mosa, which begins Warp. With Warp or CUDA begun, or
-with threads, a process cannot be forked (`tests/experiments/test_processes.py`)."""
+PRELOADED = ["mosa.experiments.preloading"]
+"""What the server imports."""
 
 
 def begun(program: str, words: Sequence[str], screen: Path, environment: Mapping[str, str]) -> BaseProcess:
@@ -31,12 +31,15 @@ def begun(program: str, words: Sequence[str], screen: Path, environment: Mapping
 
 def work(program: str, words: list[str], screen: str, environment: dict[str, str]) -> None:
     """What a process of `begun` does."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # the server ignores both
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     os.environ.clear()
     os.environ.update(environment)
-    written = os.open(screen, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
-    for number in (1, 2):
-        os.dup2(written, number)
-    os.close(written)
+    written, nothing = os.open(screen, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644), os.open(os.devnull, os.O_RDONLY)
+    for number, source in ((0, nothing), (1, written), (2, written)):
+        os.dup2(source, number)
+    # the server may have been begun without a screen; lines are read while the job runs
+    sys.stdout, sys.stderr = (open(number, "w", buffering=1, closefd=False) for number in (1, 2))
     where, _, function = program.partition(":")
     sys.argv = [where, *words]
     getattr(importlib.import_module(where), function)()

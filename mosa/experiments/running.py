@@ -36,7 +36,7 @@ def run_jobs(
     Of jobs that share their films, or a reconstruction, the first runs without the others until these are made, and they find them
     in the cache."""
     waiting = in_turn([job for job in jobs if not job.finished], devices)
-    known = {made for job in jobs if job.finished for made in (job.film, job.first)}
+    known: set[str] = set()  # what was made in earlier goes is found in the cache, or made again where that is another machine
     free = dict.fromkeys(devices, side_by_side)
     running: dict[BaseProcess, tuple[Job, int | None, float]] = {}
     failed: dict[str, str] = {}
@@ -46,7 +46,7 @@ def run_jobs(
             for process in [p for p in running if p.exitcode is not None]:
                 job, device, began = running.pop(process)
                 free[device] += side_by_side if job.alone else 1
-                known |= {job.film, job.first}
+                known |= {job.film, job.first} - in_making(job)
                 done += 1
                 if process.exitcode != 0 or not job.finished:
                     failed[job.folder.name] = reason(job, process.exitcode)
@@ -70,8 +70,13 @@ def run_jobs(
     finally:
         for process in running:  # Ctrl-C: each writes its checkpoint and ends
             process.terminate()
-        for process in running:
-            process.join()
+        try:
+            for process in running:
+                process.join()
+        except KeyboardInterrupt:  # a second one: at once
+            for process in running:
+                process.kill()
+            raise
     return failed
 
 

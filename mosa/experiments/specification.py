@@ -253,14 +253,20 @@ def jobs_of(experiment: Experiment, runs: Path, more: Sequence[str] = ()) -> lis
             if known is not None:
                 found[folder] = replace(known, places=(*known.places, place))
                 continue
-            film = " ".join(each for each in overrides if each.split(".")[0].split("=")[0] in ("scene", "experiment"))
-            rest = [each for each in overrides if each.split(".")[0].split("=")[0] in ("reconstruction", "seed", "simulation")]
+            parts = {each: each.split("=")[0].split(".") for each in overrides}
+            film = [each for each, key in parts.items() if key[0] in ("scene", "experiment") and key[1:] not in USES]
+            rest = [each for each, key in parts.items() if each not in film and key[0] in SHARED_BY]
             minutes = {device: value * math.prod(option.cost_on(device) for option in options)
                        for device, value in experiment.minutes.items()}
-            found[folder] = Job(folder, overrides, seed, (place,), minutes, film, " ".join([film, *rest]), experiment.alone)
+            found[folder] = Job(folder, overrides, seed, (place,), minutes, " ".join(film), " ".join([*film, *rest]),
+                                experiment.alone)
     return list(found.values())
 
 
+USES = (["holdout_frames"], ["holdout_cameras"], ["also_train"])
+"""Keys of a scene that say what of its films is used, and change none of them."""
+SHARED_BY = ("scene", "reconstruction", "seed", "simulation")
+"""Parts of the configuration that a reconstruction depends on."""
 ALONE = "alone-"
 """Before the name of a folder whose run had its device to itself: what others share was run in company."""
 QUIET = ("logger", "evaluation.video", "evaluation.assignment", "evaluation.floor")

@@ -38,8 +38,9 @@ class Writer:
         for name in self.left:
             if name not in self.begun:
                 self.begin(name)
-        for future in self.begun.values():
-            future.result()
+        failed = [error for future in self.begun.values() if (error := future.exception()) is not None]
+        if failed:  # the others are written
+            raise failed[0]
 
     def begin(self, name: str) -> None:
         self.begun[name] = self.pool.submit(self.write, name)

@@ -250,6 +250,15 @@ def test_what_shares_a_reconstruction_begins_when_that_is_made(tmp_path, fake):
     assert len(taken) == 1 and taken[0] > 1.5 / 60  # one of them fails
 
 
+def test_what_is_held_out_or_learned_from_changes_no_film(tmp_path):
+    scenes = tuple(Option(name, ("scene=a", *more)) for name, more in (
+        ("all", ()), ("future", ("scene.holdout_frames=5",)), ("two", ("scene.also_train=[b]",)), ("other", ("scene.material=c",))))
+    made = experiment(axes={"method": (Option("ours", ("adapter=operator",)),), "scene": scenes}, seeds=(0,))
+    jobs = jobs_of(made, tmp_path)
+    assert [job.film for job in jobs] == ["scene=a"] * 3 + ["scene=a scene.material=c"]
+    assert len({job.first for job in jobs}) == 4
+
+
 def test_what_shares_films_begins_when_these_are_made_and_reconstructs_for_itself(tmp_path, fake):
     """Two seeds of a scene have the same films; each would make all of them."""
     fake(FAKE.replace("time.sleep(0.3)", """time.sleep(0.6)

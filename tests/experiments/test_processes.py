@@ -83,3 +83,55 @@ def test_a_job_finds_what_the_server_imported(tmp_path):
     (tmp_path / "parent.py").write_text(code)
     subprocess.run([sys.executable, "parent.py"], cwd=tmp_path, check=True, timeout=120)
     assert "preloaded True" in (tmp_path / "screen.log").read_text()
+
+
+SAVING = """
+import signal, sys, time
+from pathlib import Path
+
+def stopped(*_):
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    time.sleep(1)
+    Path("saved").touch()
+    sys.exit(143)
+
+def main():
+    signal.signal(signal.SIGTERM, stopped)
+    print("ready", file=sys.stderr, flush=True)
+    time.sleep(60)
+"""
+PARENT = """
+import os, signal, sys
+from pathlib import Path
+from mosa.experiments import processes
+
+def stop(*_):
+    raise KeyboardInterrupt
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, stop)
+    process = processes.begun("saving_job:main", [], Path("screen.log"), os.environ)
+    try:
+        process.join()
+    except KeyboardInterrupt:
+        process.terminate()
+        process.join()
+    os.write(3, str(process.exitcode).encode())
+"""
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_a_stop_of_the_whole_group_of_processes_waits_for_what_jobs_save(tmp_path, shown):
+    """As `timeout` and batch systems send it; also where the command has no screen (`>&- 2>&-`), which its jobs have still."""
+    (tmp_path / "saving_job.py").write_text(SAVING)
+    (tmp_path / "parent.py").write_text(PARENT)
+    screen = "3>code" if shown else "3>code >&- 2>&-"
+    with subprocess.Popen(["sh", "-c", f"exec {sys.executable} parent.py {screen}"], cwd=tmp_path, start_new_session=True,
+                          env=os.environ | {"MOSA_PRELOADED": "", "PYTHONPATH": str(tmp_path)}) as parent:  # fmt: skip
+        log = tmp_path / "screen.log"
+        began = time.perf_counter()
+        while "ready" not in (log.read_text() if log.is_file() else "") and time.perf_counter() - began < 60:
+            time.sleep(0.05)
+        os.killpg(parent.pid, 15)
+        parent.wait(30)
+    assert (tmp_path / "saved").is_file() and (tmp_path / "code").read_text() == "143"

@@ -55,9 +55,14 @@ def test_what_is_stopped_has_written_what_was_complete(planned):
     assert written == ["three"]
 
 
-def test_what_goes_wrong_in_writing_ends_the_command(planned):
+def test_what_goes_wrong_in_writing_ends_the_command_after_the_others(planned):
+    written = []
+
     def write(name: str) -> None:
-        raise DataError(f"{name}: damaged")
+        if name == "one":
+            raise DataError(f"{name}: damaged")
+        written.append(name)
 
     with pytest.raises(DataError, match="one: damaged"), Writer(planned, write) as writer:
         writer.finish()
+    assert written == ["two", "three"]
