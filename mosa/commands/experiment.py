@@ -149,7 +149,7 @@ def run_counted(
     minutes: float,
     ended: Callable[[Job], None],
 ) -> dict[str, str]:
-    """`run_jobs`, with a row in the runs' `goes.csv` and a line at its end that says how long this and earlier goes have taken.
+    """`run_jobs`, with a row in the runs' `goes.csv` and a line at its end that says how long all goes of this command have taken.
 
     minutes: as estimated; ended: told of each job that has, whether it failed or not."""
     from mosa.experiments.commits import commit
@@ -170,7 +170,7 @@ def run_counted(
         return run_jobs(jobs, devices, options.jobs, told)
     finally:
         with only_said():
-            print(said_of(clock.write()), flush=True)
+            print(said_of([go for go in clock.write() if go.command == clock.go.command]), flush=True)
 
 
 @contextmanager

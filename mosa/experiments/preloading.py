@@ -2,16 +2,14 @@
 
 import contextlib
 import importlib
-import os
 import signal
 
-LIBRARIES = "lightning,kornia,cv2,hydra,imageio,torch.utils.tensorboard,warp"
+LIBRARIES = ("lightning", "kornia", "cv2", "hydra", "imageio", "torch.utils.tensorboard", "warp")
 """What train.py imports, but no part of mosa that begins Warp. With Warp or CUDA begun, or with threads, a process cannot be forked
 (`tests/experiments/test_processes.py`)."""
-NAME = "MOSA_PRELOADED"
 
 for number in (signal.SIGINT, signal.SIGTERM):  # sent to a whole group of processes: jobs answer them, and the server goes last
     signal.signal(number, signal.SIG_IGN)
-for name in filter(None, os.environ.get(NAME, LIBRARIES).split(",")):
+for name in LIBRARIES:
     with contextlib.suppress(Exception):  # the job that needs it says what is wrong with it
         importlib.import_module(name)

@@ -35,7 +35,7 @@ def work(program: str, words: list[str], screen: str, environment: dict[str, str
     signal.signal(signal.SIGINT, signal.default_int_handler)
     os.environ.clear()
     os.environ.update(environment)
-    written, nothing = os.open(screen, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644), os.open(os.devnull, os.O_RDONLY)
+    written, nothing = os.open(screen, os.O_WRONLY), os.open(os.devnull, os.O_RDONLY)
     for number, source in ((0, nothing), (1, written), (2, written)):
         os.dup2(source, number)
     # the server may have been begun without a screen; lines are read while the job runs

@@ -95,8 +95,7 @@ def begin(job: Job, device: int | None) -> BaseProcess:
 
 def in_making(job: Job) -> set[str]:
     """What a running job shares with others and does not have yet: its films, its reconstruction."""
-    screen = job.folder / "screen.log"
-    said = screen.read_text(errors="replace") if screen.is_file() else ""
+    said = (job.folder / "screen.log").read_text(errors="replace")
     return {what for what, stage in ((job.film, "data"), (job.first, "reconstruction")) if f"{stage} took" not in said}
 
 

@@ -16,12 +16,13 @@ from made_up import CONF, NAMES, PAPER, experiment, made_up, write_metrics
 from omegaconf import OmegaConf
 
 from mosa import whole_files
-from mosa.commands.experiment import arguments, run, shown
+from mosa.commands.experiment import arguments, run, run_counted, shown
 from mosa.config import rehearse
 from mosa.errors import ConfigError, DataError
 from mosa.experiments import processes, running, specimens
 from mosa.experiments.analyses import ANALYSES
 from mosa.experiments.collecting import Cell, best_of, records_of, table
+from mosa.experiments.goes import Clock, Go
 from mosa.experiments.page import read_tables
 from mosa.experiments.printed import printed_table
 from mosa.experiments.specification import (
@@ -270,6 +271,16 @@ def test_what_shares_films_begins_when_these_are_made_and_reconstructs_for_itsel
     running.run_jobs(jobs, [None], 2)
     words = [line.split()[0] for line in (tmp_path / "log.txt").read_text().splitlines()]
     assert words == ["begin", "filmed", "begin", "filmed", "end", "end"]
+
+
+def test_what_is_said_at_the_end_is_of_the_goes_of_this_command_alone(tmp_path, fake, capsys):
+    """A quick variant has the same folder by default; its jobs and its estimate are others."""
+    fake()
+    options = arguments(["made", "--runs", str(tmp_path)])
+    Clock(tmp_path, Go("2026-01-01 00:00:00", "mosa-experiment made --quick", "abc", 1, 1, 7, 0.6)).ended(failed=False)
+    jobs = jobs_of(narrowed(experiment(), {"scene": ["a"], "method": ["ours"]}, (0,)), tmp_path)
+    assert run_counted(options, jobs, [None], 30.0, lambda job: None) == {}
+    assert "1 jobs in one go: 0.00 hours of a device; the first go began with 1 to run and expected 0.50" in capsys.readouterr().out
 
 
 def test_every_gpu_has_its_own_jobs(tmp_path, fake, monkeypatch):

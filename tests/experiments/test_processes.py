@@ -127,7 +127,7 @@ def test_a_stop_of_the_whole_group_of_processes_waits_for_what_jobs_save(tmp_pat
     (tmp_path / "parent.py").write_text(PARENT)
     screen = "3>code" if shown else "3>code >&- 2>&-"
     with subprocess.Popen(["sh", "-c", f"exec {sys.executable} parent.py {screen}"], cwd=tmp_path, start_new_session=True,
-                          env=os.environ | {"MOSA_PRELOADED": "", "PYTHONPATH": str(tmp_path)}) as parent:  # fmt: skip
+                          env=os.environ | {"PYTHONPATH": str(tmp_path)}) as parent:  # fmt: skip
         log = tmp_path / "screen.log"
         began = time.perf_counter()
         while "ready" not in (log.read_text() if log.is_file() else "") and time.perf_counter() - began < 60:
