@@ -37,6 +37,7 @@ LEAST_DRAWS = 4
 """Of those that could be simulated: fewer say nothing about a spread."""
 QUANTILES = 400
 """Of a normal distribution, where its image under a bounded map is asked for."""
+STANDARD = torch.distributions.Normal(torch.zeros((), dtype=torch.float64), torch.ones((), dtype=torch.float64))
 
 
 @torch.no_grad()
@@ -136,16 +137,18 @@ def physical_sd(name: str, raw: Tensor, sd: float) -> float:
     """Standard deviation of a global parameter in its own unit, of its unconstrained number `raw` () and that one's.
 
     By the slope of its map; where its range is bounded on both sides, the root mean square distance from what was found of a normal
-    distribution within the limits of the fit. The slope vanishes at the bounds, and would say that a Poisson number of 0.02 is
-    known to 0.05 where 0.3 explains the motion as well."""
+    distribution that is cut off at the limits of the fit. The slope vanishes at the bounds, and would say that a Poisson number of
+    0.02 is known to 0.05 where 0.3 explains the motion as well."""
     raw = raw.detach().double().cpu().requires_grad_(True)
     with torch.enable_grad():
         value = Material.physical_of(name, raw)
         slope = torch.autograd.grad(value, raw)[0]
     if not isinstance(RANGES.get(name), Form) or math.isinf(RANGES[name].high):
         return sd * float(slope.abs())
-    shares = (torch.arange(QUANTILES, dtype=torch.float64) + 0.5) / QUANTILES
-    drawn = (raw.detach() + sd * torch.special.ndtri(shares)).clamp(*limits_of(name))
+    low, high = limits_of(name)
+    below, within = (STANDARD.cdf((torch.tensor([low, high], dtype=torch.float64) - raw.detach()) / sd)).tolist()
+    shares = below + (within - below) * (torch.arange(QUANTILES, dtype=torch.float64) + 0.5) / QUANTILES
+    drawn = (raw.detach() + sd * STANDARD.icdf(shares)).clamp(low, high)  # of what is held just outside a limit by rounding
     return float((Material.physical_of(name, drawn) - value.detach()).square().mean().sqrt())
 
 

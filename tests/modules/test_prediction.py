@@ -9,10 +9,10 @@ from small_bodies import WORLD, small_body, start
 
 from mosa.errors import ConfigError
 from mosa.modules.gauss_newton import Posterior
-from mosa.modules.learned_numbers import as_rival, each_law, read_numbers
+from mosa.modules.learned_numbers import as_rival, each_law, limits_of, read_numbers
 from mosa.modules.material import NU_MAX
 from mosa.plan import drawn_starts, information, plan
-from mosa.prediction import DRAWN, ELSEWHERE, FORMS, INFLATION, among_forms, determined, total_spread
+from mosa.prediction import DRAWN, ELSEWHERE, FORMS, INFLATION, among_forms, determined, physical_sd, total_spread
 from mosa.twin import Twin
 
 
@@ -98,11 +98,30 @@ def said_of_nu(nu: float, sd: float) -> float:
 def test_a_poisson_number_at_its_limit_is_as_unsure_as_what_lies_inside():
     """In the middle of its range the slope says it; at its limit, where the slope vanishes, all that the data leave open."""
     assert said_of_nu(0.3, 0.01) == pytest.approx(0.01 * 0.3 * (1 - 0.3 / NU_MAX), rel=0.01)
-    # half of what is within a wide distribution about the lower limit is held there, the other half lies up to the upper one
+    # all unconstrained numbers between the limits are alike to a wide distribution
+    low, high = limits_of("nu")
+    even = NU_MAX * torch.linspace(low, high, 10001).double().sigmoid()
     wide = said_of_nu(0.02, 1e4)
-    assert wide == pytest.approx((0.98 * NU_MAX - 0.02) / 2**0.5, rel=0.01)
+    assert wide == pytest.approx(float((even - 0.02).square().mean().sqrt()), rel=0.01)
     slope = 2.6 * 0.02 * (1 - 0.02 / NU_MAX)
     assert slope < 0.05 < 0.1 < said_of_nu(0.02, 2.6) < wide
+
+
+@pytest.mark.parametrize("sd", [0.5, 1.5, 2.0])
+def test_two_deviations_of_a_bounded_number_hold_the_truth_as_often_as_they_say(sd):
+    """Truths anywhere between the limits, measured with a normal error in the unconstrained number, the estimate held within the
+    limits: of those that end at a limit too, where a normal distribution with half its mass at the limit holds 82 to 90 %."""
+    generator, (low, high) = torch.Generator().manual_seed(0), limits_of("nu")
+    ends = NU_MAX * torch.tensor([low, high]).double().sigmoid()
+    truth = ends[0] + (ends[1] - ends[0]) * torch.rand(20000, generator=generator).double()
+    found = (truth / (NU_MAX - truth)).log() + sd * torch.randn(20000, generator=generator).double()
+    raw = found.clamp(low, high)
+    places = torch.linspace(low, high, 81).double()
+    said = torch.tensor([physical_sd("nu", place, sd) for place in places])
+    held = (NU_MAX * raw.sigmoid() - truth).abs() <= 2 * said[((raw - low) / (high - low) * 80).round().long()]
+    at_limit = (raw == low) | (raw == high)
+    assert at_limit.sum() > 300
+    assert 0.92 <= float(held.double().mean()) <= 0.98 and 0.88 <= float(held[at_limit].double().mean()) <= 0.98
 
 
 def test_information_of_known_draws():
