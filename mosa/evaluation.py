@@ -57,9 +57,8 @@ def run_sequences(config: Mapping, body: Body) -> list[Sequence]:
 @torch.no_grad()
 def rollouts(body: Body, sequence: Sequence, world: World) -> tuple[dict[str, Rollout], float | None, float]:
     """Every variant's rollout over all frames of `sequence`, mean |C| of the adapted one (None without an adapter), and the
-    particle substeps per second of the last. A variant that cannot be simulated on a held-out sequence is left out, with a warning.
-
-    Errors: SimulationDiverged, ConfigError (time step) on a training sequence, which the fit could simulate."""
+    particle substeps per second of the last. A variant that cannot be simulated on it is left out, with a warning: on a training
+    sequence too, of which the fit did not see the held-out frames."""
     scene = sequence.scene
     frame_dt = float(scene.times[1] - scene.times[0])
     sizes: list[float] = []
@@ -70,8 +69,6 @@ def rollouts(body: Body, sequence: Sequence, world: World) -> tuple[dict[str, Ro
             result[v] = body.simulate(sequence.start, world, scene.frames, frame_dt, model=body.model(v),
                                       collect=lambda found: sizes.append(float(found.mean_abs_C)))
         except (SimulationDiverged, ConfigError) as error:
-            if sequence.prefix.startswith("train"):
-                raise
             del sizes[counted:]
             warn(f"{sequence.prefix}: {NAMES[v]} cannot be simulated there, its errors count as infinite ({error})", stacklevel=2)
             continue
@@ -150,11 +147,11 @@ def evaluate(
 ) -> tuple[dict[str, float], dict[str, dict[str, Rollout]]]:
     """All figures, flat, named as in docs/figures.md, and the rollouts that could be simulated: result[sequence prefix][variant].
 
-    Errors: those of `rollouts`; SimulationDiverged where none of them could be."""
+    Errors: SimulationDiverged where none of them could be."""
     figures: dict[str, float] = {}
     kept: dict[str, dict[str, Rollout]] = {}
     bar = tqdm(total=len(sequences) * len(VARIANTS), desc="evaluate", unit="rollout", dynamic_ncols=True)
-    rates, measured, missing = [], set[str](), list[str]()
+    rates, measured, missing = [], set[str](), list[tuple[str, str]]()
     for sequence in sequences:
         kept[sequence.prefix] = {}
         simulated, size, rate = rollouts(body, sequence, world)
@@ -169,16 +166,26 @@ def evaluate(
                 figures |= sequence_metrics(body, sequence, simulated[variant], model, settings, target)
                 measured |= {key.rpartition("/")[2] for key in figures if key.startswith(f"{model}{sequence.prefix}/")}
             else:
-                missing.append(f"{model}{sequence.prefix}")
+                missing += [(model, part) for part in parts_of(sequence)]
             bar.update()
     bar.close()
     if not measured:
         raise SimulationDiverged("evaluation: neither the law nor its prior can be simulated on any of these sequences: "
                                  f"{', '.join(s.prefix for s in sequences)}; the warnings above say why")
-    figures |= {f"{part}/{name}": worst(name) for part in missing for name in measured - {"mean_abs_C"}}
+    of_pictures = {name for name in measured if name.endswith(("_crop", "_full"))}
+    figures |= {f"{model}{part}/{name}": worst(name) for model, part in missing
+                for name in (of_pictures if part == "camera" else measured - {"mean_abs_C"})}  # fmt: skip
     figures |= test_means(figures)
     figures["time/particle_substeps_per_s"] = max(rates)  # the first rollouts also load kernels
     return figures, kept
+
+
+def parts_of(sequence: Sequence) -> list[str]:
+    """What its figures are of: the sequence, and of the first training sequence its held-out frames and cameras."""
+    if sequence.prefix != "train":
+        return [sequence.prefix]
+    held = {"frames": sequence.scene.holdout_frames, "camera": sequence.scene.holdout_cameras}
+    return [sequence.prefix, *(part for part, indices in held.items() if indices)]
 
 
 def worst(name: str) -> float:

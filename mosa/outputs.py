@@ -91,9 +91,10 @@ def write_outputs(
         known = body.splats.appearance
         save_ply(folder / "splats.ply", known.splats.to("cpu"), known.harmonics.cpu())
     if cfg.evaluation.video:
-        shown = [s for s in evaluated if s.prefix.startswith("test") and TITLES.keys() & kept[s.prefix].keys()]
-        shown = shown or evaluated[:1]
-        write_comparisons(folder, {s.prefix: compare(body, s, kept[s.prefix]) for s in shown})
+        simulated = [s for s in evaluated if TITLES.keys() & kept[s.prefix].keys()]
+        shown = [s for s in simulated if s.prefix.startswith("test")] or simulated[:1]
+        if shown:
+            write_comparisons(folder, {s.prefix: compare(body, s, kept[s.prefix]) for s in shown})
     law = body.material.law
     parts = (results_table(figures), columns_text(figures, evaluated[0].scene.name), parameter_table(figures, law),
              continued_text(figures, law), determined_text(figures, law), geometry_lines(figures))  # fmt: skip

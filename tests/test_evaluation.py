@@ -1,13 +1,14 @@
-"""The floor is measured as the models are."""
+"""The floor is measured as the models are, and what cannot be simulated has the worst figures."""
 
 from types import SimpleNamespace
 
 import pytest
 import torch
 
-from mosa import metrics
+from mosa import evaluation, metrics
 from mosa.data.builtin import floor
-from mosa.evaluation import Sequence, floor_figures, motion_metrics
+from mosa.errors import SimulationDiverged
+from mosa.evaluation import Sequence, evaluate, floor_figures, motion_metrics
 from mosa.evaluation_settings import EvaluationSettings
 from mosa.types import Truth
 
@@ -29,3 +30,35 @@ def test_the_floor_has_the_frames_and_samples_of_the_models(monkeypatch):
             assert found[f"floor/{prefix}/{name}"] == value
     for name, value in metrics.sampling_floors(rest, 700, 900, samples=300, assignment=50).items():
         assert found[f"floor/sampling/{name}"] == pytest.approx(value)
+
+
+@pytest.mark.parametrize("held_frames, held_cameras", [((3, 4), (1,)), ((), ())])
+def test_on_a_training_drop_without_a_rollout_all_that_it_would_have_said_is_worst(monkeypatch, held_frames, held_cameras):
+    """A law that was learned from the first frames may turn an element inside out in the held-out ones."""
+    scene = SimpleNamespace(truth=None, holdout_frames=held_frames, holdout_cameras=held_cameras)
+    sequences = [Sequence("train", scene, None, 2), Sequence("test/a", scene, None, 2)]
+    body, lost = object(), {"train": {"adapted"}, "test/a": {"prior_eta"}}
+
+    def rollouts(_, sequence, __):
+        return dict.fromkeys({"adapted", "prior", "prior_eta"} - lost[sequence.prefix]), None, 1.0
+
+    def measured(_, sequence, __, model, *___):
+        parts = {sequence.prefix: ("rms_m", "psnr_crop")}
+        if sequence.prefix == "train":
+            parts |= {"frames": ("rms_m", "psnr_crop")} if held_frames else {}
+            parts |= {"camera": ("psnr_crop",), "camera/frame_01": ("psnr_crop",)} if held_cameras else {}
+        return {f"{model}{part}/{name}": 1.0 for part, names in parts.items() for name in names}
+
+    monkeypatch.setattr(evaluation, "rollouts", rollouts)
+    monkeypatch.setattr(evaluation, "sequence_metrics", measured)
+    figures, kept = evaluate(body, sequences, None, EvaluationSettings())
+    worst = {key for key, value in figures.items() if value in (float("inf"), -float("inf"))}
+    expected = {"train/rms_m", "train/psnr_crop", *(f"prior_eta/{part}/{name}" for part in ("test", "test/a")
+                                                     for name in ("rms_m", "psnr_crop"))}  # fmt: skip
+    expected |= {"frames/rms_m", "frames/psnr_crop"} if held_frames else set()
+    expected |= {"camera/psnr_crop"} if held_cameras else set()
+    assert worst == expected and figures["train/psnr_crop"] == -float("inf") < figures["test/psnr_crop"] == 1.0
+    assert "adapted" not in kept["train"] and "adapted" in kept["test/a"]
+    lost |= {prefix: {"adapted", "prior", "prior_eta"} for prefix in lost}
+    with pytest.raises(SimulationDiverged, match="train, test/a"):
+        evaluate(body, sequences, None, EvaluationSettings())
