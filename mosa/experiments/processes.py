@@ -14,6 +14,8 @@ from pathlib import Path
 
 PRELOADED = ["mosa.experiments.preloading"]
 """What the server imports."""
+NAME = "job: "
+"""What the names of the jobs' processes begin with."""
 
 
 def begun(program: str, words: Sequence[str], screen: Path, environment: Mapping[str, str]) -> BaseProcess:
@@ -24,9 +26,14 @@ def begun(program: str, words: Sequence[str], screen: Path, environment: Mapping
     if server:
         context.set_forkserver_preload(PRELOADED)  # which counts for the first process
     screen.write_bytes(b"")  # whoever reads it finds nothing of a run that was there before
-    process = context.Process(target=work, args=(program, list(words), str(screen), dict(environment)))
+    process = context.Process(target=work, args=(program, list(words), str(screen), dict(environment)), name=NAME + str(screen))
     process.start()
     return process
+
+
+def at_work() -> list[BaseProcess]:
+    """The processes of `begun` that have not ended. A stop may fall between the start of one and whoever began it having it."""
+    return [process for process in multiprocessing.active_children() if process.name.startswith(NAME)]
 
 
 def work(program: str, words: list[str], screen: str, environment: dict[str, str]) -> None:

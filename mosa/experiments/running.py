@@ -9,7 +9,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 from mosa.experiments.commits import commit
-from mosa.experiments.processes import begun
+from mosa.experiments.processes import at_work, begun
 from mosa.experiments.specification import COMMIT, FAILED, MINUTES, PRESSED, Job, in_turn
 from mosa.whole_files import write_whole
 
@@ -68,13 +68,14 @@ def run_jobs(
             else:
                 time.sleep(WAIT)
     finally:
-        for process in running:  # Ctrl-C: each writes its checkpoint and ends
+        left = at_work()
+        for process in left:  # Ctrl-C: each writes its checkpoint and ends
             process.terminate()
         try:
-            for process in running:
+            for process in left:
                 process.join()
         except KeyboardInterrupt:  # a second one: at once
-            for process in running:
+            for process in left:
                 process.kill()
             raise
     return failed

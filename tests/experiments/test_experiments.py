@@ -251,6 +251,21 @@ def test_what_shares_a_reconstruction_begins_when_that_is_made(tmp_path, fake):
     assert len(taken) == 1 and taken[0] > 1.5 / 60  # one of them fails
 
 
+def test_a_stop_that_falls_into_the_start_of_a_job_ends_that_job_too(tmp_path, fake, monkeypatch):
+    fake(FAKE.replace("time.sleep(0.3)", "time.sleep(60)"))
+    started = []
+
+    def stopped(*words):
+        started.append(begun(*words))
+        raise KeyboardInterrupt
+
+    begun = processes.begun
+    monkeypatch.setattr(running, "begun", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        running.run_jobs(jobs_of(experiment(), tmp_path), [None], 1)
+    assert [process.exitcode for process in started] == [-15] and processes.at_work() == []
+
+
 def test_what_is_held_out_or_learned_from_changes_no_film(tmp_path):
     scenes = tuple(Option(name, ("scene=a", *more)) for name, more in (
         ("all", ()), ("future", ("scene.holdout_frames=5",)), ("two", ("scene.also_train=[b]",)), ("other", ("scene.material=c",))))
