@@ -58,7 +58,7 @@ def run_sequences(config: Mapping, body: Body) -> list[Sequence]:
 def rollouts(body: Body, sequence: Sequence, world: World) -> tuple[dict[str, Rollout], float | None, float]:
     """Every variant's rollout over all frames of `sequence`, mean |C| of the adapted one (None without an adapter), and the
     particle substeps per second of the last. A variant that cannot be simulated on it is left out, with a warning: on a training
-    sequence too, of which the fit did not see the held-out frames."""
+    sequence too, which the fit has simulated near the observed motion, and without its held-out frames."""
     scene = sequence.scene
     frame_dt = float(scene.times[1] - scene.times[0])
     sizes: list[float] = []

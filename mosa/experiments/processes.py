@@ -12,10 +12,9 @@ from collections.abc import Mapping, Sequence
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-PRELOADED = ["mosa.experiments.preloading"]
-"""What the server imports."""
-NAME = "job: "
-"""What the names of the jobs' processes begin with."""
+PRELOADED = ["mosa.experiments.waiting_signals", "mosa.experiments.preloading"]
+"""What the server imports, in this order."""
+STOPS = (signal.SIGINT, signal.SIGTERM)
 
 
 def begun(program: str, words: Sequence[str], screen: Path, environment: Mapping[str, str]) -> BaseProcess:
@@ -26,20 +25,16 @@ def begun(program: str, words: Sequence[str], screen: Path, environment: Mapping
     if server:
         context.set_forkserver_preload(PRELOADED)  # which counts for the first process
     screen.write_bytes(b"")  # whoever reads it finds nothing of a run that was there before
-    process = context.Process(target=work, args=(program, list(words), str(screen), dict(environment)), name=NAME + str(screen))
+    process = context.Process(target=work, args=(program, list(words), str(screen), dict(environment)))
     process.start()
     return process
 
 
-def at_work() -> list[BaseProcess]:
-    """The processes of `begun` that have not ended. A stop may fall between the start of one and whoever began it having it."""
-    return [process for process in multiprocessing.active_children() if process.name.startswith(NAME)]
-
-
 def work(program: str, words: list[str], screen: str, environment: dict[str, str]) -> None:
     """What a process of `begun` does."""
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # the server ignores both
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)  # what was sent since the fork comes now
     os.environ.clear()
     os.environ.update(environment)
     written, nothing = os.open(screen, os.O_WRONLY), os.open(os.devnull, os.O_RDONLY)

@@ -9,8 +9,9 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 from mosa.experiments.commits import commit
-from mosa.experiments.processes import at_work, begun
+from mosa.experiments.processes import begun
 from mosa.experiments.specification import COMMIT, FAILED, MINUTES, PRESSED, Job, in_turn
+from mosa.jobs import held_back
 from mosa.whole_files import write_whole
 
 PROGRAM = "mosa.commands.train:main"
@@ -64,18 +65,18 @@ def run_jobs(
             if ready is not None and free[device] >= places:
                 waiting.remove(ready)
                 free[device] -= places
-                running[begin(ready, device)] = (ready, device, time.perf_counter())
+                with held_back():  # a stop that falls in here ends this job too
+                    running[begin(ready, device)] = (ready, device, time.perf_counter())
             else:
                 time.sleep(WAIT)
     finally:
-        left = at_work()
-        for process in left:  # Ctrl-C: each writes its checkpoint and ends
+        for process in running:  # Ctrl-C: each writes its checkpoint and ends
             process.terminate()
         try:
-            for process in left:
+            for process in running:
                 process.join()
         except KeyboardInterrupt:  # a second one: at once
-            for process in left:
+            for process in running:
                 process.kill()
             raise
     return failed

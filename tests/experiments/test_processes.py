@@ -27,7 +27,7 @@ AT_ONCE = 3.0
 def program(tmp_path, monkeypatch):
     (tmp_path / "looking_job.py").write_text(LOOK)
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(processes, "PRELOADED", [])
+    monkeypatch.setattr(processes, "PRELOADED", processes.PRELOADED[:1])  # no libraries
     return "looking_job:main"
 
 
@@ -83,6 +83,30 @@ def test_a_job_finds_what_the_server_imported(tmp_path):
     (tmp_path / "parent.py").write_text(code)
     subprocess.run([sys.executable, "parent.py"], cwd=tmp_path, check=True, timeout=120)
     assert "preloaded True" in (tmp_path / "screen.log").read_text()
+
+
+AT_ONCE_STOPPED = """
+import os
+from pathlib import Path
+from mosa.experiments import processes
+
+if __name__ == "__main__":
+    processes.PRELOADED = processes.PRELOADED[:1]
+    for _ in range(5):
+        process = processes.begun("looking_job:main", ["wait"], Path("screen.log"), os.environ)
+        process.terminate()
+        process.join(10)
+        print(process.exitcode)
+        process.kill()
+"""
+
+
+def test_a_stop_that_a_job_is_sent_before_it_answers_any_is_not_lost(tmp_path):
+    """Its server answers none, and a fork begins as its server is."""
+    (tmp_path / "looking_job.py").write_text(LOOK)
+    (tmp_path / "parent.py").write_text(AT_ONCE_STOPPED)
+    found = subprocess.run([sys.executable, "parent.py"], cwd=tmp_path, capture_output=True, text=True, timeout=500)
+    assert found.stdout.split() == ["-15"] * 5, found.stderr[-500:]
 
 
 SAVING = """

@@ -291,7 +291,7 @@ def test_eval_renders_as_the_run_did(run, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("where, variant", [("test", "prior"), ("test", "adapted"), ("train", "adapted")])
 def test_a_law_that_cannot_be_simulated_on_a_drop_has_infinite_errors_there(run, tmp_path, monkeypatch, where, variant):
-    """The fit was lost with it, and all other figures. On the training drop too: frames of it may be held out."""
+    """The fit was lost with it, and all other figures. On the training drop too, which no stage has to simulate freely."""
     simulate, failing = Body.simulate, [False]
 
     def diverges(self, start, world, frames, frame_dt, **more):

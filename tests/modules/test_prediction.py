@@ -107,6 +107,18 @@ def test_a_poisson_number_at_its_limit_is_as_unsure_as_what_lies_inside():
     assert slope < 0.05 < 0.1 < said_of_nu(0.02, 2.6) < wide
 
 
+@pytest.mark.parametrize("name", ["nu", "friction_angle"])
+def test_a_bounded_number_beyond_its_limits_or_known_exactly_has_a_deviation_too(name):
+    """A number that is continued to another grid may lie beyond the limits of the fit; from there they are the nearest."""
+    low, high = limits_of(name)
+    for end, beyond in ((max(low, -8.0), -1e-3), (min(high, 8.0), 1e-3)):
+        at, past = (physical_sd(name, torch.tensor(end + step).double(), 0.03) for step in (0.0, beyond))
+        assert past == pytest.approx(at, rel=0.1) and 0 < past < 0.1
+        exact, wide, widest = (physical_sd(name, torch.tensor(end).double(), sd) for sd in (0.0, 1e4, math.inf))
+        assert exact < 1e-6 and wide == pytest.approx(widest, rel=0.01)
+    assert math.isnan(physical_sd(name, torch.tensor(0.0), math.nan))
+
+
 @pytest.mark.parametrize("sd", [0.5, 1.5, 2.0])
 def test_two_deviations_of_a_bounded_number_hold_the_truth_as_often_as_they_say(sd):
     """Truths anywhere between the limits, measured with a normal error in the unconstrained number, the estimate held within the
