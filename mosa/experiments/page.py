@@ -278,7 +278,8 @@ def ahead_in_each(figure: Figure, claim: Claim, rows: Mapping[str, Mapping[str, 
 
 def covered(off: float, sd: float, scale: float | None) -> bool:
     """Whether twice the posterior's deviation covers an error. scale: of what 1 is written as, where the deviation is that of a
-    modulus, hence of its logarithm: an error of less than 1 may then be one downwards, which is the larger step."""
+    modulus, hence of its logarithm: an error of less than 1 may then be one downwards, which is the larger step (of what is off
+    upwards `parameters` knows more)."""
     if scale is None:
         return 2 * sd >= off
     off, sd = off / scale, sd / scale

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +10,6 @@ from pathlib import Path
 from mosa.analysis.tables import markdown
 from mosa.data.builtin.objects import OBJECTS
 from mosa.experiments.collecting import Record
-from mosa.experiments.page import covered
 from mosa.experiments.run_folders import write_table
 from mosa.experiments.specification import Experiment
 from mosa.modules.material import RELATIVE, unit_of
@@ -41,7 +41,8 @@ def parameters(experiment: Experiment, records: Sequence[Record], stem: Path) ->
                 continue
             mean, sd = statistics.fmean(found), statistics.fmean(sds) / (1.0 if parameter in RELATIVE else abs(truth))
             off = statistics.fmean(abs(value / truth - 1) for value in found)
-            said = verdict(100 * off, 100 * sd, limits.get(parameter), 100.0 if parameter in RELATIVE else None)
+            step = statistics.fmean(abs(math.log(value / truth)) for value in found) if parameter in RELATIVE else off
+            said = verdict(100 * off, 100 * step, 100 * sd, limits.get(parameter))
             spread = f" ± {statistics.stdev(found):.2g}" if len(found) > 1 else ""
             unit = unit_of(material.law, parameter)
             lines.append([option.name, f"{parameter} [{unit}]" if unit else parameter, f"{truth:g}", f"{mean:.3g}{spread}",
@@ -59,10 +60,10 @@ def parameters(experiment: Experiment, records: Sequence[Record], stem: Path) ->
             "that. The deviation of a modulus is one of its logarithm.\n\n" + markdown(header, lines)), []
 
 
-def verdict(off: float, sd: float, most: float | None, scale: float | None) -> str:
-    """Of one parameter, all in per cent; scale: see `covered`."""
+def verdict(off: float, step: float, sd: float, most: float | None) -> str:
+    """Of one parameter, all in per cent; step: how far it is off in what sd is the deviation of, a modulus' logarithm for one."""
     if most is None:
         return ""
     if off <= most:
         return "met" if 2 * sd <= most else "met, by chance"
-    return "not determined" if covered(off, sd, scale) else "missed"
+    return "not determined" if 2 * sd >= step else "missed"

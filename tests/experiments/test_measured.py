@@ -85,11 +85,12 @@ def test_a_body_is_pressed_over_half_a_turn_and_along_its_fibres_where_they_lie_
 
 
 def test_parameters_stand_beside_their_truth_with_what_the_posterior_says(tmp_path):
-    found = narrowed(load_experiment(PAPER, "table_identification"), {"scene": ["cat", "droplet", "trophy"]}, (0, 1))
+    found = narrowed(load_experiment(PAPER, "table_identification"), {"scene": ["cat", "droplet", "letter", "trophy"]}, (0, 1))
     jobs = jobs_of(found, tmp_path / "runs")
     figures = {
         "cat": {"E": (0.5e6, 0.6), "nu": (0.29, 0.01), "yield_stress": (3900.0, 0.02)},
         "droplet": {"mu": (230.0, 0.01), "kappa": (1.02e5, 2.0)},
+        "letter": {"mu": (173.0, 0.4), "kappa": (0.27e5, 0.4)},
     }
     for job in jobs:
         scene = job.places[0]["scene"].name
@@ -107,6 +108,9 @@ def test_parameters_stand_beside_their_truth_with_what_the_posterior_says(tmp_pa
     assert rows["cat", "E [Pa]"] == ["1e+06", "5e+05 ± 3.5e+02", "-50.0", "60.0", "not determined"]
     assert rows["cat", "nu"][2:] == ["-3.3", "3.3", "met"] and rows["cat", "yield_stress [Pa]"][3:] == ["2.0", "met"]
     assert rows["droplet", "mu [Pa s]"][2:] == ["+15.1", "1.0", "missed"] and rows["droplet", "kappa [Pa]"][4] == "met, by chance"
+    # as many per cent off, but of the logarithm, whose deviation it is, twice as much
+    assert rows["letter", "mu [Pa s]"][2:] == ["+73.1", "40.0", "not determined"]
+    assert rows["letter", "kappa [Pa]"][2:] == ["-73.0", "40.0", "missed"]
     assert not any(scene == "trophy" for scene, _ in rows) and pictures == []
     lines = list(csv.DictReader(open(tmp_path / "table_parameters.csv")))
     assert float(lines[0]["found"]) == pytest.approx(0.50025e6) and lines[0]["verdict"] == "not determined"
@@ -114,5 +118,5 @@ def test_parameters_stand_beside_their_truth_with_what_the_posterior_says(tmp_pa
 
 def test_a_parameter_is_judged_by_what_is_asked_and_by_its_posterior():
     for off, sd, said in ((4.0, 2.0, "met"), (4.0, 3.0, "met, by chance"), (9.0, 5.0, "not determined"), (11.0, 5.0, "missed")):
-        assert verdict(off, sd, 5.0, None) == said
-    assert verdict(3.0, 1.0, None, None) == ""
+        assert verdict(off, off, sd, 5.0) == said
+    assert verdict(20.0, 9.0, 5.0, 5.0) == "not determined" and verdict(3.0, 3.0, 1.0, None) == ""
