@@ -172,7 +172,7 @@ def evaluate(
     if not measured:
         raise SimulationDiverged("evaluation: neither the law nor its prior can be simulated on any of these sequences: "
                                  f"{', '.join(s.prefix for s in sequences)}; the warnings above say why")
-    of_pictures = {name for name in measured if name.endswith(("_crop", "_full"))}
+    of_pictures = {name for name in measured if name.endswith(("_crop", "_full"))}  # all that held-out cameras tell
     figures |= {f"{model}{part}/{name}": worst(name) for model, part in missing
                 for name in (of_pictures if part == "camera" else measured - {"mean_abs_C"})}  # fmt: skip
     figures |= test_means(figures)
@@ -199,7 +199,7 @@ def sequence_metrics(
     body, sequence: Sequence, rollout: Rollout, model: str, settings: EvaluationSettings, target: Tensor | None
 ) -> dict[str, float]:
     """The figures of one rollout: training views and frames, held-out frames, held-out cameras."""
-    scene, x = sequence.scene, rollout.x.cpu()
+    scene, x, parts = sequence.scene, rollout.x.cpu(), parts_of(sequence)
     training = sequence.prefix.startswith("train")
     frames = scene.training_frames if training else list(range(scene.frames))
     cameras = scene.training_cameras if training else list(range(len(scene.cameras)))
@@ -209,12 +209,12 @@ def sequence_metrics(
         **image_metrics(images, scene, cameras, frames),
     }
     result = {f"{model}{sequence.prefix}/{k}": v for k, v in figures.items()}
-    if sequence.prefix == "train" and scene.holdout_frames:
+    if "frames" in parts:
         held = list(scene.holdout_frames)
         figures = {**motion_metrics(x, body, sequence, held, settings, target),
                    **image_metrics(images, scene, cameras, held)}
         result |= {f"{model}frames/{k}": v for k, v in figures.items()}
-    if sequence.prefix == "train" and scene.holdout_cameras:
+    if "camera" in parts:
         held = list(scene.holdout_cameras)
         images = render(body, rollout, scene, held)
         result |= {f"{model}camera/{k}": v for k, v in image_metrics(images, scene, held, frames).items()}

@@ -37,7 +37,6 @@ LEAST_DRAWS = 4
 """Of those that could be simulated: fewer say nothing about a spread."""
 QUANTILES = 400
 """Of a normal distribution, where its image under a bounded map is asked for."""
-STANDARD = torch.distributions.Normal(*torch.tensor([0.0, 1.0], dtype=torch.float64), validate_args=False)
 
 
 @torch.no_grad()
@@ -147,9 +146,9 @@ def physical_sd(name: str, raw: Tensor, sd: float) -> float:
         return sd * float(slope.abs())
     low, high = limits_of(name)
     middle, sd = raw.detach().clamp(low, high), min(max(sd, 1e-9), 1e9)  # one that was extrapolated may lie beyond a limit
-    below, within = STANDARD.cdf((torch.tensor([low, high], dtype=torch.float64) - middle) / sd).tolist()
+    below, within = torch.special.ndtr((torch.tensor([low, high], dtype=torch.float64) - middle) / sd).tolist()
     shares = below + (within - below) * (torch.arange(QUANTILES, dtype=torch.float64) + 0.5) / QUANTILES
-    drawn = (middle + sd * STANDARD.icdf(shares)).clamp(low, high)
+    drawn = (middle + sd * torch.special.ndtri(shares)).clamp(low, high)
     return float((Material.physical_of(name, drawn) - value.detach()).square().mean().sqrt())
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 PRELOADED = ["mosa.experiments.waiting_signals", "mosa.experiments.preloading"]
 """What the server imports, in this order."""
 STOPS = (signal.SIGINT, signal.SIGTERM)
+"""Signals that the server never answers, and a job from the beginning of `work` on."""
 
 
 def begun(program: str, words: Sequence[str], screen: Path, environment: Mapping[str, str]) -> BaseProcess:
