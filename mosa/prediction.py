@@ -61,6 +61,8 @@ def predicted_spread(
         except MosaError:  # `evaluate` has said so
             continue
     sequences = [s for s in sequences if s.prefix in base]
+    if not sequences:  # of no draw would anything be simulated
+        return {"posterior/draws": 0.0, "posterior/rivals": 0.0, "posterior/model_error_m": posterior.model_error}, {}
 
     def positions() -> dict[str, Tensor]:
         return {s.prefix: _positions(body, s, world) for s in sequences}

@@ -7,7 +7,9 @@ import pytest
 import torch
 from small_bodies import WORLD, small_body, start
 
-from mosa.errors import ConfigError
+from mosa import prediction
+from mosa.errors import ConfigError, SimulationDiverged
+from mosa.evaluation import Sequence
 from mosa.modules.gauss_newton import Posterior
 from mosa.modules.learned_numbers import as_rival, each_law, limits_of, read_numbers
 from mosa.modules.material import NU_MAX
@@ -86,6 +88,19 @@ def test_a_sure_law_is_off_by_the_models_error_alone_and_an_unsure_one_by_more()
     assert float(wider[-1].mean()) > 0.00405 * ELSEWHERE and torch.equal(read_numbers(unsure.body), before)
     with pytest.raises(ConfigError, match="no posterior"):
         Twin(sure.body, WORLD, 0.01, {}, start(height=0.05, speed=-1.0)).predict(frames=3)
+
+
+def test_a_law_that_can_be_simulated_nowhere_has_no_draws_that_can(monkeypatch):
+    """All of them were counted as simulated, on none of the drops."""
+
+    def diverges(*_):
+        raise SimulationDiverged("gone")
+
+    monkeypatch.setattr(prediction, "_positions", diverges)
+    body = small_body(numbers=0.1 * torch.ones(19))
+    sequences = [Sequence("train", None, start(height=0.05, speed=-1.0), 2)]
+    figures, spreads = prediction.predicted_spread(body, posterior_of(body, 0.05), sequences, WORLD)
+    assert figures["posterior/draws"] == figures["posterior/rivals"] == 0 and spreads == {}
 
 
 def said_of_nu(nu: float, sd: float) -> float:
