@@ -156,17 +156,17 @@ def learn_black_box(module: LitMosa, body: Body) -> None:
     module.stage_index = len(module.stages) - 1
     module.begin(stage)
     module.weights = {name: value for name, value in module.weights.items() if name not in ("image", "mask", "flow")}
-    optimizer = torch.optim.Adam(module.groups(stage), betas=(0.9, 0.95))
+    made = module.adam(stage)
+    optimizer, schedule = made["optimizer"], made["lr_scheduler"]["scheduler"]
     for iteration in range(stage.iterations):
-        for group in optimizer.param_groups:
-            group["lr"] = group["rate"] * stage.decay(iteration)
         optimizer.zero_grad()
         take = module.takes[iteration % len(module.takes)]
         for gain in module.criterion.gains:
-            terms, _ = module.terms(stage, [0], module.active_frames(stage, iteration, take), take, gain=gain)
+            terms, _ = module.terms(stage, take.observations, module.active_frames(stage, iteration, take), take, gain=gain)
             (sum(module.weights[name] * value for name, value in terms.items()) / len(module.criterion.gains)).backward()
-        module.gradient_norms(optimizer, stage, iteration)
+        module.clip_networks(optimizer)
         optimizer.step()
+        schedule.step()
         body.contact.project()
 
 

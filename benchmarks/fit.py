@@ -73,7 +73,6 @@ class Steps:
 
     def __init__(self, module, views: list[int], device: str) -> None:
         self.module, self.views, self.device = module, views, device
-        self.optimizers = module.configure_optimizers()
         self.rollout = 0.0
         simulate = module.body.simulate
 
@@ -94,20 +93,24 @@ class Steps:
         return time.perf_counter()
 
     def begin(self, index: int) -> None:
-        self.module.stage_index = index
-        self.module.begin(self.module.stages[index])
+        module = self.module
+        module.stage_index, stage = index, module.stages[index]
+        module.begin(stage)
+        self.optimizer = module.adam(stage)["optimizer"] if hasattr(module, "adam") else module.configure_optimizers()[index]
 
     def step(self, index: int) -> dict[str, float]:
-        module, optimizer = self.module, self.optimizers[index]
+        module, optimizer = self.module, self.optimizer
         stage, take = module.stages[index], module.takes[0]
+        here = hasattr(module, "adam")  # else a version of before the data module served the views
         self.rollout, times = 0.0, [self.clock()]
         optimizer.zero_grad()
-        terms, _ = module.terms(stage, self.views, len(take.cues.positions), take)
+        views = take.observations.select(self.views) if here else self.views
+        terms, _ = module.terms(stage, views, len(take.cues.positions), take)
         loss = sum(module.weights.get(name, 0.0) * value for name, value in terms.items())
         times.append(self.clock())
         loss.backward()
         times.append(self.clock())
-        module.gradient_norms(optimizer, stage, 0)
+        _ = module.clip_networks(optimizer) if here else module.gradient_norms(optimizer, stage, 0)
         optimizer.step()
         module.body.contact.project()
         times.append(self.clock())

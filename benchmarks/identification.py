@@ -81,7 +81,7 @@ def make(overrides: list[str], folder: Path, device: str) -> Path:
             sequences[each.prefix]["response"] = take.response and {
                 part.name: getattr(take.response, part.name).cpu() for part in dataclasses.fields(Response)}
     problem = {
-        "config": made.config, "rest": body.rest.cpu(), "volume": body.volume.cpu(), "sequences": sequences,
+        "config": made.data.measured, "rest": body.rest.cpu(), "volume": body.volume.cpu(), "sequences": sequences,
         "fibre": getattr(hidden, "fibre", None) if getattr(hidden, "ratio", 1) > 1 else None,
         "factor": hidden.factor(body.rest.cpu().float()),
     }  # fmt: skip

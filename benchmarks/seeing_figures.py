@@ -62,7 +62,7 @@ def see(cfg: DictConfig) -> Seen:
     splats, cues, view = result.splats, result.cues, scene.cameras.select([camera])
     with torch.no_grad():
         views = observe(cues.positions, cues.covariances, splats.opacities, splats.colors, view, scene.background, flow=True)
-    return Seen(run, scene, run.reconstruction_settings, result, views, balls(cues.positions, result.volume, view), camera)
+    return Seen(run, scene, run.data.reconstruction_settings, result, views, balls(cues.positions, result.volume, view), camera)
 
 
 def balls(positions: Tensor, volume: Tensor, view: Cameras, finer: int = 8) -> Tensor:

@@ -1,3 +1,37 @@
-"""Learn a simulator of a deforming object from multi-view video."""
+"""Learn a simulator of a deforming object from multi-view video.
+
+Public names, each imported when it is first asked for:
+
+    compose           a run's configuration, as the command line composes it
+    SceneDataModule   the data of a scene under Lightning: films, reconstruction, batches of frames with their motion cues
+    LitMosa           the LightningModule: a body in its world, fitted in stages
+    Twin              a learned body, to simulate from new starts
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
 
 __version__ = "0.1.0"
+
+_PLACES = {
+    "compose": "mosa.composition",
+    "SceneDataModule": "mosa.data.datamodule",
+    "LitMosa": "mosa.modules.lit_mosa",
+    "Twin": "mosa.twin",
+}
+__all__ = ["LitMosa", "SceneDataModule", "Twin", "__version__", "compose"]
+
+if TYPE_CHECKING:
+    from mosa.composition import compose
+    from mosa.data.datamodule import SceneDataModule
+    from mosa.modules.lit_mosa import LitMosa
+    from mosa.twin import Twin
+
+
+def __getattr__(name: str):
+    """`import mosa` takes no second: what needs torch and Warp is imported by its name."""
+    if name in _PLACES:
+        return getattr(importlib.import_module(_PLACES[name]), name)
+    raise AttributeError(f"module 'mosa' has no attribute {name!r}")

@@ -11,10 +11,11 @@ from pathlib import Path
 
 import lightning as L
 import torch
+from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
-from mosa.loggers import add_picture
+from mosa.loggers import PICTURED, add_picture
 from mosa.progress import tqdm
 
 log = logging.getLogger(__name__)
@@ -39,20 +40,28 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             partial.unlink(missing_ok=True)
 
 
-class KeepLast(L.Callback):
-    """Saves `last.ckpt` after every `every` steps and at the end, so that an interruption costs no more than that."""
+class KeepLast(Checkpoint):
+    """Saves `last.ckpt` after every step, so that an interruption costs no more than that."""
 
-    def __init__(self, folder: str | Path, every: int = 1) -> None:
-        self.path, self.every = Path(folder) / "last.ckpt", every
+    def __init__(self, folder: str | Path | None = None) -> None:
+        """folder: of the file; None: checkpoints/ in the trainer's default_root_dir."""
+        self.folder = folder
+
+    def setup(self, trainer, module, stage: str) -> None:
+        root = Path(trainer.default_root_dir)
+        self.path = (root / "checkpoints" if self.folder is None else Path(self.folder)) / "last.ckpt"
 
     def on_fit_start(self, trainer, module) -> None:
         """The figures of an earlier run in this folder go: they would say that this one is complete."""
-        if trainer.is_global_zero:
-            (self.path.parent.parent / "metrics.json").unlink(missing_ok=True)
+        (Path(trainer.default_root_dir) / "metrics.json").unlink(missing_ok=True)
+
+    def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
+        """Within an epoch; at its end, and at that of a stage, the next hook saves what the next epoch begins with."""
+        if not (trainer.fit_loop.epoch_loop.batch_progress.is_last_batch or module.stage_over):
+            trainer.save_checkpoint(self.path)
 
     def on_train_epoch_end(self, trainer, module) -> None:
-        if module.steps_done % self.every == 0 or module.stage is None:
-            trainer.save_checkpoint(self.path)
+        trainer.save_checkpoint(self.path)
 
 
 class FitProgress(L.Callback):
@@ -98,6 +107,8 @@ class StageNotes(L.Callback):
         self.stage, self.began, self.steps = None, 0.0, 0
 
     def on_train_batch_start(self, trainer, module, batch, batch_idx) -> None:
+        if self.stage is not None and module.stage is not self.stage:  # ended by a callback
+            self._note(module)
         if module.stage is not None and self.stage is None:
             self.stage, self.began, self.steps = module.stage, time.perf_counter(), 0
             done = f", going on after {len(module.losses)}" if module.losses else ""
@@ -105,28 +116,34 @@ class StageNotes(L.Callback):
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
         self.steps += 1
-        if self.stage is not None and module.stage is not self.stage:
-            figures = ", ".join(f"{name} {value}" for name, value in figures_of(module.last).items())
-            log.info("stage %s: ended after %d steps, %.1f s: %s", self.stage.name, self.steps, time.perf_counter() - self.began,
-                     figures)  # fmt: skip
-            self.stage = None
+        if self.stage is not None and module.stage_over:
+            self._note(module)
+
+    def on_train_end(self, trainer, module) -> None:
+        if self.stage is not None:
+            self._note(module)
+
+    def _note(self, module) -> None:
+        figures = ", ".join(f"{name} {value}" for name, value in figures_of(module.last).items())
+        log.info("stage %s: ended after %d steps, %.1f s: %s", self.stage.name, self.steps, time.perf_counter() - self.began,
+                 figures)  # fmt: skip
+        self.stage = None
 
 
 class Pace(L.Callback):
-    """Logs what a step took (`time/step_s`) and the learning rate of each group of parameters in it (`lr/<group>`); a step in which
-    no optimiser of torch stepped has none."""
+    """Logs what a step took (`time/step_s`) and the learning rate of each group of parameters in it (`lr/<group>`). Gauss-Newton
+    has no rates."""
 
     def __init__(self) -> None:
-        self.began, self.index, self.stepped = 0.0, 0, 0
+        self.began, self.rates = 0.0, {}
 
     def on_train_batch_start(self, trainer, module, batch, batch_idx) -> None:
-        self.began, self.index = time.perf_counter(), module.stage_index  # the step may be its stage's last
-        self.stepped = trainer.global_step  # counts steps of optimisers, not of the fit
+        self.began = time.perf_counter()
+        self.rates = {} if module.stage is None or module.stage.newton else {
+            f"lr/{group['name']}": group["lr"] for optimizer in trainer.optimizers for group in optimizer.param_groups}
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
-        values = {"time/step_s": time.perf_counter() - self.began}
-        for optimizer in trainer.optimizers[self.index : self.index + 1] if trainer.global_step > self.stepped else ():
-            values |= {f"lr/{group.get('name', k)}": group["lr"] for k, group in enumerate(optimizer.param_groups)}
+        values = {"time/step_s": time.perf_counter() - self.began} | self.rates
         module.log_dict({k: torch.tensor(v, dtype=torch.float32) for k, v in values.items()}, on_step=True, on_epoch=False)
 
 
@@ -137,8 +154,9 @@ class ImageStrips(L.Callback):
         self.every = every
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
-        if trainer.is_global_zero and self.every > 0 and module.steps_done % self.every == 0:
-            add_picture(module.loggers, "real_above_rendered_below", enlarged(module.strip()), module.steps_done)
+        shown = [each for each in module.loggers if isinstance(each, PICTURED)]
+        if shown and self.every > 0 and module.steps_done % self.every == 0:
+            add_picture(shown, "real_above_rendered_below", enlarged(module.strip()), module.steps_done)
 
 
 LEGIBLE = 320

@@ -25,7 +25,7 @@ from mosa.modules.retreat import MOST_HALVINGS
 from mosa.physics.constitutive.laws import law_named
 from mosa.rendering.lighting import LIGHT
 from mosa.rendering.spherical_harmonics import DEGREES
-from mosa.schema import POSITIVE, THREE, WEIGHT, Kind, check, is_number, number, one_of, or_null, whole
+from mosa.schema import FLAG, POSITIVE, THREE, WEIGHT, Kind, check, is_number, number, one_of, or_null, whole
 from mosa.types import GROUND_MODES
 
 TENSORS = {"rest": (3,), "volume": (), "colors": (3,), "opacities": (), "covariances": (3, 3)}
@@ -43,14 +43,14 @@ NAMED = {"collections OrderedDict", "torch Size", "torch._utils _rebuild_tensor_
          *(f"torch {kind}Storage" for kind in ("Float", "Double", "Half", "BFloat16", "Long", "Int", "Short", "Char", "Byte",
                                                "Bool"))}  # fmt: skip
 """Functions and classes that a checkpoint of this program refers to; torch knows some more, of which a few make large objects."""
-BESIDE = ("ckpt_path", "resume", "optimized_metric", "logger", "trainer", "evaluation", "rendering.backend", "scene.cache",
-          "scene.root", "identification.threads", "extensions")  # fmt: skip
+BESIDE = ("ckpt_path", "resume", "optimized_metric", "logger", "callbacks", "trainer", "evaluation", "rendering.backend",
+          "scene.cache", "scene.root", "identification.threads", "extensions")  # fmt: skip
 """Keys of a run that do not say what is learned, or say where things lie on this machine. A capture may have been moved: of
 `scene.path` the last part counts."""
 BY_CONTACT = or_null(Kind("numbers by contact", lambda v: isinstance(v, Mapping) and all(
     isinstance(x, float) and not math.isnan(x) for x in v.values())))  # fmt: skip
 GOING_ON: dict[str, Kind] = {
-    "stage": whole(0), "steps_done": whole(0), "particles": whole(1), "misfit": POSITIVE,
+    "stage": whole(0), "steps_done": whole(0), "particles": whole(1), "misfit": POSITIVE, "stage_over": FLAG,
     "losses": Kind("numbers", lambda v: isinstance(v, list) and all(is_number(x) for x in v)),
     "compared": or_null(Kind("distances by law", lambda v: isinstance(v, Mapping) and all(map(is_number, v.values())))),
     "grounds": BY_CONTACT, "ground_gains": BY_CONTACT,

@@ -261,12 +261,12 @@ def newton_rollouts(module: LitMosa, stage: Stage) -> float:
     return len(planned.pairs) * (stage.iterations * each + contacts + searched)
 
 
-def seconds_of_fit(module: LitMosa, speeds: Speeds, frames: int, processes: int = 1) -> float:
+def seconds_of_fit(module: LitMosa, speeds: Speeds, frames: int) -> float:
     """Of the stages of `module`, at most: rollouts of Gauss-Newton, steps of Adam with their pictures."""
     body = module.body
     rollout, views = (frames - 1) * speeds.frame, module.config["cfg"]["fit"]["views"]
     networks = body.adapter is not None and not body.adapter.steady
-    step = (BACKWARD * rollout + views * frames * speeds.picture) * -(-len(module.takes) // processes)
+    step = (BACKWARD * rollout + views * frames * speeds.picture) * len(module.takes)
     again = module.config["cfg"]["reconstruction"].get("informed") or {}
     looks = max(1, sum(stage.looks_again for stage in module.stages))
     pictures = len(module.takes) * (frames - 1) * speeds.picture
@@ -282,7 +282,7 @@ def seconds_of_fit(module: LitMosa, speeds: Speeds, frames: int, processes: int 
 
 
 def seconds_of_parts(cfg: Mapping[str, Any], size: Size, window: int, module: LitMosa, speeds: Speeds,
-                     stored: bool, processes: int = 1) -> dict[str, float]:  # fmt: skip
+                     stored: bool) -> dict[str, float]:  # fmt: skip
     """Seconds of reconstruction, starts, fit and evaluation. window: pixels of the object's; stored: whether the reconstruction
     lies in the cache."""
     settings, slow, picture = cfg["reconstruction"], speeds.relative, speeds.picture
@@ -302,12 +302,12 @@ def seconds_of_parts(cfg: Mapping[str, Any], size: Size, window: int, module: Li
     stiff = STIFFNESS_COST if module.body.adapter is not None else 1.0
     evaluation = (3 + cfg["evaluation"]["floor"] + draws) * size.sequences * rollout * stiff
     evaluation += slow * (2 + 4 * size.sequences * distances / min(cores(), 4) + shown * 1e-7 * size.pixels) + 0.4 * picture * shown
-    fit = seconds_of_fit(module, speeds, size.frames, processes)
+    fit = seconds_of_fit(module, speeds, size.frames)
     return {"reconstruction": reconstruction, "starts": slow * poses, "fit": fit, "evaluation": evaluation}
 
 
 def estimate(cfg: Mapping[str, Any], scene: Scene, others: int, taught: int, device: str, *, stored: bool = False,
-             processes: int = 1, most: int = MEASURED) -> Costs:  # fmt: skip
+             most: int = MEASURED) -> Costs:  # fmt: skip
     """Of what follows the data. most: particles where their number is left open. Changes no random state.
 
     Errors: ConfigError where this machine's memory does not hold the run."""
@@ -327,7 +327,7 @@ def estimate(cfg: Mapping[str, Any], scene: Scene, others: int, taught: int, dev
         reference = speed_of_pictures(3000, 76, device)
         picture = speed_of_pictures(cfg["reconstruction"]["points"], round(window**0.5), device)
     speeds = Speeds(frame, picture, reference / REFERENCE_PICTURE)
-    parts = seconds_of_parts(cfg, size, window, module, speeds, stored, processes)
+    parts = seconds_of_parts(cfg, size, window, module, speeds, stored)
     if body.adapter is not None and not body.adapter.steady:
         evaluations = (size.frames - 1) * body.settings.max_substeps / body.settings.stride
         memory += min(evaluations, 100) * size.particles * ADAPTER_BYTES

@@ -52,7 +52,13 @@ def folder_name(overrides: str) -> str:
     return name.encode()[:LONGEST].decode(errors="ignore") + "_" + hashlib.sha256(overrides.encode()).hexdigest()[:8]
 
 
+def current_folder() -> str:
+    """Of the job that Hydra runs, for ${run_folder:}; outputs where there is none, as in a script or a notebook."""
+    return HydraConfig.get().runtime.output_dir if HydraConfig.initialized() else "outputs"
+
+
 OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
+OmegaConf.register_new_resolver("run_folder", current_folder, replace=True)
 
 
 def check_arguments(arguments: Sequence[str], conf: Path) -> None:
@@ -302,17 +308,16 @@ def attempted(job: Callable[[DictConfig], float | None], cfg: DictConfig) -> flo
     if not begun and HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:  # a launcher's worker
         threading.Thread(target=leave_after, args=(os.getppid(),), daemon=True).start()
     begun.append(True)
-    first = os.environ.get("LOCAL_RANK", "0") == "0"  # of the processes of a fit on several devices: it speaks for all
-    if first and threading.current_thread() is threading.main_thread():
+    if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, terminated)
     folder = OmegaConf.select(HydraConfig.get(), "runtime.output_dir") if HydraConfig.initialized() else None
     at_work.set()
     try:
-        with held(folder, wait=(cfg or {}).get("resume") == "auto") if first and folder is not None else nullcontext():
+        with held(folder, wait=(cfg or {}).get("resume") == "auto") if folder is not None else nullcontext():
             return job(cfg)
     except KeyboardInterrupt:
         resume = "stopped; resume with ckpt_path=<run folder>/checkpoints/last.ckpt, where the fit had begun"
-        leave(resume if first else None, 143 if signal.SIGTERM in signals else 130)
+        leave(resume, 143 if signal.SIGTERM in signals else 130)
     except MosaError as error:
         message = f"{type(error).__name__}: {error}"
     except Exception as error:

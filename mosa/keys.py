@@ -45,7 +45,7 @@ from mosa.schema import (
 )
 from mosa.types import GROUND_MODES
 
-SECTIONS = ("scene", "prior", "adapter", "reconstruction", "simulation", "fit", "rendering", "trainer", "logger", "evaluation",
+SECTIONS = ("scene", "prior", "adapter", "reconstruction", "simulation", "fit", "rendering", "trainer", "callbacks", "evaluation",
             "heterogeneity", "losses", "world", "criterion", "identification",
             "fit.prior", "fit.prior_eta", "fit.joint", "reconstruction.static",
             "reconstruction.appearance", "reconstruction.dynamic", "reconstruction.carried",
@@ -54,7 +54,7 @@ SECTIONS = ("scene", "prior", "adapter", "reconstruction", "simulation", "fit", 
 FIGURE = Kind("a figure's name like test/rms_m (docs/figures.md)",
               lambda v: isinstance(v, str) and v.split("/")[0] in FIGURES and "/" in v)
 FIGURES = ("train", "test", "camera", "prior", "prior_eta", "id", "id_prior", "floor", "time", "posterior", "geometry", "frames",
-           "extrapolated")
+           "extrapolated", "val")
 """What the names of figures begin with."""
 
 TRAINING: dict[str, Kind] = {
@@ -94,17 +94,11 @@ TRAINING: dict[str, Kind] = {
     "rendering.margin": whole(0, 256),
     "world.walls": or_null(SECTION),
     "world.colliders": or_null(ENTRIES),
-    "logger.tensorboard": or_null(SECTION),
-    "logger.csv": or_null(SECTION),
-    "logger.wandb": or_null(SECTION),
-    "logger.wandb.offline": FLAG,
-    "logger.wandb.tags": or_null(NAMES),
     "rendering.backend": TEXT,
     "rendering.appearance": one_of("splats", "particles"),
     "ckpt_path": or_null(TEXT),
     "optimized_metric": FIGURE,
     "scene.cache": or_null(FOLDER),  # an empty one would be the folder that this was started in
-    "logger.images_every": whole(0),
 }
 BODY = {key: kind for key, kind in TRAINING.items()
         if key.split(".")[0] in ("seed", "simulation", "prior", "heterogeneity", "adapter", "world")}  # fmt: skip

@@ -13,7 +13,7 @@ import lightning as L
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from mosa import __version__, exact_sums, parallel
+from mosa import __version__, exact_sums
 from mosa.assembly import assemble, scenes
 from mosa.config import build_evaluation, build_world, plain, world_config
 from mosa.costs import Costs, before_data, estimate
@@ -21,7 +21,7 @@ from mosa.errors import ConfigError, DataError
 from mosa.evaluation import sequences
 from mosa.extensions import load_extensions
 from mosa.extrapolation import check_can_extrapolate, extrapolated
-from mosa.fitting import fit, fit_estimate
+from mosa.fitting import build_trainer, fit, fit_estimate
 from mosa.guards import (
     check_begin,
     check_configuration,
@@ -33,7 +33,7 @@ from mosa.guards import (
 )  # fmt: skip
 from mosa.likeness import warn_of_others
 from mosa.limits import named_device
-from mosa.loggers import chosen, log_outcome
+from mosa.loggers import log_outcome
 from mosa.modules.body import Body, Start
 from mosa.outputs import figures_of, optimized, start_figures, write_outputs
 from mosa.physics.contact.colliders import colliders_from_config
@@ -45,13 +45,10 @@ from mosa.rollout_file import save_observed
 from mosa.run import (
     begins_from,
     cost,
-    device_names,
-    device_of,
     finished,
     most_particles,
     quiet,
     run_folder,
-    shared_starts,
 )  # fmt: skip
 from mosa.twin import Twin
 from mosa.types import AUTO
@@ -80,7 +77,6 @@ def train(cfg: DictConfig) -> float | None:
     quiet()
     load_extensions(plain(cfg).get("extensions"))
     check_configuration(plain(cfg))
-    chosen(plain(cfg.logger))
     L.seed_everything(cfg.seed, verbose=False)
     exact_sums.use(cfg.deterministic)
     clock, folder = StageTimes(), run_folder()
@@ -90,54 +86,49 @@ def train(cfg: DictConfig) -> float | None:
         return optimized(done, cfg.optimized_metric)
     cfg.ckpt_path = begins_from(cfg, folder)
     check_begin(cfg)
-    device = device_of(cfg)
+    trainer = build_trainer(cfg, folder)
+    device = str(trainer.strategy.root_device)
     run = assemble(cfg, device)
+    data = run.data
     log.info(before_data(plain(cfg), most_particles(device)))
     with clock.measure("data"):
-        scene, others = run.scenes
-    sequences_taught = 1 + len(run.taught)
-    parallel.check_share(len(device_names(cfg)), sequences_taught, min(cfg.fit.views, len(scene.training_cameras)))
+        scene, others = data.scenes
+    sequences_taught = 1 + len(data.taught)
     check_seen(cfg, scene)
-    clock.costs = estimate(plain(cfg), scene, len(others), sequences_taught, device, stored=run.reconstructed(),
-                           processes=len(device_names(cfg)), most=most_particles(device))
-    if parallel.launched_rank() == 0:
-        log.info("this run takes %s; %.1f GB", clock.costs.said(), clock.costs.memory / 1e9)
+    clock.costs = estimate(plain(cfg), scene, len(others), sequences_taught, device, stored=data.reconstructed(),
+                           most=most_particles(device))
+    log.info("this run takes %s; %.1f GB", clock.costs.said(), clock.costs.memory / 1e9)
     if scene.synthetic:
         log.info("scene %s: synthetic, made by this program; not a capture", scene.name)
     with clock.measure("reconstruction"):
-        reconstruction, dx = run.reconstruction, run.dx
-    volume = reconstruction.volume
-    log.info("body: %d particles, %.4g cm^3, grid spacing %.4g m", len(volume), 1e6 * float(volume.sum()), dx)
-    body, world = run.body, run.world
-    resolved = resolution(body.rest, reconstruction.spacing, dx)
+        shape, dx = data.shape, data.dx
+    log.info("body: %d particles, %.4g cm^3, grid spacing %.4g m", len(shape.rest), 1e6 * float(shape.volume.sum()), dx)
+    resolved = resolution(shape.rest, data.reconstruction.spacing, dx)
     if not resolved.enough:
         warnings.warn(f"simulation.particles: the thin parts of this body are {resolved.cells:.1f} cells across, fewer than "
                       f"{ENOUGH:g}: the grid stiffens them, and the law that is found makes up for it; about "
                       f"{resolved.particles} particles would resolve them", stacklevel=1)
     with clock.measure("starts"):
-        run.starts = shared_starts(cfg, folder, run.find_starts, body)
-    for prefix, start in run.starts.items():
+        starts = data.starts
+    for prefix, start in starts.items():
         log.info("start of %s: velocity (%s) m/s", prefix, ", ".join(f"{v:.3f}" for v in start.velocity.tolist()))
-    check_starts(world, body, run.starts)
-    if parallel.launched_rank() == 0:
-        warn_of_little(world, body, run.starts, [scene, *others])
-        warn_of_others(body, run.starts, [scene, *others])
     with clock.measure("fit"):
-        module = run.module
+        module, world = run.module, run.world
+        body = module.body
+        check_starts(world, body, starts)
+        warn_of_little(world, body, starts, [scene, *others])
+        warn_of_others(body, starts, [scene, *others])
         if cfg.extrapolate:
             check_can_extrapolate(module)
-        if parallel.launched_rank() == 0:
-            log.info(fit_estimate(module, clock.costs, len(device_names(cfg))))
-        fit(cfg, module, run.data, folder, device)
+        log.info(fit_estimate(module, clock.costs))
+        fit(trainer, module, data, cfg.ckpt_path)
     world = module.world  # where how the ground is touched was sought, it has been found
-    if parallel.launched_rank() != 0:
-        return None
-    learned_from = [prefix for prefix in run.starts if prefix.startswith("train")]
+    learned_from = [prefix for prefix in starts if prefix.startswith("train")]
     save_observed(folder / "observed.npz", {prefix: take.cues for prefix, take in zip(learned_from, module.takes)})
     with clock.measure("evaluation"):
         evaluated = run.sequences
         figures, kept = figures_of(build_evaluation(plain(cfg)), body, evaluated, world, module.posterior, folder)
-        figures |= start_figures(run.starts["train"]) | reconstruction.geometry
+        figures |= start_figures(starts["train"]) | data.reconstruction.geometry
         figures |= {f"id_prior/compared/{law}_m": distance for law, distance in module.compared.items()}
         touched = {f"{contact}_m": distance for contact, distance in module.grounds.items()}
         touched |= {f"{contact}_gain": gain for contact, gain in module.ground_gains.items()}
@@ -147,7 +138,8 @@ def train(cfg: DictConfig) -> float | None:
             figures |= extrapolated(cfg, run, scene.known_parameters)
     figures |= clock.figures | cost(device) | {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
     figures["geometry/cells_across"] = resolved.cells
-    log_outcome(plain(cfg.logger), folder, plain(cfg), figures, body.material.law)
+    figures |= {k: float(v) for k, v in trainer.callback_metrics.items() if k.startswith("val/")}
+    log_outcome(trainer.loggers, plain(cfg), figures)
     write_outputs(folder, cfg, body, evaluated, figures, kept, world)
     return optimized(figures, cfg.optimized_metric)
 

@@ -8,19 +8,15 @@ import math
 import platform
 import resource
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from mosa import parallel
 from mosa.checkpoints import check_same_run, read_checkpoint
 from mosa.config import plain
 from mosa.errors import ConfigError, DataError
-from mosa.modules.body import Body, Start
 from mosa.refused import LAST
 from mosa.whole_files import written_whole
 
@@ -100,23 +96,6 @@ def begins_from(cfg: DictConfig, folder: Path) -> str | None:
     return str(last)
 
 
-def device_names(cfg: DictConfig) -> list[str]:
-    """torch device of each process of the fit."""
-    return parallel.devices(cfg.trainer.accelerator, plain(cfg.trainer)["devices"])
-
-
-def device_of(cfg: DictConfig) -> str:
-    """torch device of this process. Errors: ConfigError naming the key of conf/trainer."""
-    names = device_names(cfg)
-    if len(names) > 1 and HydraConfig.get().mode == RunMode.MULTIRUN:
-        raise ConfigError(f"trainer.devices: expected one in a sweep, found {len(names)}: its jobs run beside each other "
-                          "(docs/sweeps.md)")
-    name = names[parallel.launched_rank()] if len(names) > 1 else names[0]
-    if name != "cpu":
-        torch.cuda.set_device(name)
-    return name
-
-
 def most_particles(device: torch.device | str) -> int:
     """Of simulation.particles=auto."""
     return MOST_PARTICLES["cpu" if str(device) == "cpu" else "cuda"]
@@ -139,20 +118,3 @@ def cost(device: str) -> dict[str, float | str]:
     if device != "cpu":
         figures["time/peak_gpu_memory_gb"] = torch.cuda.max_memory_allocated(device) / 1e9
     return figures
-
-
-def shared_starts(cfg: DictConfig, folder: Path, find: Callable[[], dict[str, Start]], body: Body) -> dict[str, Start]:
-    """The starts, found by the first process of the fit and read by the others: on a GPU each would find slightly different ones,
-    and so look for another motion in the cache."""
-    path = folder / "starts.json"
-    if parallel.launched_rank() != 0:
-        if not path.is_file():
-            raise ConfigError("trainer.devices: expected a run started by python train.py, which starts the other processes; "
-                              f"found LOCAL_RANK={parallel.launched_rank()} and no {path} (torchrun and srun are not supported)")
-        return {k: Start.read(s, body.rest) for k, s in json.loads(path.read_text()).items()}
-    found = find()
-    if len(device_names(cfg)) > 1:
-        with written_whole(path) as partial:
-            partial.write_text(json.dumps({k: s.written() for k, s in found.items()}))
-    return found
-

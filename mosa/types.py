@@ -160,6 +160,13 @@ class MotionCues:
     weight: Tensor
     covariances: Tensor
 
+    def to(self, device: torch.device | str) -> MotionCues:
+        return MotionCues(*(getattr(self, f.name).to(device) for f in fields(self)))
+
+    def first(self, frames: int) -> MotionCues:
+        """Of the first `frames` frames."""
+        return MotionCues(*(getattr(self, f.name)[:frames] for f in fields(self)))
+
 
 @dataclass(frozen=True)
 class Reconstruction:

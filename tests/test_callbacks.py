@@ -13,12 +13,16 @@ from mosa.modules.stages import Stage
 class Fit:
     """A module of two stages with one optimiser each, and what a trainer shows of it."""
 
-    def __init__(self):
-        self.stages = [Stage("prior", iterations=2, lr=0.1), Stage("joint", iterations=1, lr=0.01)]
-        self.stage_index, self.losses, self.logged = 0, [], []
+    def __init__(self, first="adam", second="adam"):
+        self.stages = [Stage("prior", iterations=2, lr=0.1, optimizer=first),
+                       Stage("joint", iterations=1, lr=0.01, optimizer=second)]
+        self.stage_index, self.losses, self.logged, self.stage_over = 0, [], [], False
         self.last = {"loss/total": 0.25, "id/E": 2e5, "gradient_norm/material": 3.0}
-        optimizers = [torch.optim.SGD([{"params": [torch.zeros(1)], "lr": lr, "name": "material"}]) for lr in (0.1, 0.01)]
-        self.trainer = SimpleNamespace(global_step=0, optimizers=optimizers)
+        self.trainer = SimpleNamespace(optimizers=[self.optimizer(0.1)])
+
+    @staticmethod
+    def optimizer(lr):
+        return torch.optim.SGD([{"params": [torch.zeros(1)], "lr": lr, "name": "material"}])
 
     @property
     def stage(self):
@@ -27,27 +31,28 @@ class Fit:
     def log_dict(self, values, **_):
         self.logged.append({k: float(v) for k, v in values.items()})
 
-    def run(self, callback, steps=(True, True, True)):
-        """The steps of the fit; whether an optimiser steps in each."""
-        for stepped in steps:
+    def run(self, callback, steps):
+        """So many steps of the fit, in order as Lightning and `Stages` have them."""
+        for _ in range(steps):
             callback.on_train_batch_start(self.trainer, self, None, 0)
             self.losses.append(0.0)
-            self.trainer.global_step += stepped
-            if len(self.losses) == self.stage.iterations:
-                self.stage_index, self.losses = self.stage_index + 1, []
+            self.stage_over = len(self.losses) == self.stage.iterations
             callback.on_train_batch_end(self.trainer, self, None, None, 0)
+            if self.stage_over:
+                self.stage_index, self.losses, self.stage_over = self.stage_index + 1, [], False
+                self.trainer.optimizers = [self.optimizer(0.01)]
 
 
 def test_a_rate_is_that_of_the_stage_a_step_was_made_in():
-    fit = Fit()
-    fit.run(Pace())
+    fit = Fit("adam")
+    fit.run(Pace(), 3)
     assert [values["lr/material"] for values in fit.logged] == pytest.approx([0.1, 0.1, 0.01])
     assert all(values["time/step_s"] >= 0 for values in fit.logged)
 
 
-def test_a_step_without_an_optimiser_has_no_rate():
-    fit = Fit()
-    fit.run(Pace(), (False, False, True))
+def test_a_step_of_gauss_newton_has_no_rate():
+    fit = Fit("gauss_newton", "adam")
+    fit.run(Pace(), 3)
     assert [set(values) for values in fit.logged] == [{"time/step_s"}] * 2 + [{"time/step_s", "lr/material"}]
 
 
@@ -55,7 +60,7 @@ def test_stages_are_noted_when_they_begin_and_end(caplog):
     caplog.set_level(logging.INFO, "mosa")
     fit = Fit()
     fit.losses = [0.0]  # of a run that goes on
-    fit.run(StageNotes(), (True, True))
+    fit.run(StageNotes(), 2)
     said = [record.getMessage() for record in caplog.records]
     assert said[0] == "stage prior: at most 2 steps, going on after 1" and said[2] == "stage joint: at most 1 steps"
     assert said[1].startswith("stage prior: ended after 1 steps, ") and said[1].endswith(" s: loss 0.25000, E 2e+05")

@@ -137,7 +137,7 @@ def test_every_option_passes_the_checks_before_a_run(group_name):
     "reconstruction.static.densify=split", "reconstruction.static.max_points=3.5", "+reconstruction.static.growth=-1",
     "reconstruction.appearance.shape=round", "+reconstruction.appearance.axis_ratio=0.5",
     "reconstruction.dynamic.modes=0", "world.walls=5", "world.colliders=[5]",
-    "evaluation.samples=0", "logger.images_every=-1",
+    "evaluation.samples=0",
 ])  # fmt: skip
 def test_a_value_of_the_wrong_kind_is_named_before_anything_is_computed(override):
     base = ["adapter=linear"] if override.startswith("adapter.") else []  # it has the keys, and the default has not

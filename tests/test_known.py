@@ -44,7 +44,7 @@ def test_every_key_of_every_file_is_known():
 @pytest.mark.parametrize("overrides", [
     [], ["ablation=no_stress"], ["ablation=paper"], ["debug=default"], ["fit=paper", "reconstruction=paper", "simulation=paper"],
     ["+prior.options.norm_eps=0"], ["+reconstruction.static.growth=0.1"], ["+fit.joint.converged=0.001"], ["adapter=direct"],
-    ["trainer=ddp", "rendering=gsplat"], ["~losses.image"], ["adapter=none", "logger=none"],
+    ["trainer=gpu", "rendering=gsplat"], ["~losses.image"], ["adapter=none", "logger=none"],
 ])  # fmt: skip
 def test_what_is_known_passes(overrides):
     check(*overrides)

@@ -128,26 +128,19 @@ def test_what_does_not_say_what_is_learned_may_differ(tmp_path, changed):
 def test_a_fit_that_begins_takes_away_the_figures_of_the_run_before(tmp_path):
     """They would say that it is complete, were it killed."""
     write_figures(tmp_path, {"test/rms_m": 0.5})
-    KeepLast(tmp_path / "checkpoints").on_fit_start(SimpleNamespace(is_global_zero=False), None)  # another process of the fit
-    assert (tmp_path / "metrics.json").is_file()
-    KeepLast(tmp_path / "checkpoints").on_fit_start(SimpleNamespace(is_global_zero=True), None)
+    KeepLast().on_fit_start(SimpleNamespace(default_root_dir=str(tmp_path)), None)
     assert not (tmp_path / "metrics.json").exists()
 
 
 def test_a_checkpoint_that_is_removed_before_the_fit_reads_it_is_named(tmp_path, monkeypatch):
     """Lightning reads it once more, after the reconstruction."""
 
-    class Trainer:
-        def __init__(self, **_):
-            self.callbacks = []
-
-        def fit(self, *_, **__):
-            raise FileNotFoundError("Checkpoint file not found")
+    def removed(*_, **__):
+        raise FileNotFoundError("Checkpoint file not found")
 
     for name in ("read_checkpoint", "check_same", "checked_posterior", "read_numbers"):
         monkeypatch.setattr(fitting, name, lambda *_: [])
-    monkeypatch.setattr(fitting.L, "Trainer", Trainer)
-    cfg = OmegaConf.create({"ckpt_path": "gone/last.ckpt", "logger": {"images_every": 0},
-                            "trainer": {"accelerator": "cpu", "devices": 1}})  # fmt: skip
+    body = SimpleNamespace(material=SimpleNamespace(law="corotated"), rest=torch.zeros(1))
+    trainer = SimpleNamespace(callbacks=[], loggers=[], fit=removed)
     with pytest.raises(DataError, match=r"ckpt_path: gone/last\.ckpt: the fit cannot go on from it \(FileNotFoundError"):
-        fitting.fit(cfg, SimpleNamespace(body=SimpleNamespace(material=SimpleNamespace(law="corotated"))), None, tmp_path, "cpu")
+        fitting.fit(trainer, SimpleNamespace(body=body), None, "gone/last.ckpt")

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from mosa.data.datamodule import ViewSchedule
+from mosa.data.batches import Epochs, ViewSchedule
 from mosa.errors import ConfigError
 from mosa.modules.stages import Stage
 
@@ -32,12 +32,25 @@ def test_unknown_stage_is_named():
 
 
 def test_views_cover_all_cameras_once_per_pass_and_depend_on_seed_and_step_alone():
-    schedule = ViewSchedule(12, 2, 100, seed=3)
+    schedule = ViewSchedule(12, 2, seed=3)
     one_pass = [v for i in range(6) for v in schedule[i]]
     assert sorted(one_pass) == list(range(12))
     torch.manual_seed(99)
-    assert [ViewSchedule(12, 2, 100, seed=3)[i] for i in range(20)] == [schedule[i] for i in range(20)]
-    assert [ViewSchedule(12, 2, 100, seed=4)[i] for i in range(6)] != [schedule[i] for i in range(6)]
+    assert [ViewSchedule(12, 2, seed=3)[i] for i in range(20)] == [schedule[i] for i in range(20)]
+    assert [ViewSchedule(12, 2, seed=4)[i] for i in range(6)] != [schedule[i] for i in range(6)]
+
+
+def test_an_epoch_is_a_pass_over_the_views_and_one_that_is_resumed_is_finished():
+    schedule = ViewSchedule(5, 2, seed=1)
+    epochs = Epochs(schedule, list)
+    first = list(epochs)
+    assert first == [schedule[i] for i in range(3)] and {view for step in first for view in step} == set(range(5))
+    epochs.begin(whole=False, step=10, done=4, left=9)  # four of the stage's steps were made, one of its second epoch
+    assert list(epochs) == [schedule[10], schedule[11]]
+    epochs.begin(whole=False, step=10, done=4, left=1)
+    assert list(epochs) == [schedule[10]]
+    epochs.begin(whole=True, step=10, done=4, left=9)
+    assert list(epochs) == [list(range(5))]
 
 
 def test_a_stage_says_what_it_learns_and_what_its_result_is_kept_as():

@@ -187,9 +187,10 @@ class GaussNewton:
         return J.T
 
     @torch.no_grad()
-    def iterate(self, learn: bool = True, settled: bool = True) -> dict[str, float]:
+    def iterate(self, learn: bool = True, settled: bool = True, r: Tensor | None = None) -> dict[str, float]:
         """One iteration from where the first seat stands. learn: update the blocks' factors by the evidence first; settled: whether
-        what is compared stays as it is, so that steps after the first that improves are worth their while.
+        what is compared stays as it is, so that steps after the first that improves are worth their while; r: (R,) the residuals
+        there, where they are known.
 
         Returns cost before and after, the way that was gone over the length of the first step (0: no step improved), that length in
         standard deviations of the posterior, and each learned block's factor. Errors: SimulationDiverged where a column fails.
@@ -198,7 +199,7 @@ class GaussNewton:
         numbers = seat.read()
         for other in self.seats[1:]:
             other.write(numbers)
-        r = seat.residuals()
+        r = seat.residuals() if r is None else r
         self.columns = None  # before the next are made: one Jacobian is in memory at a time
         J = self.columns = self.jacobian(numbers, r)
         H, g = (J.T @ J).double().cpu(), (J.T @ r).double().cpu()

@@ -92,6 +92,8 @@ class Identification:
         self.newton = GaussNewton(blocks, [self._seat(each) for each in bodies], progress=progress,
                                   many=self._many if body.rest.is_cuda and not body.settings.adaptive else None)
         self.converged = False
+        self.report: dict[str, float] = {}
+        self._residuals: Tensor | None = None  # at the numbers as they stand, between `prepare` and `iterate`
 
     def threads(self, numbers: int) -> int:
         """Rollouts side by side, of as many numbers."""
@@ -241,13 +243,24 @@ class Identification:
             self.rollout(self.body, i)
             self.substeps.append(-(-int(1.05 * self.body.last_substeps) // ROUNDED) * ROUNDED)
 
-    def iterate(self) -> dict[str, float]:
-        """One iteration of Gauss-Newton, see `GaussNewton.iterate`."""
+    @torch.no_grad()
+    def prepare(self) -> float:
+        """What the next iteration holds fixed (substeps, noise), and the cost at the numbers as they stand."""
         self._hold_substeps()
         if self.iteration < NOISE_ITERATIONS or self.noise is None:
             self._measure_noise()
-        report = self.newton.iterate(learn=1 <= self.iteration < EVIDENCE_ITERATIONS,
+        seat = self.newton.seats[0]
+        self._residuals = seat.residuals()
+        return self.newton.cost(seat.read(), self._residuals)
+
+    def iterate(self) -> dict[str, float]:
+        """One iteration of Gauss-Newton, see `GaussNewton.iterate`; `prepare` comes before it, or is done here."""
+        if self._residuals is None:
+            self.prepare()
+        r, self._residuals = self._residuals, None
+        report = self.newton.iterate(learn=1 <= self.iteration < EVIDENCE_ITERATIONS, r=r,
                                      settled=self.iteration >= NOISE_ITERATIONS and not self.calibrating)
+        self.report = report
         self.iteration += 1
         small = self.iteration > NOISE_ITERATIONS and report["length"] * report["share"] < self.settings.tolerance
         gained = report["before"] - report["after"]

@@ -10,8 +10,10 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from mosa import parallel
-from mosa.errors import DataError, MosaError, SimulationDiverged
+import torch
+from torch import Tensor
+
+from mosa.errors import DataError, SimulationDiverged
 from mosa.modules.backbone_search import choose_law
 from mosa.modules.ground_choice import EXPLAINED, alike, learned_on, named, rivals_of
 from mosa.modules.ground_search import RIVAL_ITERATIONS, better_friction, choose_ground
@@ -27,27 +29,18 @@ log = logging.getLogger(__name__)
 class NewtonSteps:
     """The part of `LitMosa` that runs stages by Gauss-Newton, under a trainer or, by `identify`, without one."""
 
-    def newton_step(self, stage: Stage, iteration: int) -> None:
-        """One iteration of Gauss-Newton: of all numbers on all takes, without images."""
-        failure, found = None, {}
-        try:
-            if self.identification is None:
-                saved = self.saved_identification if iteration > 0 else None
-                self.identification = self.begun(stage, saved)
-            found = self.identification.iterate()
-        except MosaError as error:
-            failure = error
-        parallel.agree(failure)
-        parallel.synchronise(self.body)  # ranks do the same work, and on a GPU come to slightly different numbers
+    def newton_loss(self, stage: Stage, iteration: int) -> Tensor:
+        """Minus the logarithm of the posterior at the numbers as they stand; the optimiser goes on from there."""
+        if self.identification is None:
+            saved = self.saved_identification if iteration > 0 else None
+            self.identification = self.begun(stage, saved)
+        return torch.tensor(self.identification.prepare())
+
+    def after_newton_step(self) -> None:
+        """Bookkeeping after the optimiser's step."""
+        found = self.identification.report
         self.losses.append(found["after"])
-        self.steps_done += 1
         self.report_newton(found)
-        if self.identification.converged or stage.ended(self.losses):
-            if (ground := self.better_ground(stage)) is not None:
-                self.begin_again(ground)
-                return
-            self.keep_posterior(stage)
-            self.finish(stage)
 
     def begun(self, stage: Stage, saved: Mapping[str, Any] | None = None) -> Identification:
         """A stage's identification, ready for its first iteration, or for the next one where `saved` is what a checkpoint kept."""
@@ -89,7 +82,7 @@ class NewtonSteps:
         def gain(mode: str, friction: float) -> float:
             ground = replace(found, mode=mode, friction=friction)
             cost, fit = self.fitted_on(ground, stage)
-            better = parallel.mean(own - cost)
+            better = own - cost
             if better > max(gains.values(), default=-math.inf):  # of equals the first, as max() has it below
                 fits.clear()
                 fits[ground] = fit  # one is kept, as each has a body
@@ -119,7 +112,6 @@ class NewtonSteps:
         """From now on the fit is another one, which was made on this ground; `body` has its numbers."""
         self.settle_ground(ground)
         self.body.load_state_dict(fit.body.state_dict())
-        parallel.synchronise(self.body)
         self.identification = fit
 
     def fitted_on(self, ground: Ground, stage: Stage) -> tuple[float, Identification]:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
-from mosa.data.datamodule import Observations
+from mosa.data.observations import Observations
 from mosa.errors import ConfigError, MosaError
 from mosa.modules.body import Body, Start, World
 from mosa.reconstruction.moved import SecondLook
@@ -21,10 +21,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Take:
-    """A sequence to learn from. start: where the body starts; observations: targets (datamodule.py); cues: the reconstruction's,
-    of the training frames, frame_dt [s] apart; first_contact: index of the first frame after it; again: finds the cues once more
-    about what a calibrated backbone predicts, None where the first ones stay; response: what those keep of that prediction, None
-    where it is not known and they count as they are."""
+    """A sequence to learn from. start: where the body starts; observations: targets; cues: the reconstruction's, of the training
+    frames, frame_dt [s] apart; first_contact: index of the first frame after it; again: finds the cues once more about what a
+    calibrated backbone predicts, None where the first ones stay; name: of the sequence; extra: further cues by name; response:
+    what the cues found again keep of that prediction, None where it is not known and they count as they are."""
 
     start: Start
     observations: Observations
@@ -32,6 +32,8 @@ class Take:
     frame_dt: float
     first_contact: int
     again: SecondLook | None = None
+    name: str = "train"
+    extra: dict[str, Tensor] = field(default_factory=dict)
     response: Response | None = None
 
 

@@ -12,7 +12,7 @@ from functools import cached_property
 from torch import Tensor
 
 from mosa import losses
-from mosa.data.datamodule import Observations
+from mosa.data.observations import Observations
 from mosa.errors import ConfigError
 from mosa.modules.adapter_protocol import AdapterProtocol
 from mosa.modules.body import Body, Start
@@ -25,7 +25,7 @@ from mosa.types import MotionCues, Rollout
 class Step:
     """What a step sees of one sequence, its first `frames` frames. rollout: of the body from `start`; targets: real images of the
     step's views; cues: the reconstruction's motion; operator: statistics of the adapter's evaluations, pooled over the rollout,
-    None where it has none; misfit: of the model the joint stage starts from, over the object's size."""
+    None where it has none; misfit: of the model the joint stage starts from, over the object's size; extra: the batch's own."""
 
     body: Body
     start: Start
@@ -38,6 +38,7 @@ class Step:
     operator: OperatorStatistics | None
     misfit: float
     with_flow: bool = field(default=True)
+    extra: Mapping[str, Tensor] = field(default_factory=dict)
 
     @cached_property
     def seen(self) -> Views:

@@ -52,8 +52,9 @@ class Later:
 
 
 PLACES = [  # command, its words, where memory ends, what is raised there
-    ("train", FIRST, "mosa.pipeline:estimate", MODULE), ("train", FIRST, "mosa.assembly:reconstruct", TORCH),
-    ("train", FIRST, "mosa.assembly:sequence_start", HANDLE), ("train", FIRST, "mosa.modules.lit_mosa:LitMosa.training_step", WARP),
+    ("train", FIRST, "mosa.pipeline:estimate", MODULE), ("train", FIRST, "mosa.data.datamodule:reconstruct", TORCH),
+    ("train", FIRST, "mosa.data.datamodule:sequence_start", HANDLE),
+    ("train", FIRST, "mosa.modules.lit_mosa:LitMosa.training_step", WARP),
     ("train", AGAIN, "mosa.modules.lit_mosa:LitMosa.on_load_checkpoint", TORCH),
     ("train", AGAIN, "mosa.modules.lit_mosa:LitMosa.end", ALLOC), ("train", AGAIN, "mosa.evaluation:rollouts", WARP),
     ("eval", other("eval", f"ckpt_path={CHECKPOINT}", f"cache={cache}"), "mosa.pipeline:figures_of", HANDLE),

@@ -53,7 +53,7 @@ def call(script: str, folder: Path, cache: Path, *overrides: str) -> subprocess.
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, cache):
     folder = tmp_path_factory.mktemp("run")
-    result = call("train.py", folder, cache, "logger=[tensorboard,csv]", "logger.images_every=2")
+    result = call("train.py", folder, cache, "logger=[tensorboard,csv]", "callbacks.pictures.every=2")
     assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
     (folder / "screen").write_text(result.stderr)
     return folder

@@ -8,30 +8,30 @@ from pathlib import Path
 
 import pytest
 import torch
-from assembled import assembled
+from assembled import assembled, made
 
 ROOT = Path(__file__).parents[2]
 
 
 def test_a_step_descends_the_mean_over_the_sequences(cache):
-    _, _, module = assembled(cache, "+fit.prior.optimizer=adam", taught=["test_60"])
-    assert len(module.takes) == 2
-    parameters = list(module.body.material.parameters())
-    stage, views = module.stages[0], [0, 1]
+    run = made(cache, "+fit.prior.optimizer=adam", taught=["test_60"])
+    module, batch = run.module, run.data.batch([0, 1])
+    assert len(module.takes) == len(batch.sequences) == 2
+    module.configure_optimizers()
+    parameters, stage = module.learned(), module.stages[0]
 
-    def gradient(take):
+    def gradient(own):
+        take = module.takes[own.index]
         frames = stage.active_frames(0, min(take.first_contact + 3, len(take.cues.positions)), len(take.cues.positions))
-        terms, _ = module.terms(stage, views, frames, take)
+        terms, _ = module.terms(stage, own.observations, frames, take)
         loss = sum(module.weights[k] * v for k, v in terms.items())
         slope = torch.stack(torch.autograd.grad(loss, parameters))
         return float(loss.detach()), slope
 
-    (first, g1), (second, g2) = (gradient(take) for take in module.takes)
-    still = torch.optim.SGD([{"params": parameters, "rate": 0.0, "name": "material"}], lr=0.0)
-    module.optimizers, module.manual_backward = (lambda: still), (lambda loss: loss.backward())
-    module.log_dict = lambda *_, **__: None
-    module.training_step(views, 0)
-    assert module.losses[0] == pytest.approx((first + second) / 2, rel=1e-6) and first != second
+    (first, g1), (second, g2) = (gradient(own) for own in batch.sequences)
+    loss = module.training_step(batch, 0)
+    loss.backward()
+    assert float(loss.detach()) == pytest.approx((first + second) / 2, rel=1e-6) and first != second
     found = torch.stack([p.grad for p in parameters])
     assert (found - (g1 + g2) / 2).abs().max() <= 1e-5 * found.abs().max()
 
@@ -41,7 +41,7 @@ def test_a_take_is_simulated_at_its_own_frame_rate(cache):
     take, stage = module.takes[0], module.stages[0]
     longer = replace(take, frame_dt=2 * take.frame_dt)
     with torch.no_grad():
-        _, found = module.terms(stage, [0], 3, longer)
+        _, found = module.terms(stage, take.observations.select([0]), 3, longer)
         expected = module.body.simulate(take.start, module.world, 3, longer.frame_dt, model=module.body.model().only(adapter=False))
         usual = module.body.simulate(take.start, module.world, 3, take.frame_dt, model=module.body.model().only(adapter=False))
     assert (found.x - expected.x).abs().max() < 1e-6

@@ -182,7 +182,7 @@ def fit_of(take, **changed) -> LitMosa:
     body = small_body(adapter=False, E=1.7 * E, nu=0.3)
     config = {"world": {"ground": {"height": 0.0, "mode": AUTO, "friction": 0.0}}}
     stage = replace(Stage("prior", 1, 0.1), optimizer="gauss_newton", **changed)
-    return LitMosa(body, takes=[take], world=world(Ground(0.0, "sticky")), background=torch.ones(3), config=config,
+    return LitMosa.of_parts(body, takes=[take], world=world(Ground(0.0, "sticky")), background=torch.ones(3), config=config,
                    weights={"position": 1.0}, stages=[stage])  # fmt: skip
 
 
@@ -214,7 +214,7 @@ def learning(truth: Ground) -> LitMosa:
     take.again = None
     config = {"world": {"ground": {"height": 0.0, "mode": AUTO, "friction": 0.0}}}
     stages = [replace(Stage(name, 8, 0.1), optimizer="gauss_newton") for name in ("prior", "joint")]
-    return LitMosa(small_body(E=1.2 * E, nu=0.3, on=False), takes=[take], world=world(Ground(0.0, "sticky")),
+    return LitMosa.of_parts(small_body(E=1.2 * E, nu=0.3, on=False), takes=[take], world=world(Ground(0.0, "sticky")),
                    background=torch.ones(3), config=config, weights={"position": 1.0}, stages=stages,
                    criterion=Criterion("corrected"), settings=IdentificationSettings(grid_error=0.0))  # fmt: skip
 

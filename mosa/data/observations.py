@@ -1,0 +1,61 @@
+"""Targets that a fit is compared with: images and mattes cropped to the object, with the flow maps of the reconstruction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mosa.modules.observer import observe
+from mosa.rendering.cameras import crop_boxes, crop_cameras, crop_images
+from mosa.types import Cameras, Reconstruction, Scene
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Targets of V views and T frames: images (V, T, h, w, 3), mattes (V, T, h, w), flow (V, T - 1, h, w, 2) [px] or None where no
+    cues tell it, cropped cameras. image_width [px]: of the pictures before they were cropped."""
+
+    images: Tensor
+    mattes: Tensor
+    flow: Tensor | None
+    cameras: Cameras
+    image_width: int
+
+    def select(self, views: Sequence[int], frames: int | None = None) -> Observations:
+        """The given views and the first `frames` frames, all of them where None."""
+        views = list(views)
+        flow = None if self.flow is None else self.flow[views, : None if frames is None else frames - 1]
+        return Observations(self.images[views, :frames], self.mattes[views, :frames], flow, self.cameras.select(views),
+                            self.image_width)
+
+    def to(self, device: torch.device | str) -> Observations:
+        flow = None if self.flow is None else self.flow.to(device)
+        return Observations(self.images.to(device), self.mattes.to(device), flow, self.cameras.to(device), self.image_width)
+
+
+def cropped(scene: Scene, views: Sequence[int], frames: Sequence[int], margin: int) -> Observations:
+    """Images and mattes of these cameras and frames, in one window per camera that holds its mattes and `margin` pixels."""
+    views, frames = list(views), list(frames)
+    images, mattes = scene.images[views][:, frames], scene.mattes[views][:, frames]
+    x0, y0, width, height = crop_boxes(mattes, margin=margin)
+    images, mattes = (crop_images(stack, x0, y0, width, height, axis=2) for stack in (images, mattes))
+    cameras = crop_cameras(scene.cameras.select(views), x0, y0, width, height)
+    return Observations(images, mattes, None, cameras, scene.cameras.width)
+
+
+@torch.no_grad()
+def training_observations(scene: Scene, reconstruction: Reconstruction, *, margin: int = 6, device="cpu") -> Observations:
+    """Cropped images, mattes and cue flow of the cameras and frames that learning may read, on `device`."""
+    frames = scene.training_frames
+    found = cropped(scene, scene.training_cameras, frames, margin).to(device)
+    cues, splats = reconstruction.cues, reconstruction.splats
+    flow = [
+        observe(cues.positions[: len(frames)].to(device), cues.covariances[: len(frames)].to(device),
+                splats.opacities.to(device), splats.colors.to(device), found.cameras.select([v]), scene.background.to(device),
+                flow=True).flow
+        for v in range(len(found.cameras))
+    ]
+    return Observations(found.images, found.mattes, torch.cat(flow), found.cameras, found.image_width)

@@ -1,0 +1,70 @@
+"""The callback that leads a fit from one stage to the next, as Lightning's own callbacks for staged fine-tuning do."""
+
+from __future__ import annotations
+
+import lightning as L
+import torch
+from lightning.pytorch.callbacks import Checkpoint, EarlyStopping
+
+from mosa.data.batches import Epochs
+
+
+class Stages(Checkpoint):
+    """Begins stages, ends them, and stops the trainer after the last.
+
+    `LitMosa` brings it along (`configure_callbacks`). A stage has an optimiser and a schedule of its own. Callbacks that stop a
+    training (`EarlyStopping`) end the running stage; the next one begins with their counters at zero.
+
+    It is a `Checkpoint` only because Lightning calls these after the callbacks that stop a training; it saves nothing.
+    """
+
+    def __init__(self) -> None:
+        self.begun = -1  # number of the stage that has begun in this process
+
+    def on_fit_start(self, trainer: L.Trainer, pl_module) -> None:
+        self.announce(trainer, pl_module)  # the first batch is fetched before the training starts
+
+    def on_train_start(self, trainer: L.Trainer, pl_module) -> None:
+        if pl_module.stage is None:  # a run that was stopped after its fit
+            trainer.should_stop = True
+
+    def on_train_epoch_start(self, trainer: L.Trainer, pl_module) -> None:
+        self.announce(trainer, pl_module)
+
+    def on_train_batch_start(self, trainer: L.Trainer, pl_module, batch, batch_idx: int) -> None:
+        if pl_module.stage_over and batch_idx == 0:  # of a checkpoint that was written before the stage was ended
+            self.advance(trainer, pl_module)
+        if pl_module.stage is not None and self.begun != pl_module.stage_index and not pl_module.stage_over:
+            self.begun = pl_module.stage_index
+            if not pl_module.losses:
+                pl_module.begin(pl_module.stage)
+
+    def on_train_epoch_end(self, trainer: L.Trainer, pl_module) -> None:
+        stoppers = [each for each in trainer.callbacks if isinstance(each, EarlyStopping)]
+        if trainer.should_stop and any(each.wait_count >= each.patience for each in stoppers):
+            pl_module.stage_over = True
+        if pl_module.stage_over:
+            self.advance(trainer, pl_module)
+            if pl_module.stage is not None:
+                trainer.should_stop = False
+                for each in stoppers:
+                    each.wait_count, each.stopped_epoch = 0, 0
+                    each.best_score = torch.tensor(torch.inf if each.monitor_op == torch.lt else -torch.inf)
+            self.announce(trainer, pl_module)
+
+    def advance(self, trainer: L.Trainer, pl_module) -> None:
+        """Ends the running stage; the next one gets its optimiser."""
+        pl_module.finish()
+        self.begun = -1
+        if pl_module.stage is None:
+            trainer.should_stop = True
+        else:
+            trainer.strategy.setup_optimizers(trainer)
+
+    @staticmethod
+    def announce(trainer: L.Trainer, pl_module) -> None:
+        """Tells the training data what the next epoch is."""
+        epochs, stage = getattr(trainer.datamodule, "epochs", None), pl_module.stage
+        if isinstance(epochs, Epochs) and stage is not None:
+            done = len(pl_module.losses)
+            epochs.begin(whole=stage.newton, step=pl_module.steps_done, done=done, left=max(1, stage.iterations - done))
