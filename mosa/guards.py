@@ -122,7 +122,7 @@ def check_seen(cfg: DictConfig, scene: Scene) -> None:
     check_clear(solids, place[None], "the object, as frame 0 shows it,")
     dx, radius = cfg.simulation.dx, float((radii * ((place - origins) * directions).sum(1)).mean())
     if dx is not None:
-        count = 4 / 3 * 3.14 * (radius / dx) ** 3 * cfg.simulation.particles_per_cell
+        count = 4 / 3 * 3.14 * min(radius / dx, 1e30) ** 3 * cfg.simulation.particles_per_cell
         check_particles("simulation.dx", count)
         if count < FEWEST:
             raise ConfigError(f"simulation.dx: expected a grid that is finer than the object, of a radius of {radius:.3g} m, found "

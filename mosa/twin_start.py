@@ -16,14 +16,13 @@ from mosa.limits import machine_memory
 from mosa.modules.body import VARIANTS, Body, Start, World
 from mosa.physics.contact.colliders import colliders_from_config
 from mosa.physics.contact.overlap import check_clear
+from mosa.physics.engine.time_step import MOST_SUBSTEPS
 from mosa.schema import is_number
 
 STARTED = ("rotation", "height", "position", "velocity", "angular_velocity")
 """What a start may say."""
 FASTEST = 1e6
 """[m/s], [rad/s] of a start: the time step would be refused far below."""
-MOST_SUBSTEPS = 10**6
-"""Of a step: it would take hours."""
 UNDER = 0.25
 """Share of the body below the ground from which on it cannot start there: pressed against it, it has less."""
 STORED_BYTES = 4 * (3 + 3 + 9 + 9)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -12,6 +13,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from mosa.errors import DataError
+from mosa.limits import counted
 from mosa.types import Cameras
 
 
@@ -33,6 +35,12 @@ class Volume:
     def occupied_volume(self, threshold: float = 0.5) -> float:
         """Volume [m^3] of the region above `threshold`; the value near the boundary gives the fraction of a cell."""
         return float((self.values > threshold).sum()) * self.pitch**3
+
+
+def voxel_counts(counts: Iterable[float]) -> tuple[int, ...]:
+    """Numbers of voxels per axis, of a body that is carved or filled. Errors: DataError for more than this machine can hold."""
+    return counted("voxels of the object", counts, "take larger and fewer ones (resolution, particles, dx), or a smaller box",
+                   each=100, error=DataError)  # fmt: skip
 
 
 def matte_values(points: Tensor, mattes: Tensor, cameras: Cameras) -> Tensor:
@@ -119,8 +127,8 @@ def hull_bounds(mattes: Tensor, cameras: Cameras, box: Tensor, *, resolution: in
 def visual_hull(mattes: Tensor, cameras: Cameras, box: Tensor, *, pitch: float) -> Volume:
     """Occupancy in [0, 1] on a grid of the given pitch around the object. mattes: (V, H, W); box: (2, 3) [m]."""
     bounds = hull_bounds(mattes, cameras, box)
-    counts = ((bounds[1] - bounds[0]) / pitch).ceil().long() + 1
-    grid = Volume(torch.empty(tuple(counts.tolist()), device=mattes.device), bounds[0], pitch)
+    counts = voxel_counts(((bounds[1] - bounds[0]) / pitch).ceil() + 1)
+    grid = Volume(torch.empty(counts, device=mattes.device), bounds[0], pitch)
     return Volume(occupancy(grid.points(), mattes, cameras), bounds[0], pitch)
 
 

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from mosa.errors import DataError
-from mosa.reconstruction.hull import Volume
+from mosa.reconstruction.hull import Volume, voxel_counts
 from mosa.rendering.covariance import covariance_from
 from mosa.types import Splats
 
@@ -84,14 +84,14 @@ def solid_of(splats: Splats, *, resolution: int = 80, share: float = 0.9, up: Te
     """
     low, high = splats.means.amin(0), splats.means.amax(0)
     extent = float((high - low).max())
-    if not extent > 0:
-        raise DataError("solid: expected Gaussians that fill a space, found them all in one place")
+    if not 0 < extent < np.inf:
+        raise DataError(f"solid: expected Gaussians that fill a space, found an extent of {extent:.3g}")
     pitch = extent / resolution
     gap = float(np.median(cKDTree(splats.means.numpy()).query(splats.means.numpy(), k=5)[0][:, 4]))
     wider = WIDER * max(gap, pitch)
     room = MARGIN * pitch + 3 * wider
     origin = low - room
-    shape = tuple(((high - low + 2 * room) / pitch).ceil().long().add(1).tolist())
+    shape = voxel_counts(((high - low + 2 * room) / pitch).ceil() + 1)
     shell = opacity_field(splats, origin, shape, pitch, wider) > LEVEL
     closed, count = np.zeros(shape, np.int32), 0
     for direction in product((-1, 0, 1), repeat=3):

@@ -11,6 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from mosa.errors import DataError
+from mosa.limits import counted
 from mosa.rendering.projection_kernels import TILE
 from mosa.rendering.records import record_functions, record_type
 
@@ -73,6 +74,9 @@ def tile_lists(depths: Tensor, records: Tensor, width: int, height: int) -> tupl
     """
     images, gaussians, _ = records.shape
     number, columns, rows = images * gaussians, -(-width // TILE), -(-height // TILE)
+    last = images * rows * columns
+    # their numbers have 32 bits, and Gaussians are sorted in twice the room
+    counted("rasterize: Gaussians, or tiles, of all images", [max(number, last)], "render fewer images at once", most=ENTRIES_MAX)
     device = wp.device_from_torch(records.device)
     scalar = wp.dtype_from_torch(records.dtype)
     count, emit = list_kernels(scalar)
@@ -93,7 +97,6 @@ def tile_lists(depths: Tensor, records: Tensor, width: int, height: int) -> tupl
         outputs=[_descriptor(tiles), _descriptor(entries)],
         device=device,
     )
-    last = images * rows * columns
     wp.utils.radix_sort_pairs(wp.from_torch(tiles), wp.from_torch(entries), total, end_bit=last.bit_length())
     marks = torch.arange(last + 1, dtype=torch.int32, device=records.device)
     starts = torch.searchsorted(tiles[:total], marks, out_int32=True)

@@ -168,7 +168,7 @@ def test_mesh_files(tmp_path):
         (CUBE, [[c, b, a] for a, b, c in CUBE_FACES], {}, "face inwards"),
         (CUBE, [[0, 1, 9]], {}, "indices from 0 to 7"),
         (CUBE, CUBE_FACES, {"spacing": -1.0}, "spacing"),
-        (CUBE, CUBE_FACES, {"spacing": 1e-4}, "too large"),
+        (CUBE, CUBE_FACES, {"spacing": 1e-4}, "use a larger spacing"),
         (CUBE[:, :2], CUBE_FACES, {}, r"vertices \(P, 3\)"),
     ],
 )

@@ -13,6 +13,7 @@ import warp as wp
 from torch import Tensor
 
 from mosa.errors import ConfigError, DataError
+from mosa.limits import counted
 
 MAX_LATTICE = 2**24
 FARTHEST, SMALLEST = 1e6, 1e-6
@@ -96,13 +97,11 @@ def field_of_triangles(
         raise ConfigError(f"mesh: spacing: expected a positive number [m], found {spacing}")
     margin = max(2 * spacing, extent / 6 if margin is None else margin)
     low = points.min(0) - margin
-    dims = np.ceil((points.max(0) + margin - low) / spacing) + 1
-    if not dims.prod() <= MAX_LATTICE:  # in floating point, which does not overflow
-        raise ConfigError(f"mesh: a lattice of {dims.tolist()} nodes at spacing {spacing:.3g} m is too large: use a larger spacing")
-    dims = dims.astype(int)
+    dims = counted(f"mesh: nodes at spacing {spacing:.3g} m", np.ceil((points.max(0) + margin - low) / spacing) + 1,
+                   "use a larger spacing or a smaller margin", most=MAX_LATTICE)  # fmt: skip
     axes = [low[i] + spacing * np.arange(dims[i]) for i in range(3)]
     lattice = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    values = torch.from_numpy(_signed_distance(points, index, lattice)).reshape(*dims.tolist())
+    values = torch.from_numpy(_signed_distance(points, index, lattice)).reshape(dims)
     return SignedDistanceField(values, tuple(low.tolist()), float(spacing), margin)
 
 
