@@ -20,7 +20,7 @@ from mosa.extensions import registered_keys
 from mosa.idle import warn_of_idle
 from mosa.keys import CAPTURE, ENVIRONMENTS, EVALUATION, SIMULATION, SPLATS, TRAINING
 from mosa.known import check_known, conf_folder
-from mosa.limits import machine_memory
+from mosa.limits import counted
 from mosa.modules.body import Body, Start, World
 from mosa.physics.contact.colliders import colliders_from_config
 from mosa.physics.contact.overlap import check_clear
@@ -90,10 +90,7 @@ def check_environments(values: Mapping[str, Any]) -> None:
 
 def check_particles(key: str, count: float) -> None:
     """Errors: ConfigError where the machine cannot hold as many."""
-    most = int(machine_memory() / PARTICLE_BYTES)
-    if count > most:
-        raise ConfigError(f"{key}: expected at most {most} particles, which fill this machine's {machine_memory() / 1e9:.1f} GB, "
-                          f"found {count:.3g}")
+    counted(key, [count], "take as many as this machine has memory for", each=PARTICLE_BYTES / 2)
 
 
 def check_begin(cfg: DictConfig) -> None:

@@ -31,7 +31,7 @@ def counted(where: str, sizes: Iterable[float], remedy: str, *, each: float = 8,
     become integers, which would wrap. It may be `most`, and as many of `each` bytes as fill half of the memory. Errors: `error`."""
     sizes, most = [min(n, 10**300) if isinstance(n, int) else float(n) for n in sizes], min(most, machine_memory() / (2 * each))
     if not math.prod(map(float, sizes)) <= most:  # as NaN is not
-        raise error(f"{where}: expected at most {most:.3g} in all, found {' x '.join(f'{n:.6g}' for n in sizes)}: {remedy}")
+        raise error(f"{where}: expected at most {int(most)}, found {' x '.join(f'{n:.6g}' for n in sizes)}: {remedy}")
     return tuple(map(int, sizes))
 
 

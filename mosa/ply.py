@@ -21,10 +21,8 @@ def check_ply(path: Path) -> None:
     element, properties = b"", 0
     for line in header.splitlines():
         words = line.split()
-        if words[:1] == [b"element"]:
-            element, properties = line, 0
-        properties += words[:1] == [b"property"]  # each of which takes a byte at least
-        words = element.split()
+        element, properties = (line, 0) if words[:1] == [b"element"] else (element, properties + (words[:1] == [b"property"]))
+        words = element.split()  # each of its properties takes a byte at least
         if words and (len(words) != 3 or not words[2].isdigit() or len(words[2]) > 18 or int(words[2]) * max(properties, 1) > size):
             raise DataError(f"{path}: expected a PLY file whose elements fit into its {size} bytes, found "
                             f"{element[:80].decode(errors='replace')!r}")

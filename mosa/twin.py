@@ -33,7 +33,6 @@ from mosa.physics.contact.colliders import Collider, colliders_from_config, reac
 from mosa.prediction import DRAWS, among_forms, drawn_motions, rival_motions, total_spread
 from mosa.progress import tqdm
 from mosa.rendering.cameras import look_at
-from mosa.rendering.records import SIDE_MAX
 from mosa.rollout_file import poses, save_rollout
 from mosa.shown_body import FILE as BODY_FILE
 from mosa.shown_body import save_body
@@ -212,8 +211,6 @@ class Twin:
     def render(self, rollout: Rollout, size: int = 400, colliders: Sequence[Collider | Mapping] | None = None) -> Tensor:
         """(T, size, size, 3) images from one camera that sees the whole motion, on the ground and among `colliders`, those that the
         rollout was simulated with (None: the world's). Half spaces and meshes are not drawn."""
-        if isinstance(size, bool) or not isinstance(size, int) or not 1 <= size <= SIDE_MAX:
-            raise ConfigError(f"size: expected a whole number of pixels, 1 to {SIDE_MAX}, found {str(size)[:80]}")
         body, up = self.body, self.world.up.to(self.body.rest)
         solids = self._met(rollout, colliders)
         low, high = rollout.x.amin((0, 1)), rollout.x.amax((0, 1))

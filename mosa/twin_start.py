@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.limits import machine_memory
+from mosa.limits import counted
 from mosa.modules.body import VARIANTS, Body, Start, World
 from mosa.physics.contact.colliders import colliders_from_config
 from mosa.physics.contact.overlap import check_clear
@@ -33,9 +33,7 @@ def check_frames(frames: int, particles: int) -> None:
     """Errors: ConfigError where frames are no whole number, or are more than the machine can hold."""
     if isinstance(frames, bool) or not isinstance(frames, int) or frames < 1:
         raise ConfigError(f"frames: expected a whole number of at least 1, found {frames!r}")
-    most = machine_memory() // (2 * STORED_BYTES * particles)
-    if frames > most:
-        raise ConfigError(f"frames: expected at most {most}, which take half of this machine's memory, found {frames}")
+    counted("frames", (frames, particles), "frames times particles, of which this machine can hold fewer", each=STORED_BYTES)
 
 
 def check_variant(variant: str) -> None:

@@ -81,8 +81,7 @@ def common_path(phones: list[Phone], tracks: list[Track], fall: Fall, knowledge:
     low, high = max(t.min() for t in times), min(t.max() for t in times)
     inside = (every >= low) & (every <= high)
     every, across, values = every[inside], across[inside], values[inside]
-    count, _ = counted("intervals of the videos' frames, squared", [max(4, (high - low) // step)] * 2,
-                       "cut the videos, or give phones an even rate (fps)", each=2 * 9 * 8, error=DataError)  # fmt: skip
+    count, _ = counted("knots of the videos' path", [max(4, (high - low) // step)] * 2, "cut the videos, or set fps", each=144)
     knots = np.concatenate([[low] * 3, np.linspace(low, high, count), [high] * 3])
     basis = BSpline.design_matrix(np.clip(every, low, high), knots, 3).toarray()
     n = basis.shape[1]

@@ -167,7 +167,7 @@ class Task(ABC):
         return replace(world, ground=Ground(0.0, "separate", self.ground_friction), box=box, planes=(), colliders=())
 
     def draw(self, count: int, generator: torch.Generator) -> Trials:
-        """`count` trials. Errors: ConfigError."""
+        """`count` trials."""
         counted("trials", (count, sum(map(len, self.drawn))), "take fewer", each=3 * 8)
         found = []
         for quantities in self.drawn:

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from mosa.errors import ConfigError, MosaError, SimulationDiverged
+from mosa.errors import MosaError, SimulationDiverged
 from mosa.limits import counted
 
 SHORTER, SHORTEST = 0.4, 0.05
@@ -100,10 +100,7 @@ class Posterior:
         return cls(list(written["names"]), *tensors, float(written["model_error"]), rivals)
 
     def draws(self, count: int, generator: torch.Generator | None = None) -> Tensor:
-        """(count, D) float64. generator: of the random numbers; None: one with seed 0, so that the same draws come every time.
-        Errors: ConfigError."""
-        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-            raise ConfigError(f"draws: expected a whole number of at least 1, found {count!r}")
+        """(count, D) float64. generator: of the random numbers; None: one with seed 0, so that the same draws come every time."""
         counted("draws", (count, len(self.mean)), "take fewer", each=3 * 8)
         generator = torch.Generator().manual_seed(0) if generator is None else generator
         L = torch.linalg.cholesky(self.covariance)

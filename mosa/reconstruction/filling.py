@@ -73,8 +73,7 @@ def fill(volume: Volume, *, spacing: float, threshold: float = 0.5, smallest_par
     cell = np.floor((voxels - centre) / spacing)
     low = cell.min(0)
     shape = np.array(voxel_counts(cell.max(0) - low + 1))
-    cell, low = cell.astype(np.int64), low.astype(np.int64)
-    flat = np.ravel_multi_index((cell - low).T, shape)
+    flat = np.ravel_multi_index((cell - low).astype(np.int64).T, shape)
     count = np.bincount(flat, minlength=int(shape.prod()))
     # the fullest cells, as many as the volume holds: so a particle's mean volume is spacing^3 for thin bodies too
     wanted = max(1, round(len(voxels) * (volume.pitch / spacing) ** 3))

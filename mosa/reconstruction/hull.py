@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ from mosa.errors import DataError
 from mosa.limits import counted
 from mosa.types import Cameras
 
+voxel_counts = partial(counted, "voxels of the object", remedy="take fewer and larger ones", each=100, error=DataError)
 
 @dataclass(frozen=True)
 class Volume:
@@ -35,12 +36,6 @@ class Volume:
     def occupied_volume(self, threshold: float = 0.5) -> float:
         """Volume [m^3] of the region above `threshold`; the value near the boundary gives the fraction of a cell."""
         return float((self.values > threshold).sum()) * self.pitch**3
-
-
-def voxel_counts(counts: Iterable[float]) -> tuple[int, ...]:
-    """Numbers of voxels per axis, of a body that is carved or filled. Errors: DataError for more than this machine can hold."""
-    return counted("voxels of the object", counts, "take larger and fewer ones (resolution, particles, dx), or a smaller box",
-                   each=100, error=DataError)  # fmt: skip
 
 
 def matte_values(points: Tensor, mattes: Tensor, cameras: Cameras) -> Tensor:

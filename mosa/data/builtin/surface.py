@@ -10,7 +10,6 @@ import warp.geometry
 from scipy.spatial import cKDTree
 
 from mosa.data.builtin.shapes import Shape
-from mosa.limits import counted
 
 wp.config.log_level = wp.LOG_WARNING
 
@@ -52,7 +51,6 @@ def level_gradient(shape: Shape, points: np.ndarray, h: float = 1e-4) -> np.ndar
 def fill(shape: Shape, spacing: float, rng: np.random.Generator) -> np.ndarray:
     """Particles (N, 3) [m] on a lattice of `spacing` inside the shape, the lattice shifted at random."""
     offset = rng.uniform(0, spacing, 3)
-    counted("places of particles", np.ptp(shape.bounds, axis=0) / spacing + 2, "take a larger spacing", each=100)
     axes = [np.arange(a, b + spacing, spacing) for a, b in zip(shape.bounds[0] - spacing + offset, shape.bounds[1])]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     return points[shape.distance(points) < 0]

@@ -138,7 +138,6 @@ class SegmentSolver:
             frames //= 2
         return frames
 
-    @np.errstate(over="ignore", invalid="ignore")
     def _serves(self, bounds: np.ndarray, time: float, least: float, margin: int) -> bool:
         """Whether the windows for `time` [s] are about as small as those for the time `least`."""
         reach = fallen(bounds, self._pull, time)

@@ -47,7 +47,6 @@ def required_substeps(
         if not (math.isfinite(value) and value >= 0):
             raise ConfigError(f"time step: {name}: expected a number >= 0, found {value}")
     speed = wave_speed(modulus_max, density, factor)
-    # bounded first: infinity has no whole number
     count = max(1, math.ceil(min(1e9, frame_dt * step_rate(speed, viscosity, density, dx, v_max, courant))))
     if count > limit:
         viscous = f", viscosity {viscosity:.3g} Pa s" if viscosity else ""
