@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
+import sys
 import tempfile
-import warnings
 from importlib.metadata import version
 
 FOLDERS = """HOME TMPDIR XDG_CONFIG_HOME XDG_DATA_HOME XDG_CACHE_HOME WARP_CACHE_PATH CUDA_CACHE_PATH TRITON_HOME TRITON_CACHE_DIR
@@ -21,7 +21,7 @@ def cache_home() -> str:
 
 def settle_caches() -> None:
     """Variables that are empty or relative count as unset. Where no kernels can be kept, a temporary folder is used until this
-    process ends, with a warning that names the variable to set."""
+    process ends, with a word that names the variable to set."""
     for name in FOLDERS:
         if not os.path.isabs(os.environ.get(name, os.sep)):
             del os.environ[name]
@@ -32,7 +32,7 @@ def settle_caches() -> None:
     except OSError as error:
         _temporary.append(tempfile.TemporaryDirectory(prefix="mosa-", ignore_cleanup_errors=True))
         os.environ[name] = _temporary[-1].name
-        warnings.warn(f"{place}: cannot be made ({error.strerror}): kernels are compiled into a temporary folder, again in every "
-                      f"process; set {name} to a folder that can be written", stacklevel=2)  # fmt: skip
+        print(f"{place}: cannot be made ({error.strerror}): kernels are compiled into a temporary folder, again by every command; "
+              f"set {name} to a folder that can be written", file=sys.stderr)  # fmt: skip
     for name in ("CUDA_CACHE_PATH", "TRITON_CACHE_DIR", "TORCHINDUCTOR_CACHE_DIR"):  # by themselves not below XDG_CACHE_HOME
         os.environ.setdefault(name, os.path.join(cache_home(), "mosa", name.lower()))

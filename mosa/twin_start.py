@@ -45,8 +45,8 @@ def checked_dt(value: float | None, default: float) -> float:
     """[s] of a step. Errors: ConfigError."""
     if value is None:
         return default
-    if not is_number(value) or not value > 0:
-        raise ConfigError(f"control_dt: expected a positive number [s], found {value!r}")
+    if not is_number(value) or not 0 < value <= 100:
+        raise ConfigError(f"control_dt: expected a positive number of at most 100 [s], found {value!r}")
     return float(value)
 
 

@@ -16,7 +16,7 @@ from mosa.errors import DataError
 from mosa.limits import counted
 from mosa.types import Cameras
 
-voxel_counts = partial(counted, "voxels of the object", remedy="take fewer and larger ones", each=100, error=DataError)
+voxel_counts = partial(counted, "voxels of the object", remedy="take fewer and larger ones", each=40, error=DataError)
 
 @dataclass(frozen=True)
 class Volume:

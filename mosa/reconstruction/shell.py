@@ -44,10 +44,10 @@ def opacity_field(splats: Splats, origin: Tensor, shape: tuple[int, int, int], p
     covariances = covariance_from(splats.scales, splats.rotations).double() + wider**2 * torch.eye(3).double()
     places = (splats.means.double() - origin.double()) / pitch
     widest = REACH * covariances.diagonal(dim1=1, dim2=2).amax(1).sqrt() / pitch
-    inverse, reach = torch.linalg.inv(covariances / pitch**2), widest.ceil().long()
+    inverse, reach = torch.linalg.inv(covariances / pitch**2), widest.ceil()
     left = torch.zeros(shape, dtype=torch.float64).flatten()  # sum of log(1 - alpha)
     limits = torch.tensor(shape)
-    for width in reach[reach <= LARGEST].unique().tolist():
+    for width in reach[reach <= LARGEST].unique().long().tolist():
         members = (reach == width).nonzero()[:, 0]
         axis = torch.arange(-width, width + 1)
         around = torch.cartesian_prod(axis, axis, axis)

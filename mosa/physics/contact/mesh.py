@@ -137,13 +137,13 @@ def field_of_mesh(path: Path, spacing: float | None = None, margin: float | None
         raise ConfigError(f"mesh: {path}: expected a file .obj or .ply")
     try:
         vertices, faces = readers[path.suffix.lower()](path)
+        triangles = np.array([(f[0], f[i], f[i + 1]) for f in faces for i in range(1, len(f) - 1)], dtype=np.int64).reshape(-1, 3)
     except DataError as error:
         raise ConfigError(f"mesh: {error}") from error
     except Exception as error:  # whatever a parser finds: the file is not what its name says
         raise ConfigError(f"mesh: {path} cannot be read ({type(error).__name__}: {error})") from error
-    triangles = [(f[0], f[i], f[i + 1]) for f in faces for i in range(1, len(f) - 1)]
     try:
-        return field_of_triangles(scale * vertices, np.array(triangles, dtype=np.int64).reshape(-1, 3), spacing, margin)
+        return field_of_triangles(scale * vertices, triangles, spacing, margin)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
 
