@@ -13,7 +13,10 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
+from mosa.caches import settle_caches
+
 __version__ = "0.1.0"
+settle_caches()
 
 _PLACES = {
     "compose": "mosa.composition",

@@ -152,7 +152,7 @@ def size_of(cfg: Mapping[str, Any], scene: Scene, others: int, taught: int, most
     dx = cfg["simulation"]["dx"]
     particles = particles_of(cfg, most)
     if dx is not None:
-        particles = round(4.2 * (radius / dx) ** 3 * cfg["simulation"]["particles_per_cell"])
+        particles = round(4.2 * min(radius / dx, 1e30) ** 3 * cfg["simulation"]["particles_per_cell"])
     cameras, frames, height, width = scene.images.shape[:4]
     return Size(int(particles), cameras, frames, height * width, 1 + others, taught), radius
 

@@ -146,6 +146,9 @@ class Episode:
             if not isinstance(found, Tensor) or found.shape != known.shape or found.dtype != known.dtype:
                 what = f"{found.dtype} {tuple(found.shape)}" if isinstance(found, Tensor) else repr(found)
                 raise ConfigError(f"state.{f.name}: expected a tensor {known.dtype} {tuple(known.shape)}, found {what}")
+        for name in ("frames", "substeps"):
+            if not 0 <= int(found := getattr(state, name)) <= 2**53:  # as far as times have them exactly
+                raise ConfigError(f"state.{name}: expected a whole number of at least 0 and at most 2^53, found {int(found)}")
         particles = ParticleState(*(getattr(state, name).to(now.x.device) for name in State._fields))
         self._moment = Moment(particles, int(state.substeps), int(state.frames), float(state.lag))
         self._driven, self._poses = state.driven.cpu(), (state.position.cpu(), state.rotation.cpu())

@@ -20,7 +20,7 @@ from mosa.extensions import registered_keys
 from mosa.idle import warn_of_idle
 from mosa.keys import CAPTURE, ENVIRONMENTS, EVALUATION, SIMULATION, SPLATS, TRAINING
 from mosa.known import check_known, conf_folder
-from mosa.limits import machine_memory
+from mosa.limits import counted
 from mosa.modules.body import Body, Start, World
 from mosa.physics.contact.colliders import colliders_from_config
 from mosa.physics.contact.overlap import check_clear
@@ -90,10 +90,7 @@ def check_environments(values: Mapping[str, Any]) -> None:
 
 def check_particles(key: str, count: float) -> None:
     """Errors: ConfigError where the machine cannot hold as many."""
-    most = int(machine_memory() / PARTICLE_BYTES)
-    if count > most:
-        raise ConfigError(f"{key}: expected at most {most} particles, which fill this machine's {machine_memory() / 1e9:.1f} GB, "
-                          f"found {count:.3g}")
+    counted(key, [count], "take as many as this machine has memory for", each=PARTICLE_BYTES / 2)
 
 
 def check_begin(cfg: DictConfig) -> None:
@@ -122,7 +119,7 @@ def check_seen(cfg: DictConfig, scene: Scene) -> None:
     check_clear(solids, place[None], "the object, as frame 0 shows it,")
     dx, radius = cfg.simulation.dx, float((radii * ((place - origins) * directions).sum(1)).mean())
     if dx is not None:
-        count = 4 / 3 * 3.14 * (radius / dx) ** 3 * cfg.simulation.particles_per_cell
+        count = 4 / 3 * 3.14 * min(radius / dx, 1e30) ** 3 * cfg.simulation.particles_per_cell
         check_particles("simulation.dx", count)
         if count < FEWEST:
             raise ConfigError(f"simulation.dx: expected a grid that is finer than the object, of a radius of {radius:.3g} m, found "

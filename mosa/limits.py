@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 import torch
 
-from mosa.errors import ConfigError
+from mosa.errors import ConfigError, MosaError
 from mosa.refused import lacks_memory
 
 CGROUP = Path("/sys/fs/cgroup/memory.max")
@@ -21,6 +23,16 @@ def machine_memory() -> int:
     except OSError:
         return total
     return min(total, int(limit)) if limit.isdigit() else total
+
+
+def counted(where: str, sizes: Iterable[float], remedy: str, *, each: float = 8, most: float = math.inf,
+            error: type[MosaError] = ConfigError) -> tuple[int, ...]:  # fmt: skip
+    """Sizes (whole numbers) of an array that is about to be allocated. Their product is compared in floating point, before they
+    become integers, which would wrap. It may be `most`, and as many of `each` bytes as fill half of the memory. Errors: `error`."""
+    sizes, most = [min(n, 10**300) if isinstance(n, int) else float(n) for n in sizes], min(most, machine_memory() / (2 * each))
+    if not math.prod(map(float, sizes)) <= most:  # as NaN is not
+        raise error(f"{where}: expected at most {int(most)}, found {' x '.join(f'{n:.6g}' for n in sizes)}: {remedy}")
+    return tuple(map(int, sizes))
 
 
 def named_device(name: str | torch.device) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mosa.live import COLORS, Live
-from mosa.viewing import add_ground, add_solid, aim, beside_panel, cell, open_server, turn, view_of
+from mosa.viewing import add_ground, add_solid, aim, beside_panel, cell, offered, open_server, turn, view_of
 
 log = logging.getLogger(__name__)
 
@@ -90,7 +90,7 @@ class LiveViewer:
         """Let the body go as the sliders say."""
         with self.busy:
             self.live.uncertain = bool(self.uncertain.value)
-            self.live.change(**{name: float(slider.value) for name, slider in self.sliders.items()})
+            self.live.change(**{name: float(offered(slider)) for name, slider in self.sliders.items()})
             self.live.drop()
             self.follow()
             self.draw()
@@ -120,19 +120,20 @@ class LiveViewer:
 
     def pushed(self, position: Any) -> None:
         """The gizmo was moved: the ball is to go there."""
-        self.live.target = np.asarray(position, np.float64)
+        if np.shape(position) == (3,) and np.abs(position).max() < 1e6:  # [m], as NaN is not
+            self.live.target = np.asarray(position, np.float64)
 
     def dragged(self, event: Any) -> None:
         """The ball is dragged: from the point where it was taken to the mouse."""
-        self.live.target = self.live.hand_position + np.asarray(event.end_position) - np.asarray(event.start_position)
+        self.pushed(self.live.hand_position + np.asarray(event.end_position) - np.asarray(event.start_position))
         self.follow()
 
     def draw(self) -> None:
         """The state now."""
         with self.busy, self.server.atomic():
-            live, by = self.live, self.color.value
+            live, by = self.live, offered(self.color)
             colors, scale = live.paint(by)
-            if self.geometry.value == "splats":
+            if offered(self.geometry) == "splats":
                 means, covariances, painted, opacities = live.splats(by, colors)
                 parts = (means / self.unit).astype(np.float32), covariances / self.unit**2, painted, opacities[:, None]
                 if self.splats is None:
@@ -142,9 +143,9 @@ class LiveViewer:
             else:
                 self.points.points = live.positions.cpu().numpy().astype(np.float32)
                 self.points.colors = (255 * colors).astype(np.uint8)
-            self.points.visible = self.geometry.value == "particles"
+            self.points.visible = offered(self.geometry) == "particles"
             if self.splats is not None:
-                self.splats.visible = self.geometry.value == "splats"
+                self.splats.visible = offered(self.geometry) == "splats"
             self.ball.position = tuple(map(float, live.hand_position))
             for node, (position, rotation) in zip(self.solids, live.poses()):
                 if node is not None:
@@ -166,17 +167,18 @@ class LiveViewer:
         hidden = len(live.twin.world.planes) + sum(node is None for node in self.solids)
         if hidden:
             said += f"  \nNot drawn: {hidden} walls, half spaces or meshes"
-        if self.color.value == "uncertainty" and live.spread is None:
+        if offered(self.color) == "uncertainty" and live.spread is None:
             said += "  \nGray: not known; tick uncertainty and drop the body."
         self.caption.content = said
         self.message.content = f"**{live.message}**" if live.message else ""
 
     def run(self) -> None:
         """Steps while the twin runs, at most as fast as time goes by, until `stop`."""
-        pause = 0.0
+        pause, wanted = 0.0, self.live.dt
         while not self.ended.wait(pause):
             begun = time.perf_counter()
             try:
+                wanted = self.live.dt / offered(self.slowdown)
                 with self.busy:
                     if self.live.running:
                         self.live.step()
@@ -186,7 +188,6 @@ class LiveViewer:
                 self.live.running, self.live.message = False, f"{type(error).__name__}: {error}"
                 self.message.content = f"**{self.live.message}**"
             self.taken = time.perf_counter() - begun
-            wanted = self.live.dt / self.slowdown.value
             pause = max(wanted - self.taken, 0.002)  # the buttons get their turn
             self.taken += pause
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from mosa.errors import DataError
-from mosa.limits import machine_memory
+from mosa.limits import counted
 from mosa.whole_files import written_whole
 
 HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
@@ -27,9 +27,7 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
-            if (total := sum(entry.file_size for entry in entries)) > machine_memory() // 2:
-                raise DataError(f"{path}: expected at most half of this machine's {machine_memory() / 1e9:.0f} GB of memory, found "
-                                f"{total / 1e9:.3g} GB")
+            counted(f"{path}: bytes", [sum(entry.file_size for entry in entries)], "more than is read", each=1, error=DataError)
             for entry in entries:
                 check_entry(archive, entry, path)
         with np.load(path, allow_pickle=False) as stored:

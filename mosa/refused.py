@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from json import JSONDecodeError
 from pathlib import Path
 
+from mosa.caches import cache_home
+
 DISK = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.EIO, errno.ENOTDIR,
         errno.EISDIR, errno.EFBIG, errno.EEXIST}  # fmt: skip
 """What a disk or a folder's rights refuse, which is no mistake of the program."""
@@ -37,8 +39,9 @@ def disk_message(error: OSError) -> str | None:
         return f"{error.filename}: cannot be written or read: its folder has been removed meanwhile; give the command again"
     if error.errno not in DISK:
         return None
+    keys = "XDG_CACHE_HOME" if str(error.filename).startswith(cache_home()) else "hydra.run.dir= and scene.cache= (eval.py: cache=)"
     return (f"{error.filename or 'a file'}: cannot be written or read ({error.strerror}); free space, or choose other folders with "
-            "hydra.run.dir= and scene.cache= (eval.py: cache=)")
+            f"{keys}")
 
 
 def causes(error: BaseException | None) -> Iterator[BaseException]:

@@ -12,18 +12,17 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.limits import machine_memory
+from mosa.limits import counted
 from mosa.modules.body import VARIANTS, Body, Start, World
 from mosa.physics.contact.colliders import colliders_from_config
 from mosa.physics.contact.overlap import check_clear
+from mosa.physics.engine.time_step import MOST_SUBSTEPS
 from mosa.schema import is_number
 
 STARTED = ("rotation", "height", "position", "velocity", "angular_velocity")
 """What a start may say."""
 FASTEST = 1e6
 """[m/s], [rad/s] of a start: the time step would be refused far below."""
-MOST_SUBSTEPS = 10**6
-"""Of a step: it would take hours."""
 UNDER = 0.25
 """Share of the body below the ground from which on it cannot start there: pressed against it, it has less."""
 STORED_BYTES = 4 * (3 + 3 + 9 + 9)
@@ -34,9 +33,7 @@ def check_frames(frames: int, particles: int) -> None:
     """Errors: ConfigError where frames are no whole number, or are more than the machine can hold."""
     if isinstance(frames, bool) or not isinstance(frames, int) or frames < 1:
         raise ConfigError(f"frames: expected a whole number of at least 1, found {frames!r}")
-    most = machine_memory() // (2 * STORED_BYTES * particles)
-    if frames > most:
-        raise ConfigError(f"frames: expected at most {most}, which take half of this machine's memory, found {frames}")
+    counted("frames", (frames, particles), "frames times particles, of which this machine can hold fewer", each=STORED_BYTES)
 
 
 def check_variant(variant: str) -> None:
@@ -48,8 +45,8 @@ def checked_dt(value: float | None, default: float) -> float:
     """[s] of a step. Errors: ConfigError."""
     if value is None:
         return default
-    if not is_number(value) or not value > 0:
-        raise ConfigError(f"control_dt: expected a positive number [s], found {value!r}")
+    if not is_number(value) or not 0 < value <= 100:
+        raise ConfigError(f"control_dt: expected a positive number of at most 100 [s], found {value!r}")
     return float(value)
 
 

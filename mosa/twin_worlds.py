@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mosa.episode import Episode, Stepped, TwinState
 from mosa.errors import ConfigError
+from mosa.limits import counted
 from mosa.modules.body import Body, Start, World
 from mosa.physics.contact.colliders import Collider
 from mosa.twin_start import (
@@ -32,6 +33,7 @@ class TwinWorlds:
     ) -> None:
         if isinstance(count, bool) or not isinstance(count, int) or count < 1:
             raise ConfigError(f"worlds: expected a whole number of at least 1, found {count!r}")
+        counted("worlds", (count, len(body.rest)), "take fewer", each=500)  # bytes of a particle
         if laws is not None and (not isinstance(laws, Tensor) or laws.ndim != 2 or len(laws) != count):
             found = tuple(laws.shape) if isinstance(laws, Tensor) else repr(laws)[:80]
             raise ConfigError(f"laws: expected one for each of {count} worlds, a tensor ({count}, numbers), found {found}")

@@ -8,6 +8,7 @@ known; beside it the calibrated prior's and the learned body's. Needs viser: the
 
 from __future__ import annotations
 
+import logging
 import sys
 import threading
 from collections.abc import Mapping, Sequence
@@ -22,7 +23,7 @@ from mosa.live import Live
 from mosa.live_viewer import LiveViewer
 from mosa.refused import explained
 from mosa.twin import Twin
-from mosa.viewing import add_ground, aim, beside_panel, open_server, view_of
+from mosa.viewing import add_ground, aim, beside_panel, offered, open_server, view_of
 
 GEOMETRY = ("splats", "particles")
 
@@ -93,12 +94,12 @@ class Viewer:
 
     @property
     def clip(self) -> Clip:
-        return self.clips[self.sequence.value]
+        return self.clips[offered(self.sequence)]
 
     def choose(self) -> None:
         """Another sequence, from its start, and where it is seen."""
         with self.drawing:
-            known, chosen = layouts(self.clip), self.layout.options.index(self.layout.value)
+            known, chosen = layouts(self.clip), self.layout.options.index(offered(self.layout))
             alike = len(known) == len(self.layout.options)  # the same layouts, of other bodies
             self.layout.options, self.layout.disabled = known, len(known) == 1
             self.layout.value = known[chosen if alike else 0]
@@ -109,7 +110,7 @@ class Viewer:
 
     def explain(self) -> None:
         """The colours' legend."""
-        scale = self.clip.scales.get(self.color.value)
+        scale = self.clip.scales.get(offered(self.color))
         self.legend.visible = scale is not None
         if scale is not None:
             self.legend.image = scale.legend()
@@ -117,13 +118,13 @@ class Viewer:
     def draw(self) -> None:
         """The current frame."""
         with self.drawing, self.server.atomic():
-            clip, layout = self.clip, self.layout.value
-            frame = min(int(self.frame.value), len(clip.times) - 1)
+            clip, layout = self.clip, offered(self.layout)
+            frame = min(int(offered(self.frame)), len(clip.times) - 1)
             above, below = clip.overlays.get(layout, (layout, None))
             for name, nodes in self.nodes.items():
                 shown = name in clip.bodies and (layout == "side by side" or name in (above, below))
                 shown = shown and frame < len(clip.bodies[name].centers)
-                for node, wanted in zip(nodes, (self.geometry.value == "splats", self.geometry.value == "particles", True)):
+                for node, wanted in zip(nodes, (offered(self.geometry) == "splats", offered(self.geometry) == "particles", True)):
                     node.visible = shown and wanted
                 if shown:
                     place = list(clip.bodies).index(name) if layout == "side by side" else 0
@@ -135,12 +136,12 @@ class Viewer:
         clip, (splats, points, label) = self.clip, self.nodes[name]
         centers = clip.bodies[name].centers[frame] + shift
         if splats.visible:
-            means, covariances, colors, opacities = clip.splats(name, frame, self.color.value)
+            means, covariances, colors, opacities = clip.splats(name, frame, offered(self.color))
             colors, opacities = (np.full_like(colors, GRAY), FAINT * opacities) if under else (colors, opacities)
             splats.set_gaussians(((means + shift) / self.unit).astype(np.float32), covariances / self.unit**2, colors,
                                  opacities[:, None])
         else:
-            colors = clip.appearance if name == clip.reference else clip.paint(frame, self.color.value, name)
+            colors = clip.appearance if name == clip.reference else clip.paint(frame, offered(self.color), name)
             colors = np.full_like(colors, GRAY) if under else colors
             points.points, points.colors = centers.astype(np.float32), (255 * colors).astype(np.uint8)
         label.text = f"{name} (gray)" if under else name
@@ -150,9 +151,14 @@ class Viewer:
 
     def run(self) -> None:
         """Advances the slider while `play` is on, until `stop`."""
-        while not self.ended.wait(1 / self.rate.value):
-            if self.play.value:
-                self.frame.value = (int(self.frame.value) + 1) % len(self.clip.times)  # draws
+        pause = 1.0
+        while not self.ended.wait(pause):
+            try:
+                pause = 1 / offered(self.rate)
+                if self.play.value:
+                    self.frame.value = (int(offered(self.frame)) + 1) % len(self.clip.times)  # draws
+            except Exception:  # the page outlives whatever a message, or a picture, meets
+                logging.getLogger(__name__).exception("the viewer: a picture is left out")
 
     def stop(self) -> None:
         """Ends the player and the server."""

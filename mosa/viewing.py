@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import ipaddress
 import math
 import socket
 from itertools import product
 from typing import Any
+from unittest.mock import patch
+from urllib.parse import urlsplit
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -35,7 +38,36 @@ def open_server(host: str, port: int) -> Any:
             raise ValueError("an empty name")
     except (OSError, ValueError, TypeError) as error:
         raise ConfigError(f"host: expected 127.0.0.1, 0.0.0.0 or this machine's address, found {host!r} ({error})") from error
-    return viser.ViserServer(host=host, port=port, label="MoSA", verbose=False)
+    import websockets.asyncio.server as sockets  # viser brings it
+
+    def serve(*arguments: Any, process_request: Any, begin: Any = sockets.serve, **options: Any) -> Any:
+        def answer(connection: Any, request: Any) -> Any:
+            if own_page(request.headers.get("Origin"), request.headers.get("Host"), host):
+                return process_request(connection, request)
+            return connection.respond(403, f"expected a page of this server, by its address or the name {host}\n")
+
+        return begin(*arguments, process_request=answer, **options)
+
+    with patch.object(sockets, "serve", serve):  # viser has no argument for it
+        return viser.ViserServer(host=host, port=port, label="MoSA", verbose=False)
+
+
+def own_page(origin: str | None, asked: str | None, host: str) -> bool:
+    """Whether a request is of a page of the server itself, or of none (no browser). asked: the name by which the server was asked
+    for: an address or one of its own names, as a stranger's may be said to be at this address."""
+    try:
+        name = urlsplit(f"//{asked}").hostname
+        known = name in ("localhost", host, socket.gethostname()) or ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return bool(known) and origin in (None, f"http://{asked}", f"https://{asked}")
+
+
+def offered(handle: Any) -> Any:
+    """What is chosen on the page, within what the page offers: a message may say anything."""
+    if hasattr(handle, "options"):
+        return handle.value if handle.value in handle.options else handle.options[0]
+    return min(max(handle.min, handle.value), handle.max)  # of NaN the least
 
 
 def horizontal(up: np.ndarray) -> np.ndarray:

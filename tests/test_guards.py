@@ -18,6 +18,7 @@ from mosa.checkpoints import check_resumed, check_same, read_checkpoint
 from mosa.config import rehearse
 from mosa.data.images import check_amount, read_image
 from mosa.data.particles import read_ply
+from mosa.data.splats import load_ply
 from mosa.errors import ConfigError, DataError
 from mosa.guards import check_begin, check_configuration, check_particles
 from mosa.limits import machine_memory
@@ -29,7 +30,7 @@ from mosa.run import read_figures
 def test_more_particles_than_memory_holds_are_refused_with_the_most_that_fit():
     most = machine_memory() / 5e3
     check_particles("simulation.particles", 0.9 * most)
-    with pytest.raises(ConfigError, match=rf"simulation\.particles: expected at most {int(most)} particles"):
+    with pytest.raises(ConfigError, match=rf"simulation\.particles: expected at most {int(most)}, found"):
         check_particles("simulation.particles", 1.1 * most)
 
 
@@ -176,7 +177,7 @@ def test_a_giant_picture_is_refused_from_its_header(tmp_path):
     with pytest.raises(DataError, match=r"a\.png: expected at most 67 million pixels, found 13000x13000"):
         read_image(tmp_path / "a.png")
     check_amount(100, 100, 100)
-    with pytest.raises(ConfigError, match=r"scene\.scale: 1000000 pictures"):
+    with pytest.raises(ConfigError, match=r"scene\.scale: pixels of all pictures: .*found 1e\+06 x 2000 x 2000: lower it"):
         check_amount(10**6, 2000, 2000)
 
 
@@ -188,6 +189,13 @@ def test_a_ply_that_claims_more_than_it_has_is_named(tmp_path, count):
         read_ply(tmp_path / "a.ply")
     with pytest.raises(ConfigError, match=r"a\.ply: expected a PLY file"):
         field_of_mesh(tmp_path / "a.ply")
+
+
+def test_a_ply_has_a_byte_for_each_property_of_its_elements(tmp_path):
+    many = "".join(f"property double f_{i}\n" for i in range(2000))
+    (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 30000\n{many}end_header\n")
+    with pytest.raises(DataError, match=r"a\.ply: expected a PLY file whose elements fit .* found 'element vertex 30000'"):
+        load_ply(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize("overrides, message", [

@@ -1,5 +1,6 @@
 """A twin that is played with: the motion it makes, what the ball does to it, its colours, and what goes wrong; and the page."""
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -209,6 +210,8 @@ def test_the_page_drops_steps_pushes_and_outlives_a_divergence():
         time.sleep(0.05)
         assert live.time == at and not live.running
         shown.pushed((0.1, 0.2, 0.3))
+        for place in ((math.nan, 0, 0), (math.inf, 0, 0), (1e300, 0, 0), (1, 2), 3.0, None, ((1, 2, 3),)):
+            shown.pushed(place)  # which no message may make the ball's
         assert live.target == pytest.approx([0.1, 0.2, 0.3])
         assert shown.draggable  # by the viser that the tests ask for
         here = live.hand_position.copy()
@@ -232,6 +235,11 @@ def test_the_page_drops_steps_pushes_and_outlives_a_divergence():
             time.sleep(0.02)
         assert "ZeroDivisionError" in shown.message.content and shown.player.is_alive()
         live.twin.step = stepped
+        for speed in (0.0, math.nan, -1.0, 1e300):
+            shown.slowdown.value = speed
+            time.sleep(0.02)
+        assert shown.player.is_alive()
+        shown.slowdown.value = 1.0
         shown.drop()
         shown.step()
         assert shown.message.content == "" and live.time > 0

@@ -1,5 +1,6 @@
 """What the viewer shows of a run: read from its folder, painted, placed; and, where viser is installed, served."""
 
+import math
 import socket
 import sys
 import time
@@ -23,7 +24,7 @@ from mosa.physics.contact.colliders import domain_walls
 from mosa.rollout_file import save_observed, save_rollout
 from mosa.twin import Twin
 from mosa.types import Appearance, MotionCues, Rollout, Splats
-from mosa.viewing import FIELD_OF_VIEW, beside_panel, view_of
+from mosa.viewing import FIELD_OF_VIEW, beside_panel, own_page, view_of
 
 N, T, SEEN = 27, 5, 3
 GROUND = -0.2
@@ -355,6 +356,62 @@ def test_the_server_plays_and_ends(run):
     finally:
         shown.stop()
     assert not shown.player.is_alive()
+
+
+@pytest.mark.parametrize("origin, asked, own", [
+    (None, "127.0.0.1:80", True), ("http://127.0.0.1:80", "127.0.0.1:80", True), ("http://localhost:9", "localhost:9", True),
+    ("https://[::1]:80", "[::1]:80", True), ("http://machine.lab:80", "machine.lab:80", True), (None, "machine.lab:80", True),
+    ("http://127.0.0.1:81", "127.0.0.1:80", False), ("http://stranger.example", "127.0.0.1:80", False),
+    ("http://localhost:80", "127.0.0.1:80", False), ("null", "127.0.0.1:80", False), ("", "127.0.0.1:80", False),
+    ("file://", "127.0.0.1:80", False), ("http://127.0.0.1:80@stranger.example", "127.0.0.1:80", False),
+    ("http://stranger.example:80", "stranger.example:80", False), (None, "stranger.example:80", False), (None, None, False),
+    ("http://127.0.0.1.stranger.example:80", "127.0.0.1.stranger.example:80", False), (None, "[::1", False), (None, "", False),
+])  # fmt: skip
+def test_a_page_is_the_server_s_own(origin, asked, own):
+    """Also where a stranger's name is said to be this machine's address."""
+    assert own_page(origin, asked, "machine.lab") is own
+
+
+def test_no_message_ends_the_player_and_no_foreign_page_connects(run):
+    viser = pytest.importorskip("viser")
+    import msgspec
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    shown = viewer.Viewer(read_run(run), port=0)
+    try:
+        port = shown.server.get_port()
+        options = {"uri": f"ws://127.0.0.1:{port}", "subprotocols": [f"viser-v{viser.__version__}"], "max_size": None}
+        for origin in ("http://stranger.example", f"http://127.0.0.1:{port + 1}", "null"):
+            with pytest.raises(InvalidStatus) as refused:
+                connect(**options, origin=origin)
+            assert refused.value.response.status_code == 403
+        inputs = {name: getattr(shown, name) for name in ("sequence", "layout", "frame", "rate", "geometry", "color", "play")}
+        with connect(**options, origin=f"http://127.0.0.1:{port}") as page:
+            for said in (math.nan, -math.inf, 1e300, -(10**18), 10**18, "abc", None, [], {"a": 1}, 0, True):
+                for handle in inputs.values():
+                    message = {"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {"value": said}}
+                    page.send(msgspec.msgpack.encode(message))
+            until = time.time() + 10
+            while not (shown.play.value is True and shown.color.value == "True") and time.time() < until:
+                time.sleep(0.01)
+        assert shown.color.value == "True" and shown.rate.value == 1 and shown.play.value is True
+        assert viewer.offered(shown.color) == "appearance" and viewer.offered(shown.sequence) == "train"
+        shown.rate.value = 0
+        shown.layout.value, shown.frame.value, shown.rate._impl.value = "side by side", 0, 30
+        until = time.time() + 10
+        while "frame 3" not in shown.caption.content and time.time() < until:
+            time.sleep(0.01)
+        assert "frame 3" in shown.caption.content and shown.player.is_alive()
+    finally:
+        shown.stop()
+
+
+@pytest.mark.parametrize("value, used", [
+    (0, 1), (-3, 1), (math.nan, 1), (math.inf, 30), (-math.inf, 1), (1e300, 30), (10**400, 30), (5, 5), (29.5, 29.5),
+])  # fmt: skip
+def test_numbers_of_the_page_are_within_its_limits(value, used):
+    assert viewer.offered(SimpleNamespace(min=1, max=30, value=value)) == used
 
 
 def test_the_server_shows_a_learned_body_alone(run):

@@ -14,6 +14,7 @@ import numpy as np
 from mosa.capture.fall import Fall, Knowledge, row_share
 from mosa.capture.mattes import Track
 from mosa.capture.phones import Phone
+from mosa.limits import counted
 
 PITCH = 1 / 18
 """Of the hull's grid, in radii of the object."""
@@ -61,9 +62,9 @@ def outline_centre(phone: Phone, points: np.ndarray, pitch: float) -> np.ndarray
     pixels = phone.camera.project(points)
     depth = np.linalg.norm(points.mean(0) - phone.camera.centre)
     cell = pitch / depth * phone.camera.K[0, 0]
-    x, y = np.floor((pixels - pixels.min(0)) / cell).astype(int).T
-    covered = np.zeros((y.max() + 1, x.max() + 1), bool)
-    covered[y, x] = True
+    cells = np.floor((pixels - pixels.min(0)) / cell)[:, ::-1]
+    covered = np.zeros(counted(f"{phone.name}: cells of an outline", cells.max(0) + 1, "look at the phone's pose"), bool)
+    covered[tuple(cells.astype(int).T)] = True
     rows, columns = np.nonzero(covered)
     return pixels.min(0) + cell * np.array([columns.mean() + 0.5, rows.mean() + 0.5])
 

@@ -20,6 +20,7 @@ from mosa.capture.phones import Phone
 from mosa.data.agreement import HOLE
 from mosa.data.images import fill_holes
 from mosa.errors import DataError
+from mosa.limits import counted
 
 KINDS = ("flow", "shift", "none")
 NEAR = 0.02
@@ -80,7 +81,8 @@ def common_path(phones: list[Phone], tracks: list[Track], fall: Fall, knowledge:
     low, high = max(t.min() for t in times), min(t.max() for t in times)
     inside = (every >= low) & (every <= high)
     every, across, values = every[inside], across[inside], values[inside]
-    knots = np.concatenate([[low] * 3, np.linspace(low, high, max(4, int((high - low) / step))), [high] * 3])
+    count, _ = counted("knots of the videos' path", [max(4, (high - low) // step)] * 2, "cut the videos, or set fps", each=144)
+    knots = np.concatenate([[low] * 3, np.linspace(low, high, count), [high] * 3])
     basis = BSpline.design_matrix(np.clip(every, low, high), knots, 3).toarray()
     n = basis.shape[1]
     matrix = np.einsum("kab,ki,kj->iajb", across, basis, basis).reshape(3 * n, 3 * n)

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from mosa.capture.poses import VIDEOS
+from mosa.data.images import read_image
 from mosa.errors import ConfigError, DataError
 
 
@@ -104,6 +105,7 @@ def plate_of(folder: Path | None, clip: Clip, seconds: tuple[float, float] | Non
                 other = open_clip(file)
                 return median_of(other, 0, len(other.times) - 1, clip)
             if file.stem == stem and file.suffix.lower() in (".png", ".jpg", ".jpeg"):
+                read_image(file)  # refused where it is damaged, or larger than pictures are; OpenCV would ask for memory first
                 picture = cv2.imread(str(file), cv2.IMREAD_COLOR)
                 if picture is None:
                     raise DataError(f"{file}: expected a readable picture, found a damaged one")

@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from mosa.errors import ConfigError, DataError
-from mosa.limits import machine_memory
+from mosa.limits import counted
 
 MOST_PIXELS = 2**26
 """Of one picture: twice an 8K frame."""
@@ -92,12 +92,8 @@ def check_pixels(path: Path) -> None:
 
 def check_amount(pictures: int, width: int, height: int) -> None:
     """Errors: ConfigError where that many pictures with mattes, of that size, do not fit into this machine's memory."""
-    wanted = 2 * 16 * pictures * width * height  # colours and matte in single precision, and once more while they are put together
-    if wanted > machine_memory():
-        most = (machine_memory() / wanted) ** 0.5
-        raise ConfigError(f"scene.scale: {pictures} pictures of {width}x{height} px take {wanted / 1e9:.1f} GB, more than this "
-                          f"machine's {machine_memory() / 1e9:.1f} GB; "
-                          f"multiply scene.scale by at most {most:.2g}, or restrict scene.frames")
+    # colours and matte in single precision, and once more while they are put together
+    counted("scene.scale: pixels of all pictures", (pictures, width, height), "lower it, or restrict scene.frames", each=16)
 
 
 def plain_mode(picture: Image.Image) -> str:

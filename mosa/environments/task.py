@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
+from mosa.limits import counted
 from mosa.modules.start import World
 from mosa.schema import Kind, is_number, number, whole
 from mosa.types import Ground
@@ -167,6 +168,7 @@ class Task(ABC):
 
     def draw(self, count: int, generator: torch.Generator) -> Trials:
         """`count` trials."""
+        counted("trials", (count, sum(map(len, self.drawn))), "take fewer", each=3 * 8)
         found = []
         for quantities in self.drawn:
             low, high = (torch.tensor([getattr(q, side) for q in quantities], dtype=torch.float64) for side in ("low", "high"))

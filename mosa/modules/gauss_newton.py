@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import MosaError, SimulationDiverged
+from mosa.limits import counted
 
 SHORTER, SHORTEST = 0.4, 0.05
 """A step that does not improve is tried again so much shorter; one of fewer standard deviations of the posterior is not tried."""
@@ -100,6 +101,7 @@ class Posterior:
 
     def draws(self, count: int, generator: torch.Generator | None = None) -> Tensor:
         """(count, D) float64. generator: of the random numbers; None: one with seed 0, so that the same draws come every time."""
+        counted("draws", (count, len(self.mean)), "take fewer", each=3 * 8)
         generator = torch.Generator().manual_seed(0) if generator is None else generator
         L = torch.linalg.cholesky(self.covariance)
         return self.mean + torch.randn(count, len(self.mean), generator=generator, dtype=torch.float64) @ L.T

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from mosa.errors import DataError
-from mosa.reconstruction.hull import Volume
+from mosa.reconstruction.hull import Volume, voxel_counts
 
 SMALLEST_PIECE = 0.02
 """Connected pieces below this part of the largest one are debris of the hull (ghosts seen by every matte) and are dropped."""
@@ -70,10 +70,10 @@ def fill(volume: Volume, *, spacing: float, threshold: float = 0.5, smallest_par
     origin = volume.origin.double().cpu().numpy()
     voxels = np.argwhere(body) * volume.pitch + origin
     centre = voxels.mean(0)
-    cell = np.floor((voxels - centre) / spacing).astype(np.int64)
+    cell = np.floor((voxels - centre) / spacing)
     low = cell.min(0)
-    shape = cell.max(0) - low + 1
-    flat = np.ravel_multi_index((cell - low).T, shape)
+    shape = np.array(voxel_counts(cell.max(0) - low + 1))
+    flat = np.ravel_multi_index((cell - low).astype(np.int64).T, shape)
     count = np.bincount(flat, minlength=int(shape.prod()))
     # the fullest cells, as many as the volume holds: so a particle's mean volume is spacing^3 for thin bodies too
     wanted = max(1, round(len(voxels) * (volume.pitch / spacing) ** 3))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -12,8 +13,10 @@ from scipy import ndimage
 from torch import Tensor
 
 from mosa.errors import DataError
+from mosa.limits import counted
 from mosa.types import Cameras
 
+voxel_counts = partial(counted, "voxels of the object", remedy="take fewer and larger ones", each=40, error=DataError)
 
 @dataclass(frozen=True)
 class Volume:
@@ -119,8 +122,8 @@ def hull_bounds(mattes: Tensor, cameras: Cameras, box: Tensor, *, resolution: in
 def visual_hull(mattes: Tensor, cameras: Cameras, box: Tensor, *, pitch: float) -> Volume:
     """Occupancy in [0, 1] on a grid of the given pitch around the object. mattes: (V, H, W); box: (2, 3) [m]."""
     bounds = hull_bounds(mattes, cameras, box)
-    counts = ((bounds[1] - bounds[0]) / pitch).ceil().long() + 1
-    grid = Volume(torch.empty(tuple(counts.tolist()), device=mattes.device), bounds[0], pitch)
+    counts = voxel_counts(((bounds[1] - bounds[0]) / pitch).ceil() + 1)
+    grid = Volume(torch.empty(counts, device=mattes.device), bounds[0], pitch)
     return Volume(occupancy(grid.points(), mattes, cameras), bounds[0], pitch)
 
 

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from mosa.errors import DataError
-from mosa.reconstruction.hull import Volume
+from mosa.reconstruction.hull import Volume, voxel_counts
 from mosa.rendering.covariance import covariance_from
 from mosa.types import Splats
 
@@ -44,10 +44,10 @@ def opacity_field(splats: Splats, origin: Tensor, shape: tuple[int, int, int], p
     covariances = covariance_from(splats.scales, splats.rotations).double() + wider**2 * torch.eye(3).double()
     places = (splats.means.double() - origin.double()) / pitch
     widest = REACH * covariances.diagonal(dim1=1, dim2=2).amax(1).sqrt() / pitch
-    inverse, reach = torch.linalg.inv(covariances / pitch**2), widest.ceil().long()
+    inverse, reach = torch.linalg.inv(covariances / pitch**2), widest.ceil()
     left = torch.zeros(shape, dtype=torch.float64).flatten()  # sum of log(1 - alpha)
     limits = torch.tensor(shape)
-    for width in reach[reach <= LARGEST].unique().tolist():
+    for width in reach[reach <= LARGEST].unique().long().tolist():
         members = (reach == width).nonzero()[:, 0]
         axis = torch.arange(-width, width + 1)
         around = torch.cartesian_prod(axis, axis, axis)
@@ -84,14 +84,14 @@ def solid_of(splats: Splats, *, resolution: int = 80, share: float = 0.9, up: Te
     """
     low, high = splats.means.amin(0), splats.means.amax(0)
     extent = float((high - low).max())
-    if not extent > 0:
-        raise DataError("solid: expected Gaussians that fill a space, found them all in one place")
+    if not 0 < extent < np.inf:
+        raise DataError(f"solid: expected Gaussians that fill a space, found an extent of {extent:.3g}")
     pitch = extent / resolution
     gap = float(np.median(cKDTree(splats.means.numpy()).query(splats.means.numpy(), k=5)[0][:, 4]))
     wider = WIDER * max(gap, pitch)
     room = MARGIN * pitch + 3 * wider
     origin = low - room
-    shape = tuple(((high - low + 2 * room) / pitch).ceil().long().add(1).tolist())
+    shape = voxel_counts(((high - low + 2 * room) / pitch).ceil() + 1)
     shell = opacity_field(splats, origin, shape, pitch, wider) > LEVEL
     closed, count = np.zeros(shape, np.int32), 0
     for direction in product((-1, 0, 1), repeat=3):

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError, DataError
+from mosa.limits import counted
 from mosa.rendering import gsplat_backend
 from mosa.rendering.records import SIDE_MAX
 from mosa.rendering.splatting import PRESETS, SCALARS, Geometry, Splat, start_warp
@@ -76,6 +77,7 @@ def _check(means: Tensor, covariances: Tensor, opacities: Tensor, features: Tens
             raise ConfigError(f"rasterize: cameras.{name} has shape {tuple(value.shape)}, expected {(images, size, size)}")
     if max(cameras.width, cameras.height) > SIDE_MAX:
         raise ConfigError(f"rasterize: images of {cameras.width} x {cameras.height} px; no side may be longer than {SIDE_MAX}")
+    counted("rasterize: numbers", (images, cameras.height, cameras.width, features.shape[-1] + 1), "render fewer or smaller images")
     if not means.is_cuda and (int(state_index.min()) < 0 or int(state_index.max()) >= states):
         raise ConfigError(f"rasterize: state_index reaches outside the {states} states")
 

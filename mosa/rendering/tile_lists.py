@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from mosa.errors import DataError
+from mosa.limits import counted
 from mosa.rendering.projection_kernels import TILE
 from mosa.rendering.records import record_functions, record_type
 
@@ -73,6 +73,8 @@ def tile_lists(depths: Tensor, records: Tensor, width: int, height: int) -> tupl
     """
     images, gaussians, _ = records.shape
     number, columns, rows = images * gaussians, -(-width // TILE), -(-height // TILE)
+    last = images * rows * columns
+    counted("rasterize: Gaussians, or tiles, of all images", [max(number, last)], "render fewer at once", most=ENTRIES_MAX)  # int32
     device = wp.device_from_torch(records.device)
     scalar = wp.dtype_from_torch(records.dtype)
     count, emit = list_kernels(scalar)
@@ -83,8 +85,7 @@ def tile_lists(depths: Tensor, records: Tensor, width: int, height: int) -> tupl
     wp.launch(count, dim=number, inputs=given, outputs=[_descriptor(numbers)], device=device)
     ends = numbers.cumsum(0, dtype=torch.int64)
     total = int(ends[-1])
-    if total > ENTRIES_MAX:
-        raise DataError(f"rasterize: {total} pairs of a Gaussian and a tile, more than {ENTRIES_MAX}; render fewer images at once")
+    counted("rasterize: pairs of a Gaussian and a tile", [total], "render fewer images at once", most=ENTRIES_MAX)
     tiles, entries = torch.empty(2, 2 * total, dtype=torch.int32, device=records.device)
     wp.launch(
         emit,
@@ -93,7 +94,6 @@ def tile_lists(depths: Tensor, records: Tensor, width: int, height: int) -> tupl
         outputs=[_descriptor(tiles), _descriptor(entries)],
         device=device,
     )
-    last = images * rows * columns
     wp.utils.radix_sort_pairs(wp.from_torch(tiles), wp.from_torch(entries), total, end_bit=last.bit_length())
     marks = torch.arange(last + 1, dtype=torch.int32, device=records.device)
     starts = torch.searchsorted(tiles[:total], marks, out_int32=True)

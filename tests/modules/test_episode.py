@@ -31,6 +31,25 @@ def twin(precision=64, world=WORLD, **options):
     return Twin(body, world, FRAME_DT, {}, start(dtype=torch.float64 if precision == 64 else torch.float32))
 
 
+@pytest.mark.parametrize("adaptive", [False, True])
+@pytest.mark.parametrize("added", [1e8, 1e9, 3e38])
+def test_a_state_of_any_speed_is_refused_by_what_it_takes(added, adaptive):
+    """Read from a file as docs/twin.md shows; its window has more nodes than 64 bits count."""
+    made = twin(32)
+    made.body.settings = replace(made.body.settings, adaptive=adaptive)
+    tensors = made.reset(velocity=(0.0, -1.0, 0.0)).tensors()
+    made.state = TwinState.read({**tensors, "v": tensors["v"] + added})
+    with pytest.raises((SimulationDiverged, ConfigError), match=r"speeds (to|reach) "):
+        made.step()
+
+
+def test_a_step_that_is_too_long_for_its_speed_is_refused():
+    made = twin()
+    made.reset(velocity=(2e5, 0, 0), control_dt=1, substeps=1)
+    with pytest.raises(SimulationDiverged, match=r"particles spread over 1e\+07 x .* \(speeds to 2e\+05 m/s\): use more substeps"):
+        made.step()
+
+
 @pytest.mark.parametrize("precision", [32, 64])
 @pytest.mark.parametrize("adaptive", [False, True])
 def test_steps_are_one_long_simulation_to_the_last_bit(precision, adaptive):
@@ -373,7 +392,11 @@ def test_errors_of_starts_and_states():
         made.worlds(2).reset([{}, {"height": -1}])
     with pytest.raises(ConfigError, match=r"laws: expected one for each of 2 worlds, a tensor .*found \(3, 5\)"):
         made.worlds(2, torch.zeros(3, 5))
+    with pytest.raises(ConfigError, match=r"worlds: expected at most .*, found 1e\+09 x 120"):
+        made.worlds(10**9)
     made.reset()
+    with pytest.raises(ConfigError, match=r"state\.substeps: expected a whole number of at least 0 and at most 2\^53, found 4611"):
+        made.state = replace(made.state, substeps=torch.tensor(2**62))
     with pytest.raises(ConfigError, match=r"state\.x: expected a tensor torch.float64 \(120, 3\), found torch.float64 \(7, 3\)"):
         made.state = replace(made.state, x=torch.zeros(7, 3).double())
     with pytest.raises(DataError, match=r"state: expected .* found x"):

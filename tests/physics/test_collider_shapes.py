@@ -168,7 +168,8 @@ def test_mesh_files(tmp_path):
         (CUBE, [[c, b, a] for a, b, c in CUBE_FACES], {}, "face inwards"),
         (CUBE, [[0, 1, 9]], {}, "indices from 0 to 7"),
         (CUBE, CUBE_FACES, {"spacing": -1.0}, "spacing"),
-        (CUBE, CUBE_FACES, {"spacing": 1e-4}, "too large"),
+        (CUBE, CUBE_FACES, {"spacing": 1e-4}, "use a larger spacing"),
+        (CUBE, CUBE_FACES, {"margin": 1e12}, "use a larger spacing or a smaller margin"),
         (CUBE[:, :2], CUBE_FACES, {}, r"vertices \(P, 3\)"),
     ],
 )
@@ -188,4 +189,7 @@ def test_unreadable_files(tmp_path):
         field_of_mesh(tmp_path / "a.ply")
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3")
     with pytest.raises(ConfigError, match=r"a\.obj: mesh: expected a closed surface"):
+        field_of_mesh(tmp_path / "a.obj")
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 99999999999999999999")
+    with pytest.raises(ConfigError, match=r"a\.obj cannot be read \(OverflowError"):
         field_of_mesh(tmp_path / "a.obj")

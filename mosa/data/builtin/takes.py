@@ -5,13 +5,13 @@ from __future__ import annotations
 import functools
 import hashlib
 import logging
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from mosa.caches import cache_home
 from mosa.data.builtin.drop import simulate
 from mosa.data.builtin.objects import OBJECTS, BuiltinObject, drop_named, object_named
 from mosa.data.builtin.renderer import render_surface, ring_of_cameras
@@ -47,7 +47,7 @@ class Film:
 
 def default_cache() -> Path:
     """$XDG_CACHE_HOME/mosa or ~/.cache/mosa."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mosa"
+    return Path(cache_home()) / "mosa"
 
 
 def cameras_of(body: BuiltinObject, seed: int) -> Cameras:
@@ -93,7 +93,7 @@ def make(
         write_take(file, take)
     except OSError as error:
         raise ConfigError(
-            f"scene.cache: cannot write {file} ({error.strerror}); choose a folder with scene.cache="
+            f"scene.cache: cannot write {file} ({error.strerror}); choose a folder with XDG_CACHE_HOME or scene.cache="
         ) from error
     return take
 

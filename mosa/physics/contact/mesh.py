@@ -13,6 +13,7 @@ import warp as wp
 from torch import Tensor
 
 from mosa.errors import ConfigError, DataError
+from mosa.limits import counted
 
 MAX_LATTICE = 2**24
 FARTHEST, SMALLEST = 1e6, 1e-6
@@ -96,13 +97,11 @@ def field_of_triangles(
         raise ConfigError(f"mesh: spacing: expected a positive number [m], found {spacing}")
     margin = max(2 * spacing, extent / 6 if margin is None else margin)
     low = points.min(0) - margin
-    dims = np.ceil((points.max(0) + margin - low) / spacing) + 1
-    if not dims.prod() <= MAX_LATTICE:  # in floating point, which does not overflow
-        raise ConfigError(f"mesh: a lattice of {dims.tolist()} nodes at spacing {spacing:.3g} m is too large: use a larger spacing")
-    dims = dims.astype(int)
+    dims = counted(f"mesh: nodes at spacing {spacing:.3g} m", np.ceil((points.max(0) + margin - low) / spacing) + 1,
+                   "use a larger spacing or a smaller margin", most=MAX_LATTICE)  # fmt: skip
     axes = [low[i] + spacing * np.arange(dims[i]) for i in range(3)]
     lattice = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    values = torch.from_numpy(_signed_distance(points, index, lattice)).reshape(*dims.tolist())
+    values = torch.from_numpy(_signed_distance(points, index, lattice)).reshape(dims)
     return SignedDistanceField(values, tuple(low.tolist()), float(spacing), margin)
 
 
@@ -138,13 +137,13 @@ def field_of_mesh(path: Path, spacing: float | None = None, margin: float | None
         raise ConfigError(f"mesh: {path}: expected a file .obj or .ply")
     try:
         vertices, faces = readers[path.suffix.lower()](path)
+        triangles = np.array([(f[0], f[i], f[i + 1]) for f in faces for i in range(1, len(f) - 1)], dtype=np.int64).reshape(-1, 3)
     except DataError as error:
         raise ConfigError(f"mesh: {error}") from error
     except Exception as error:  # whatever a parser finds: the file is not what its name says
         raise ConfigError(f"mesh: {path} cannot be read ({type(error).__name__}: {error})") from error
-    triangles = [(f[0], f[i], f[i + 1]) for f in faces for i in range(1, len(f) - 1)]
     try:
-        return field_of_triangles(scale * vertices, np.array(triangles, dtype=np.int64).reshape(-1, 3), spacing, margin)
+        return field_of_triangles(scale * vertices, triangles, spacing, margin)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
+from mosa.limits import counted
 
 
 class Poses(NamedTuple):
@@ -248,6 +249,7 @@ def sample_poses(
 
     Errors: ConfigError naming a collider whose motion is not finite (a NaN would silently touch nothing).
     """
+    counted("substeps of all frames and colliders", (frames, substeps, len(motions)), "take fewer", each=3 * 8 * (3 + 9 + 3 + 3))
     return _poses([motion.sample(frames, substeps, dt, start, first) for motion in motions], dtype, device)
 
 

@@ -17,7 +17,7 @@ from mosa.errors import ConfigError, SimulationDiverged
 from mosa.physics.constitutive.laws import Law
 from mosa.physics.engine.material_operations import kirchhoff_stress
 from mosa.physics.engine.numerics import Numerics, State
-from mosa.physics.engine.time_step import VISCOUS_NUMBER, step_rate
+from mosa.physics.engine.time_step import MOST_SUBSTEPS, VISCOUS_NUMBER, step_rate
 
 STRETCH = 1e-3
 """Relative stretch of the differences that measure the stiffness: exact to 1e-6 of it in float64, 1e-4 in float32."""
@@ -116,7 +116,7 @@ class StepChooser:
         density = float(self.density[stiffest] if isinstance(self.density, Tensor) else self.density)
         if not math.isfinite(c):
             raise SimulationDiverged(f"frame {frame}: the stress of particle {stiffest} is not finite at its start")
-        needed = max(1, math.ceil(self.frame_dt * step_rate(c, mu, density, dx, fastest, control.courant)))
+        needed = max(1, math.ceil(min(1e9, self.frame_dt * step_rate(c, mu, density, dx, fastest, control.courant))))
         if needed > control.maximum:
             raise ConfigError(
                 f"simulation.max_substeps: expected at least {needed} for frame {frame}, found {control.maximum}: particle "
@@ -132,7 +132,7 @@ class StepChooser:
 def check_counts(counts, frames: int) -> list[int]:
     """Given counts of the frames - 1 intervals, as integers. Errors: ConfigError."""
     values = list(counts)
-    if len(values) != frames - 1 or any(isinstance(c, bool) or int(c) != c or c < 1 for c in values):
+    if len(values) != frames - 1 or any(isinstance(c, bool) or not 1 <= c <= MOST_SUBSTEPS or int(c) != c for c in values):
         raise ConfigError(
             f"counts: expected {frames - 1} positive whole numbers, one for each frame interval (Rollout.counts of an earlier "
             f"rollout), found {values}"

@@ -6,7 +6,6 @@ G2P -> x += dt v -> F <- map((I + dt C_affine) F), and a rollout starts with one
 the usual order, F first in a substep, cut at another place (docs/decisions.md, "Order of a substep").
 """
 
-import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,6 +16,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
+from mosa.limits import counted
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.constitutive.plasticity import YIELD_CONVENTIONS
 from mosa.physics.constitutive.strain import STRAINS
@@ -43,6 +43,7 @@ from mosa.physics.engine.material_operations import material_state
 from mosa.physics.engine.numerics import Numerics, flat
 from mosa.physics.engine.solver import SegmentSolver
 from mosa.physics.engine.stepping import Prepared, Stepper
+from mosa.physics.engine.time_step import MOST_SUBSTEPS
 from mosa.physics.launching import SCALARS
 from mosa.types import Ground, ParticleState, Rollout
 
@@ -77,9 +78,9 @@ class Simulator:
         options: LawOptions = AS_USUAL,
     ) -> None:
         self.law = law_named(law)
-        for name, value in (("dx", dx), ("frame_dt", frame_dt), ("substeps", substeps)):
-            if not (math.isfinite(value) and value > 0):
-                raise ConfigError(f"{name}: expected a positive number, found {value}")
+        for name, value, most in (("dx", dx, 1e300), ("frame_dt", frame_dt, 1e300), ("substeps", substeps, MOST_SUBSTEPS)):
+            if not 0 < value <= most:
+                raise ConfigError(f"{name}: expected a positive number of at most {most:g}, found {value}")
         if strain is not None and (strain not in STRAINS or "mu" not in self.law.offsets or self.law.viscosity is not None):
             if strain not in STRAINS:
                 raise ConfigError(f"strain: expected one of {', '.join(STRAINS)} or None, found {strain!r}")
@@ -272,6 +273,7 @@ class Simulator:
         if (frames is not None and frames < 1) or (stride is not None and stride < 1):
             raise ConfigError(f"frames and stride: expected at least 1, found {frames} and {stride}")
         check_state(self.numerics, state, volume)
+        counted("particles of all frames", (frames or 1, *state.x.shape[:-1]), "take fewer", each=4 * (3 + 3 + 9 + 9))
         volume, n, count = volume.detach().contiguous(), len(volume), worlds or 1
         density, mean_mass = checked_density(density, volume)
         F = state.F if worlds is None else state.F.flatten(0, 1)

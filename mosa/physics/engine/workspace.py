@@ -13,7 +13,9 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from mosa.errors import SimulationDiverged
 from mosa.exact_sums import COLUMNS, needed
+from mosa.limits import counted
 from mosa.physics.constitutive.laws import SLOTS
 from mosa.physics.constitutive.material_kernels import kernels_of
 from mosa.physics.contact.collider_buffers import ColliderBuffers
@@ -174,6 +176,8 @@ class Workspace:
         self.adj_grid = self.adj_grid_wp = self.adj_velocity_wp = None
         # where only the last one is wanted a second one, which is cleared while the first is read
         grids, vec4 = self.substeps if self.with_adjoint else 2, self.kernels.vec4
+        each = 8 * self.numerics.dtype.itemsize
+        counted("kept grid nodes", (grids, count), "use more substeps, or a box", each=each, error=SimulationDiverged)
         self.fields = torch.zeros((2, grids, count, 4), dtype=self.numerics.dtype, device=self.numerics.device)
         self.grid_wp, self.velocity_wp = ([wp.from_torch(t, dtype=vec4) for t in slots] for slots in self.fields)
         if self.exact:

@@ -37,6 +37,7 @@ def fallen(bounds: np.ndarray, gravity: np.ndarray, time: float) -> np.ndarray:
     return bounds
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def grid_window(
     x: Tensor, v: Tensor, dx: float, time: float, margin: int, bounds: np.ndarray | None = None,
     name: Callable[[int], str] = lambda world: "",
@@ -54,29 +55,25 @@ def grid_window(
         bad = int((~(torch.isfinite(x).all(1) & torch.isfinite(v).all(1))).nonzero()[0])
         raise SimulationDiverged(f"{name(world)}particle {bad} has a non-finite position or velocity before the substep")
     low, dims = window_of(bounds, dx, time, margin)
-    far = np.abs(low).max(-1) + dims.max(-1)
-    if far.max() > FARTHEST:
-        world = int(np.argmax(far))
+    # as shares of the most; NaN, of infinite ends, is too much as well
+    most = np.maximum(dims.prod(-1) / MAX_NODES, (np.abs(low).max(-1) + dims.max(-1)) / FARTHEST)
+    if not (most.max() <= 1 and dims.prod(-1).sum() <= MOST_NODES):
+        world = int(np.argmax(most))
+        spread = " x ".join(f"{n:.6g}" for n in dims.reshape(-1, 3)[world])
+        reach, speed = np.abs(rows[world].reshape(2, 6)).max(1)
         raise SimulationDiverged(
-            f"{name(world)}a particle is {np.abs(rows[world, :6]).max():.3g} m from the origin, more than {FARTHEST} nodes of {dx} "
-            "m: use more substeps, or a box"
+            f"{name(world)}particles spread over {spread} grid nodes of {dx} m, to {reach:.3g} m from the origin (speeds to "
+            f"{speed:.3g} m/s): use more substeps, or a box"
         )
-    nodes = dims.prod(-1)
-    if nodes.max() > MAX_NODES or nodes.sum() > MOST_NODES:
-        world = int(np.argmax(nodes))
-        raise SimulationDiverged(
-            f"{name(world)}particles spread over {dims.reshape(-1, 3)[world].tolist()} grid nodes of {dx} m (speeds to "
-            f"{np.abs(rows[world, 6:]).max():.3g} m/s): use more substeps, or a box"
-        )
-    return low, dims
+    return low.astype(np.int64), dims.astype(np.int64)
 
 
 def window_of(bounds: np.ndarray, dx: float, time: float | np.ndarray, margin: int) -> tuple[np.ndarray, np.ndarray]:
-    """As `grid_window`, of extents (..., 12) and of any size; time: one, or some that broadcast with (..., 1)."""
+    """As `grid_window`, of extents (..., 12) and of any size, in float64; time: one, or some that broadcast with (..., 1)."""
     bounds = np.asarray(bounds, dtype=np.float64)
     speeds = _OUTWARDS * bounds[..., 6:]
     turned = TURNED * np.abs(speeds).max(-1, keepdims=True)  # by the largest component of a velocity
     ahead = np.ceil(np.maximum(GAINED * speeds, turned) * time / dx) + margin
     cells = np.floor(bounds[..., :6] / dx - 0.5)
     low, high = cells[..., :3] - ahead[..., :3], cells[..., 3:] + 2 + ahead[..., 3:]
-    return low.astype(np.int64), (high - low + 1).astype(np.int64)
+    return low, high - low + 1
