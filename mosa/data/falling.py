@@ -34,6 +34,10 @@ SWAPPED = 3.0
 """Factor by which swapping two frames makes a track smoother from which on they are swapped. It is 0.9 to 1.02 for films as they
 are; two swapped frames of the bird give 1.0 (at rest) to 100."""
 
+COARSE, ABRUPT, MOVED = 160, 10.0, 0.1
+"""Pictures are compared at about so many pixels across. They stop where they change that many times less than in the frame beside;
+radii that the object then moves at least where data are refused."""
+
 
 SIZES, FASTEST = (1e-4, 1e3), 1e3
 """[m], [m/s]: what cameras around an object film as it falls and deforms lies far inside."""
@@ -97,9 +101,6 @@ def parabola(track: Track, frames: int) -> tuple[Tensor, float]:
 
 def check_fall(scene: Scene, label: str) -> None:
     """The film is one of an object that falls and meets the ground. Errors: DataError naming what contradicts it, and the keys."""
-    same = scene.images[:, 1:] == scene.images[:, :-1]
-    if bool(same.all()):
-        raise DataError(f"{label}: all {scene.frames} frames are identical: expected a film of a moving object")
     track = track_of(scene)
     g = float(scene.gravity.double().norm())
     if track is None:
@@ -116,6 +117,45 @@ def check_fall(scene: Scene, label: str) -> None:
     check_order(scene, track, label)
     check_rate(scene, track, label, g)
     check_direction(scene, track, label, g)
+
+
+def check_still(scene: Scene, label: str) -> None:
+    """Neither all cameras nor one of them show a picture again while the object moves. A body at rest looks the same for long, to the
+    bit where a renderer made the film: what counts is that pictures stop, or go on, from one frame to the next.
+
+    Errors: DataError naming the frames, and the camera where others go on; a warning where the object moves little."""
+    step = math.ceil(max(scene.mattes.shape[2:]) / COARSE)
+    mattes, images = scene.mattes[..., ::step, ::step] > 0.5, scene.images[..., ::step, ::step, :]
+    either = mattes[:, 1:] | mattes[:, :-1]
+    change = ((images[:, 1:] - images[:, :-1]).abs().mean(4) * either).sum((2, 3)) / either.sum((2, 3)).clamp(min=1)
+    if not bool(change.any()):
+        raise DataError(f"{label}: all {scene.frames} frames are identical: expected a film of a moving object")
+    track = track_of(scene)
+    if track is None:
+        return
+    same = change <= torch.minimum(2 * change.amin(1, keepdim=True), change.amax(1, keepdim=True) / ABRUPT)
+    moves, fall = track.points.diff(dim=0), float(scene.gravity.double().norm()) * track.dt**2
+    for v, row in enumerate([same.all(0), *(same & either.any(3).any(2) & ~same.all(0))], -1):
+        of = change if v < 0 else change[v : v + 1]
+        ends = torch.nn.functional.pad(row.int(), (1, 1)).diff().nonzero()[:, 0].tolist()
+        for first, last in zip(ends[::2], ends[1::2]):
+            level = float(of[:, first:last].max())
+            sides = [k for k in (first - 1, last) if 0 <= k < len(row) and float(of[:, k].min()) > ABRUPT * level]
+            if v >= 0:
+                moved = float((track.points[first : last + 1] - track.points[first]).norm(dim=1).max()) * (level == 0 or bool(sides))
+                found = f"camera {scene.cameras.names[v]} shows one picture in frames {first} to {last}, while others see the object move"
+            elif last == first + 1 and len(sides) == 2 and float(moves[sides[0]] @ moves[sides[1]]) < 0:
+                continue  # where it turns round it may look the same before and after
+            else:  # what is let go begins to move from one frame to the next
+                moved = max((float(moves[k].norm()) - fall * (k == last) for k in sides), default=0.0)
+                found = f"all cameras show one picture in frames {first} to {last}, and from one frame to the next the object moves"
+            said = (f"{label}: {found} by {moved:.3g} m (its radius is {track.radius:.3g} m; {len(ends) // 2} such stretches): expected a "
+                    "new picture in every frame: a frozen recording, or one brought to another frame rate? Restrict scene.frames"
+                    + (f", or leave it out with scene.holdout_cameras=[{scene.cameras.names[v]}]" if v >= 0 else ""))
+            if moved > MOVED * track.radius:
+                raise DataError(said)
+            if moved > track.noise:
+                warnings.warn(said, stacklevel=3)
 
 
 def check_size(track: Track, label: str) -> None:
@@ -176,18 +216,21 @@ def check_direction(scene: Scene, track: Track, label: str, g: float) -> None:
 
 
 def check_order(scene: Scene, track: Track, label: str) -> None:
-    """No two frames in each other's place."""
+    """No two frames in each other's place, and no stretch in reverse."""
     fall = scene.gravity.double() * track.dt**2
 
     def rough(points: Tensor) -> float:
         return float((points[2:] - 2 * points[1:-1] + points[:-2] - fall).square().sum())
 
-    now, best, pair = rough(track.points), math.inf, (0, 0)
+    now, best, pair = rough(track.points), math.inf, (0, 0, "")
     for i, j in combinations(range(scene.frames), 2):
-        swapped = track.points.clone()
+        swapped, reverse = track.points.clone(), track.points.clone()
         swapped[[i, j]] = track.points[[j, i]]
-        best, pair = min((best, pair), (rough(swapped), (i, j)))
+        best, pair = min((best, pair), (rough(swapped), (i, j, f"frames {i} and {j} seem to be in each other's place: swapping")))
+        if 3 <= j - i < scene.frames - 1:
+            reverse[i : j + 1] = track.points[i : j + 1].flip(0)
+            best, pair = min((best, pair), (rough(reverse), (i, j, f"frames {i} to {j} seem to be in reverse order: turning")))
     floor = 6 * scene.frames * track.noise**2  # of second differences of noise
     if now > SWAPPED * (best + floor):
-        raise DataError(f"{label}: frames {pair[0]} and {pair[1]} seem to be in each other's place: swapping them makes the "
-                        f"object's path {now / best:.3g} times smoother; put them in order, or restrict scene.frames")
+        raise DataError(f"{label}: {pair[2]} them makes the object's path {now / best:.3g} times smoother; put them in order, or "
+                        "restrict scene.frames")

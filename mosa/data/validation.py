@@ -9,9 +9,10 @@ import warnings
 import torch
 
 from mosa.data.agreement import check_agreement, holes_report
-from mosa.data.falling import check_fall
+from mosa.data.falling import check_fall, check_still
 from mosa.data.footage import TIME_JITTER
 from mosa.data.outlines import check_outlines, check_particles
+from mosa.data.tangents import check_pictures
 from mosa.errors import DataError
 from mosa.types import Scene
 
@@ -56,6 +57,8 @@ def validate(scene: Scene) -> Scene:
     check_mattes(scene, label)
     check_borders(scene, label)
     check_agreement(scene, label)
+    check_still(scene, label)
+    check_pictures(scene, label)
     for frame in range(1, scene.frames):
         check_agreement(scene, label, frame)
     check_fall(scene, label)
