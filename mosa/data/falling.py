@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from itertools import combinations
+from itertools import combinations, pairwise
 from typing import NamedTuple
 
 import torch
@@ -105,6 +105,7 @@ def check_fall(scene: Scene, label: str) -> None:
     g = float(scene.gravity.double().norm())
     if track is None:
         return
+    check_still(scene, track, label)
     check_size(track, label)
     if g == 0:
         for frames in range(3, scene.frames + 1):
@@ -119,43 +120,30 @@ def check_fall(scene: Scene, label: str) -> None:
     check_direction(scene, track, label, g)
 
 
-def check_still(scene: Scene, label: str) -> None:
-    """Neither all cameras nor one of them show a picture again while the object moves. A body at rest looks the same for long, to the
-    bit where a renderer made the film: what counts is that pictures stop, or go on, from one frame to the next.
-
-    Errors: DataError naming the frames, and the camera where others go on; a warning where the object moves little."""
+def check_still(scene: Scene, track: Track, label: str) -> None:
+    """The pictures go on while the object moves. Of a body at rest they may be alike to the bit: what counts is that those of all
+    cameras stop, or go on, from one frame to the next. Errors: DataError naming the frames."""
     step = math.ceil(max(scene.mattes.shape[2:]) / COARSE)
-    mattes, images = scene.mattes[..., ::step, ::step] > 0.5, scene.images[..., ::step, ::step, :]
-    either = mattes[:, 1:] | mattes[:, :-1]
-    change = ((images[:, 1:] - images[:, :-1]).abs().mean(4) * either).sum((2, 3)) / either.sum((2, 3)).clamp(min=1)
+    frames = [(scene.images[:, t, ::step, ::step], scene.mattes[:, t, ::step, ::step] > 0.5) for t in range(scene.frames)]
+    change = torch.stack([((b - a).abs().mean(3) * (m | n)).sum() / (m | n).sum() for (a, m), (b, n) in pairwise(frames)])
     if not bool(change.any()):
         raise DataError(f"{label}: all {scene.frames} frames are identical: expected a film of a moving object")
-    track = track_of(scene)
-    if track is None:
-        return
-    same = change <= torch.minimum(2 * change.amin(1, keepdim=True), change.amax(1, keepdim=True) / ABRUPT)
+    same = change <= torch.minimum(2 * change.min(), change.max() / ABRUPT)
+    ends = torch.nn.functional.pad(same.int(), (1, 1)).diff().nonzero()[:, 0].tolist()
     moves, fall = track.points.diff(dim=0), float(scene.gravity.double().norm()) * track.dt**2
-    for v, row in enumerate([same.all(0), *(same & either.any(3).any(2) & ~same.all(0))], -1):
-        of = change if v < 0 else change[v : v + 1]
-        ends = torch.nn.functional.pad(row.int(), (1, 1)).diff().nonzero()[:, 0].tolist()
-        for first, last in zip(ends[::2], ends[1::2]):
-            level = float(of[:, first:last].max())
-            sides = [k for k in (first - 1, last) if 0 <= k < len(row) and float(of[:, k].min()) > ABRUPT * level]
-            if v >= 0:
-                moved = float((track.points[first : last + 1] - track.points[first]).norm(dim=1).max()) * (level == 0 or bool(sides))
-                found = f"camera {scene.cameras.names[v]} shows one picture in frames {first} to {last}, while others see the object move"
-            elif last == first + 1 and len(sides) == 2 and float(moves[sides[0]] @ moves[sides[1]]) < 0:
-                continue  # where it turns round it may look the same before and after
-            else:  # what is let go begins to move from one frame to the next
-                moved = max((float(moves[k].norm()) - fall * (k == last) for k in sides), default=0.0)
-                found = f"all cameras show one picture in frames {first} to {last}, and from one frame to the next the object moves"
-            said = (f"{label}: {found} by {moved:.3g} m (its radius is {track.radius:.3g} m; {len(ends) // 2} such stretches): expected a "
-                    "new picture in every frame: a frozen recording, or one brought to another frame rate? Restrict scene.frames"
-                    + (f", or leave it out with scene.holdout_cameras=[{scene.cameras.names[v]}]" if v >= 0 else ""))
-            if moved > MOVED * track.radius:
-                raise DataError(said)
-            if moved > track.noise:
-                warnings.warn(said, stacklevel=3)
+    for first, last in zip(ends[::2], ends[1::2]):
+        level = ABRUPT * float(change[first:last].max())
+        sides = [k for k in (first - 1, last) if 0 <= k < len(change) and float(change[k]) > level]
+        if last == first + 1 and len(sides) == 2 and float(moves[sides[0]] @ moves[sides[1]]) < 0:
+            continue  # where it turns round it may look the same before and after
+        moved = max((float(moves[k].norm()) - fall * (k == last) for k in sides), default=0.0)  # what is let go starts to fall
+        said = (f"{label}: expected new pictures, found the same in frames {first} to {last} of all cameras, while the object moves by "
+                f"{moved:.3g} m in a frame beside ({len(ends) // 2} such stretches): did the recording freeze, or was it "
+                "brought to another frame rate? Leave these frames out (scene.frames), or each one that is there again")
+        if moved > MOVED * track.radius:
+            raise DataError(said)
+        if moved > track.noise:
+            warnings.warn(said, stacklevel=4)
 
 
 def check_size(track: Track, label: str) -> None:
@@ -209,6 +197,8 @@ def check_direction(scene: Scene, track: Track, label: str, g: float) -> None:
     beyond = float(energy[last] - 3 * error[last]) > start + 3 * float(error[0])
     found = (f"{label}: the object has {float(energy[last]):.3g} J/kg in frames {last} to {last + 1}, {start:.3g} at the start: "
              "expected a fall, in which the ground takes energy")
+    if scene.ground is not None and float(track.low[0]) < scene.ground.height + 0.3 * track.radius:
+        found += "; it touches the ground in frame 0: does the film begin after contact (start it earlier, scene.frames)? If not"
     if beyond and float(energy[last]) > SURE * start:
         raise DataError(f"{found}; a film that runs backwards (times negated, frames in descending order)?")
     if beyond and float(energy[last]) > SUSPECT * start:

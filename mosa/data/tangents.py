@@ -1,8 +1,8 @@
-"""Does each picture show what the other cameras see at that moment? Frozen, exchanged, mirrored and shifted pictures do not.
+"""Does each picture show what the other cameras see at that moment? Frozen, exchanged, mirrored and shifted ones do not.
 
-Of all planes through two cameras, the first and the last that meet the object touch both of its outlines, whatever its shape. Each
-pair of cameras so compares two angles a frame, to a fraction of a pixel; of a camera that disagrees with most others, its own
-pictures are tried mirrored, at other frames and in other cameras' places.
+Of all planes through two cameras the first and the last that meet the object touch both of its outlines, whatever its shape: each
+pair of cameras compares two angles a frame, to a fraction of a pixel. Outlines of a camera that disagrees with most others are
+tried mirrored, in other cameras' places and at other frames.
 """
 
 from __future__ import annotations
@@ -13,16 +13,15 @@ import cv2
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize, pad
 
 from mosa.data.agreement import lines_of_sight, misses
 from mosa.errors import DataError
 from mosa.types import Scene
 
-TRIED, SUSPECT, WRONG = 0.04, 0.08, 0.3
-"""Radii of the object by which an outline may miss what most other cameras see: beyond them another place is tried, data are warned
-of, and refused. In films as they are it is at most 0.04 (docs/data.md)."""
-USUAL = 4.0
-"""Times the film's own median that it may be in any case: coarse pictures and calibrations have more. It is 3 at most there."""
+TRIED, SUSPECT, USUAL = 0.04, 0.08, 4.0
+"""Radii by which an outline may miss what most others see: beyond them another place is tried for it, and data are warned of; and
+times the film's median that it may in any case. In films as they are: at most 0.04, and three times the median (docs/data.md)."""
 EXPLAINED = 3.0
 """Factor by which outlines fit better elsewhere from which on that is where they belong."""
 NEAR, WIDE = 2.0, 2.0
@@ -30,15 +29,14 @@ NEAR, WIDE = 2.0, 2.0
 
 
 class Tangents:
-    """outlines: [V][T] corners (n, 2) [px] of the mattes' convex hulls; angles: (V, V, T, 2) [rad] of the planes that touch the first
-    camera's outline and contain the second camera; reach: (V, V, T) radii of the object in a radian. NaN where they do not compare.
-    """
+    """outlines: [V][T] corners (n, 2) [px] of the mattes' convex hulls; angles: (V, V, T, 2) [rad] of the planes that touch the
+    first camera's and contain the second; reach: (V, V, T) radii of the object in a radian. NaN where two do not compare."""
 
     def __init__(self, scene: Scene) -> None:
         V, T, self.width = len(scene.cameras), scene.frames, scene.cameras.width
         self.K, self.rotation = scene.cameras.K.double(), scene.cameras.w2c[:, :3, :3].double()
         place = -(self.rotation.transpose(1, 2) @ scene.cameras.w2c[:, :3, 3:].double())[..., 0]
-        axis = torch.nn.functional.normalize(place[None] - place[:, None], dim=2)
+        axis = normalize(place - place[:, None], dim=2)
         axis = torch.where(torch.ones(V, V).triu()[..., None] > 0, axis, -axis)  # one direction for both cameras of a pair
         self.outlines = [[outline_of(matte) for matte in mattes] for mattes in scene.mattes]
         self.angles, self.reach = torch.full((V, V, T, 2), torch.nan).double(), torch.full((V, V, T), torch.nan).double()
@@ -51,7 +49,7 @@ class Tangents:
             arm = point - place[:, None]
             arm = arm - (arm * axis).sum(2, keepdim=True) * axis
             if self.ahead is None:
-                self.ahead = torch.nn.functional.normalize(arm, dim=2)
+                self.ahead = normalize(arm, dim=2)
                 self.aside = torch.linalg.cross(axis, self.ahead)
             reach = arm.norm(dim=2) / (radii * (point - origins).norm(dim=1)).median()
             self.reach[..., t] = torch.where((reach > NEAR) & ~torch.eye(V, dtype=torch.bool), reach, torch.nan)
@@ -60,10 +58,10 @@ class Tangents:
 
     def touching(self, outline: Tensor, camera: int) -> Tensor:
         """Angles (V, 2) of an outline (n, 2), were it that camera's."""
-        rays = torch.nn.functional.pad(outline, (0, 1), value=1.0) @ torch.linalg.inv(self.K[camera]).T @ self.rotation[camera]
+        rays = pad(outline, (0, 1), value=1.0) @ torch.linalg.inv(self.K[camera]).T @ self.rotation[camera]
         angle = torch.atan2(rays @ self.aside[camera].T, rays @ self.ahead[camera].T)
         span = torch.stack([angle.amin(0), angle.amax(0)], 1)
-        return torch.where((span[:, 1:] - span[:, :1]) < WIDE, span, torch.nan)
+        return torch.where(span.diff(dim=1) < WIDE, span, torch.nan)
 
     def misfits(self) -> Tensor:
         """Radii (V, T) by which an outline misses what most other cameras see; NaN where fewer than two compare."""
@@ -73,10 +71,11 @@ class Tangents:
     def misfit(self, outline: Tensor, camera: int, frame: int) -> float:
         """The same of an outline (n, 2), were it that camera's in that frame; infinite where nothing compares."""
         off = (self.touching(outline, camera) - self.angles[:, camera, frame]).abs().amax(1) * self.reach[camera, :, frame]
-        return float(off.nanmedian().nan_to_num(torch.inf))
+        known = sorted(off[off.isfinite()].tolist())
+        return known[len(known) // 2] if known else torch.inf  # of two the larger: either may fit by chance
 
     def explanation(self, camera: int, frames: list[int], names: tuple[str, ...]) -> tuple[float, str]:
-        """Where the outlines of a camera's frames fit best, and by how many radii they miss there."""
+        """By how many radii the outlines of a camera's frames miss where they fit best, and where that is."""
         own = [self.outlines[camera][t] for t in frames]
         mirrored = [torch.stack([self.width - outline[:, 0], outline[:, 1]], 1) for outline in own]
         tried = [([self.misfit(each, camera, t) for each, t in zip(mirrored, frames)], "mirrored")]
@@ -101,24 +100,24 @@ def listed(frames: list[int]) -> str:
 
 
 def check_pictures(scene: Scene, label: str) -> None:
-    """Every outline is one that the other cameras leave room for, at that moment. Errors: DataError naming camera and frames, and
-    what its pictures are where that is found. Silent where fewer than three mattes of a frame are whole."""
-    tangents = Tangents(scene)
+    """Every outline ends where the other cameras' at that moment say. Errors: DataError naming camera and frames where its pictures
+    fit elsewhere; a warning where they fit nowhere. Silent where fewer than three mattes of a frame are whole."""
+    tangents, names, worst = Tangents(scene), scene.cameras.names, (0.0, "")
     off = tangents.misfits().nan_to_num(0.0)
-    usual = float(off[off > 0].median()) if bool((off > 0).any()) else 0.0
-    flagged = off > max(TRIED, USUAL * usual)
-    for v in off.amax(1).argsort(descending=True).tolist():
-        frames, name = flagged[v].nonzero()[:, 0].tolist(), scene.cameras.names[v]
-        if not frames:
+    limit = max(TRIED, USUAL * float(off[off > 0].median())) if bool((off > 0).any()) else TRIED
+    for v, row in enumerate(off):
+        if not (frames := (row > limit).nonzero()[:, 0].tolist()):
             continue
-        far, (better, place) = float(off[v].max()), tangents.explanation(v, frames, scene.cameras.names)
-        sure = better < float(off[v, frames].median()) / EXPLAINED
-        said = (f"{label}: camera {name}, {listed(frames)}: the outlines are not what most other cameras see at that moment: expected "
-                f"them to meet, found them up to {far:.2g} of the object's radius apart"
-                + (f"; {place} they fit to {better:.2g}: put the right pictures there" if sure else ": another moment, another "
-                   "camera's pictures, mirrored or shifted ones, a matte that misses a part, or a pose that is off?")
-                + f"; leave the camera out with scene.holdout_cameras=[{name}], or the frames with scene.frames")
-        if sure or far > WRONG:
+        better, place = tangents.explanation(v, frames, names)
+        sure = better < min(limit, float(row[frames].median()) / EXPLAINED)
+        said = (f"{label}: camera {names[v]}, {listed(frames)}: expected outlines that end where most other cameras' say, found "
+                f"them up to {float(row.max()):.2g} of the object's radius beside"
+                + (f"; {place} they fit to {better:.2g}: put the right pictures there" if sure else ": another moment or camera, "
+                   "mirrored or shifted pictures, a matte with a part too many or too few, or a pose that is off?")
+                + f"; or leave out the camera (scene.holdout_cameras=[{names[v]}]) or the frames (scene.frames)")  # fmt: skip
+        if sure:
             raise DataError(said)
-        if far > SUSPECT:
-            warnings.warn(said, stacklevel=3)
+        worst = max(worst, (float(row.max()), said))
+    if worst[0] > SUSPECT:
+        many = int((off.amax(1) > limit).sum())
+        warnings.warn(worst[1] + f" ({many} cameras have such frames)" * (many > 1), stacklevel=4)

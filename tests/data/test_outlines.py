@@ -62,7 +62,7 @@ def shifted(height):
 
 Z_UP = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
 WRONG = {
-    "exchanged": (exchanged("0", "2"), "the outlines of frame"),
+    "exchanged": (exchanged("0", "2"), "camera 0, frames 0 to 4: .* as pictures of camera 2 they fit to 0.0"),
     "mirrored": (mirrored, "the outlines of frame"),
     "another axis is up": (moved(Z_UP), "scene.ground.height: expected the object above the ground"),
     "the ground is higher": (shifted(-0.15), "scene.ground.height: expected the object above the ground"),
