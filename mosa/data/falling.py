@@ -137,8 +137,8 @@ def check_still(scene: Scene, track: Track, label: str) -> None:
         if last == first + 1 and len(sides) == 2 and float(moves[sides[0]] @ moves[sides[1]]) < 0:
             continue  # where it turns round it may look the same before and after
         moved = max((float(moves[k].norm()) - fall * (k == last) for k in sides), default=0.0)  # what is let go starts to fall
-        said = (f"{label}: expected new pictures, found the same in frames {first} to {last} of all cameras, while the object moves by "
-                f"{moved:.3g} m in a frame beside ({len(ends) // 2} such stretches): did the recording freeze, or was it "
+        said = (f"{label}: expected new pictures, found the same in frames {first} to {last} of all cameras, and an object moving "
+                f"by {moved:.3g} m in a frame beside ({len(ends) // 2} such stretches): did the recording freeze, or was it "
                 "brought to another frame rate? Leave these frames out (scene.frames), or each one that is there again")
         if moved > MOVED * track.radius:
             raise DataError(said)

@@ -193,7 +193,8 @@ def group(shots: list[Shot], file: Path) -> tuple[dict[str, Shot], dict[str, lis
                 raise DataError(f"{shot.where}: camera {name} has {key} = {shot.intrinsics.get(key)}, {known.intrinsics.get(key)} "
                                 f"in {known.where}: expected one lens, focus and zoom a camera; write one set in all its entries")
         off, where = max(((apart(known, shot), shot.where) for shot in others), default=(0.0, ""))
-        found = f"{where}: camera {name} is {off:.2%} (of a radian, or the cameras' distances) from its pose in {known.where}"
+        found = (f"{where}: camera {name} has another pose than in {known.where}, {off:.2%} away (of a radian, or of the cameras' "
+                 "distance from their middle)")
         if off > JITTER:
             raise DataError(f"{found}; cameras must not move")
         if off > 1e-5:

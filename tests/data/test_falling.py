@@ -138,7 +138,7 @@ def test_a_camera_that_is_a_frame_late_is_named(scene):
     order = [0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10]
     mattes = scene.mattes.clone()
     mattes[1] = scene.mattes[1, order]
-    with pytest.raises(DataError, match=r"camera 1, frames 1 to 11: .* as pictures of frames 0 to 10 they fit to 0.0"):
+    with pytest.raises(DataError, match=r"camera 1, frames 4 to 11: .* as pictures of frames 3 to 10 they fit to 0.0"):
         validate(replace(scene, mattes=mattes))
 
 
