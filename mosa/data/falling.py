@@ -197,12 +197,13 @@ def check_direction(scene: Scene, track: Track, label: str, g: float) -> None:
     beyond = float(energy[last] - 3 * error[last]) > start + 3 * float(error[0])
     found = (f"{label}: the object has {float(energy[last]):.3g} J/kg in frames {last} to {last + 1}, {start:.3g} at the start: "
              "expected a fall, in which the ground takes energy")
+    cause = "a film that runs backwards (times negated, frames in descending order)?"
     if scene.ground is not None and float(track.low[0]) < scene.ground.height + 0.3 * track.radius:
-        found += "; it touches the ground in frame 0: does the film begin after contact (start it earlier, scene.frames)? If not"
+        cause = "a film that begins after contact (start it earlier, scene.frames), or one that runs backwards?"
     if beyond and float(energy[last]) > SURE * start:
-        raise DataError(f"{found}; a film that runs backwards (times negated, frames in descending order)?")
+        raise DataError(f"{found}; {cause}")
     if beyond and float(energy[last]) > SUSPECT * start:
-        warnings.warn(f"{found}; does the film run backwards?", stacklevel=4)
+        warnings.warn(f"{found}; {cause}", stacklevel=4)
 
 
 def check_order(scene: Scene, track: Track, label: str) -> None:

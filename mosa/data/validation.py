@@ -105,14 +105,16 @@ def check_cameras(scene: Scene, label: str) -> None:
         if float((R @ R.T - torch.eye(3, dtype=R.dtype)).abs().max()) > 2e-3 or float(torch.linalg.det(R)) < 0:
             raise DataError(f"{label}: camera {name}: expected a rotation in its pose, found {R.tolist()}")
         cx, cy = cameras.K[v, 0, 2].item(), cameras.K[v, 1, 2].item()
-        said = (f"{label}: camera {name}: the principal point cx, cy = ({cx:.1f}, {cy:.1f}) px lies %s of its {cameras.width}x"
-                f"{cameras.height} px images: ")
-        if centred := max(abs(cx) / cameras.width, abs(cy) / cameras.height) < CORNER:
-            said += "measured from their centre? Expected from the upper left corner, so add half of the images' size"
-        if not (0 < cx < cameras.width and 0 < cy < cameras.height):
-            raise DataError(said % "outside" + "intrinsics of another resolution?" * (not centred))
+        inside = 0 < cx < cameras.width and 0 < cy < cameras.height
+        centred = max(abs(cx) / cameras.width, abs(cy) / cameras.height) < CORNER
+        said = (f"{label}: camera {name}: the principal point cx, cy = ({cx:.1f}, {cy:.1f}) px lies "
+                f"{'in the corner' if inside else 'outside'} of its {cameras.width}x{cameras.height} px images: ")
+        said += ("measured from their centre? Expected from the upper left corner: add half of their size" if centred else
+                 "intrinsics of another resolution?")
+        if not inside:
+            raise DataError(said)
         if centred:
-            warnings.warn(said % "in the corner", stacklevel=3)
+            warnings.warn(said, stacklevel=3)
 
 
 def check_pixels(K: torch.Tensor, label: str) -> None:

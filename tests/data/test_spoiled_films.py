@@ -172,7 +172,7 @@ def test_a_camera_that_is_held_out_may_be_wrong(scene):
         warnings.simplefilter("always")
         assert validate(spoiled_one) is spoiled_one
     assert len(found) == 1
-    assert re.search("camera 3, frames 1, 2, 4: .* nothing is learned from cameras that are held out", str(found[0].message))
+    assert re.search("camera 3, frames 1, 2, 4: .*nothing is learned from cameras that are held out", str(found[0].message))
 
 
 def test_a_body_at_rest_may_look_the_same_to_the_bit(scene):
