@@ -130,6 +130,12 @@ def check_still(scene: Scene, track: Track, label: str) -> None:
         raise DataError(f"{label}: all {scene.frames} frames are identical: expected a film of a moving object")
     same = change <= torch.minimum(2 * change.min(), change.max() / ABRUPT)
     ends = torch.nn.functional.pad(same.int(), (1, 1)).diff().nonzero()[:, 0].tolist()
+    seen = [images.numpy().tobytes() for images, _ in frames]
+    for t, first in ((t, seen.index(each)) for t, each in enumerate(seen)):
+        away = float((track.points[first : t + 1] - track.points[t]).norm(dim=1).max())
+        if away > MOVED * track.radius and change[first:t].any():
+            raise DataError(f"{label}: expected new pictures, found those of frame {first} in frame {t} of all cameras again, after "
+                            f"the object was {away:.3g} m away: is a part of the film there twice? Leave it out (scene.frames)")
     moves, fall = track.points.diff(dim=0), float(scene.gravity.double().norm()) * track.dt**2
     for first, last in zip(ends[::2], ends[1::2]):
         level = ABRUPT * float(change[first:last].max())
