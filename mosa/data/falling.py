@@ -134,7 +134,7 @@ def check_still(scene: Scene, track: Track, label: str) -> None:
     for t, first in ((t, seen.index(each)) for t, each in enumerate(seen)):
         away = float((track.points[first : t + 1] - track.points[t]).norm(dim=1).max())
         if away > MOVED * track.radius and change[first:t].any():
-            raise DataError(f"{label}: expected new pictures, found those of frame {first} in frame {t} of all cameras again, after "
+            raise DataError(f"{label}: expected new pictures, found those of frame {first} in frame {t} of all cameras, after "
                             f"the object was {away:.3g} m away: is a part of the film there twice? Leave it out (scene.frames)")
     moves, fall = track.points.diff(dim=0), float(scene.gravity.double().norm()) * track.dt**2
     for first, last in zip(ends[::2], ends[1::2]):

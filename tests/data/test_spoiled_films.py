@@ -133,7 +133,7 @@ SPOILED = {
         [5], lambda x: torch.cat([x[:3], x[3:].flip(2)]), "camera 5, frames 3 to 4: .*; mirrored they fit to 0.0"),
     "one camera is shifted": ([0], lambda x: x.roll(3, 2), "camera 0, frames 0 to 4: .*: another moment or camera, mirrored or"),
     "all cameras freeze": (range(6), lambda x: x[HELD], "found the same in frames 3 to 4 of all cameras"),
-    "all cameras begin again": (range(6), lambda x: x[[0, 1, 2, 0, 1]], "those of frame 0 in frame 3 of all cameras again"),
+    "all cameras begin again": (range(6), lambda x: x[[0, 1, 2, 0, 1]], "those of frame 0 in frame 3 of all cameras, after"),
     "all frames are doubled": (range(6), lambda x: x[[0, 0, 1, 1, 2]], r"in frames 0 to 1 of all cameras, .*\(2 such stretches\)"),
 }  # fmt: skip
 
