@@ -24,6 +24,8 @@ TRIED, SUSPECT, USUAL = 0.04, 0.08, 4.0
 times the film's median that it may in any case. In films as they are: at most 0.04, and three times the median (docs/data.md)."""
 EXPLAINED = 3.0
 """Factor by which outlines fit better elsewhere from which on that is where they belong."""
+COPY = 0.1
+"""Difference of colours of 0 to 1 below which a picture is another's copy, written anew."""
 NEAR, WIDE = 2.0, 2.0
 """Radii from the line through two cameras below which, and angle [rad] of the object about it above which, they do not compare."""
 
@@ -74,12 +76,13 @@ class Tangents:
         known = sorted(off[off.isfinite()].tolist())
         return known[len(known) // 2] if known else torch.inf  # of two the larger: either may fit by chance
 
-    def explanation(self, camera: int, frames: list[int], names: tuple[str, ...]) -> tuple[float, str]:
-        """By how many radii the outlines of a camera's frames miss where they fit best, and where that is."""
+    def explanation(self, camera: int, frames: list[int], others: list[int], names: tuple[str, ...]) -> tuple[float, str]:
+        """By how many radii the outlines of a camera's frames miss where they fit best, and where that is: there mirrored, at other
+        frames or in the places of some others."""
         own = [self.outlines[camera][t] for t in frames]
         mirrored = [torch.stack([self.width - outline[:, 0], outline[:, 1]], 1) for outline in own]
         tried = [([self.misfit(each, camera, t) for each, t in zip(mirrored, frames)], "mirrored")]
-        for other in set(range(len(names))) - {camera}:
+        for other in others:
             tried.append(([self.misfit(each, other, t) for each, t in zip(own, frames)], f"as pictures of camera {names[other]}"))
         best = [min((self.misfit(each, camera, s), s) for s in range(self.angles.shape[2])) for each in own]
         tried.append(([off for off, _ in best], f"as pictures of {listed([s for _, s in best])}"))
@@ -108,16 +111,19 @@ def check_pictures(scene: Scene, label: str) -> None:
     for v, row in enumerate(off):
         if not (frames := (row > limit).nonzero()[:, 0].tolist()):
             continue
-        better, place = tangents.explanation(v, frames, names)
+        # of a round body all pictures fit all cameras: another camera's are those that are its own too, or are missed there
+        others = [w for w in range(len(names)) if w != v and (bool((off[w, frames] > limit).any())
+                  or float((scene.images[v, frames] - scene.images[w, frames]).abs().max()) < COPY)]  # fmt: skip
+        better, place = tangents.explanation(v, frames, others, names)
         sure = better < min(limit, float(row[frames].median()) / EXPLAINED)
         said = (f"{label}: camera {names[v]}, {listed(frames)}: expected outlines that end where most other cameras' say, found "
                 f"them up to {float(row.max()):.2g} of the object's radius beside"
                 + (f"; {place} they fit to {better:.2g}: put the right pictures there" if sure else ": another moment or camera, "
                    "mirrored or shifted pictures, a matte with a part too many or too few, or a pose that is off?")
                 + f"; or leave out the camera (scene.holdout_cameras=[{names[v]}]) or the frames (scene.frames)")  # fmt: skip
-        if sure:
+        if sure and float(row.max()) > SUSPECT:
             raise DataError(said)
-        worst = max(worst, (float(row.max()), said))
+        worst = max(worst, (float(row.max()) + sure, said))  # one that is explained is said first, however small
     if worst[0] > SUSPECT:
         many = int((off.amax(1) > limit).sum())
         warnings.warn(worst[1] + f" ({many} cameras have such frames)" * (many > 1), stacklevel=4)
