@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from itertools import combinations
+from itertools import combinations, pairwise
 from typing import NamedTuple
 
 import torch
@@ -33,6 +33,10 @@ WEIGHTLESS = 1.0
 SWAPPED = 3.0
 """Factor by which swapping two frames makes a track smoother from which on they are swapped. It is 0.9 to 1.02 for films as they
 are; two swapped frames of the bird give 1.0 (at rest) to 100."""
+
+COARSE, ABRUPT, MOVED = 160, 10.0, 0.1
+"""Pictures are compared at about so many pixels across. They stop where they change that many times less than in the frame beside;
+radii that the object then moves at least where data are refused."""
 
 
 SIZES, FASTEST = (1e-4, 1e3), 1e3
@@ -97,13 +101,11 @@ def parabola(track: Track, frames: int) -> tuple[Tensor, float]:
 
 def check_fall(scene: Scene, label: str) -> None:
     """The film is one of an object that falls and meets the ground. Errors: DataError naming what contradicts it, and the keys."""
-    same = scene.images[:, 1:] == scene.images[:, :-1]
-    if bool(same.all()):
-        raise DataError(f"{label}: all {scene.frames} frames are identical: expected a film of a moving object")
     track = track_of(scene)
     g = float(scene.gravity.double().norm())
     if track is None:
         return
+    check_still(scene, track, label)
     check_size(track, label)
     if g == 0:
         for frames in range(3, scene.frames + 1):
@@ -116,6 +118,38 @@ def check_fall(scene: Scene, label: str) -> None:
     check_order(scene, track, label)
     check_rate(scene, track, label, g)
     check_direction(scene, track, label, g)
+
+
+def check_still(scene: Scene, track: Track, label: str) -> None:
+    """The pictures go on while the object moves. Of a body at rest they may be alike to the bit: what counts is that those of all
+    cameras stop, or go on, from one frame to the next. Errors: DataError naming the frames."""
+    step = math.ceil(max(scene.mattes.shape[2:]) / COARSE)
+    frames = [(scene.images[:, t, ::step, ::step], scene.mattes[:, t, ::step, ::step] > 0.5) for t in range(scene.frames)]
+    change = torch.stack([((b - a).abs().mean(3) * (m | n)).sum() / (m | n).sum() for (a, m), (b, n) in pairwise(frames)])
+    if not bool(change.any()):
+        raise DataError(f"{label}: all {scene.frames} frames are identical: expected a film of a moving object")
+    same = change <= torch.minimum(2 * change.min(), change.max() / ABRUPT)
+    ends = torch.nn.functional.pad(same.int(), (1, 1)).diff().nonzero()[:, 0].tolist()
+    seen = [images.numpy().tobytes() for images, _ in frames]
+    for t, first in ((t, seen.index(each)) for t, each in enumerate(seen)):
+        away = float((track.points[first : t + 1] - track.points[t]).norm(dim=1).max())
+        if away > MOVED * track.radius and change[first:t].any():
+            raise DataError(f"{label}: expected new pictures, found those of frame {first} in frame {t} of all cameras, after "
+                            f"the object was {away:.3g} m away: is a part of the film there twice? Leave it out (scene.frames)")
+    moves, fall = track.points.diff(dim=0), float(scene.gravity.double().norm()) * track.dt**2
+    for first, last in zip(ends[::2], ends[1::2]):
+        level = ABRUPT * float(change[first:last].max())
+        sides = [k for k in (first - 1, last) if 0 <= k < len(change) and float(change[k]) > level]
+        if last == first + 1 and len(sides) == 2 and float(moves[sides[0]] @ moves[sides[1]]) < 0:
+            continue  # where it turns round it may look the same before and after
+        moved = max((float(moves[k].norm()) - fall * (k == last) for k in sides), default=0.0)  # what is let go starts to fall
+        said = (f"{label}: expected new pictures, found the same in frames {first} to {last} of all cameras, and an object moving "
+                f"by {moved:.3g} m in a frame beside ({len(ends) // 2} such stretches): did the recording freeze, or was it "
+                "brought to another frame rate? Leave these frames out (scene.frames), or each one that is there again")
+        if moved > MOVED * track.radius:
+            raise DataError(said)
+        if moved > track.noise:
+            warnings.warn(said, stacklevel=4)
 
 
 def check_size(track: Track, label: str) -> None:
@@ -169,25 +203,31 @@ def check_direction(scene: Scene, track: Track, label: str, g: float) -> None:
     beyond = float(energy[last] - 3 * error[last]) > start + 3 * float(error[0])
     found = (f"{label}: the object has {float(energy[last]):.3g} J/kg in frames {last} to {last + 1}, {start:.3g} at the start: "
              "expected a fall, in which the ground takes energy")
+    cause = "a film that runs backwards (times negated, frames in descending order)?"
+    if scene.ground is not None and float(track.low[0]) < scene.ground.height + 0.3 * track.radius:
+        cause = "a film that begins after contact (start it earlier, scene.frames), or one that runs backwards?"
     if beyond and float(energy[last]) > SURE * start:
-        raise DataError(f"{found}; a film that runs backwards (times negated, frames in descending order)?")
+        raise DataError(f"{found}; {cause}")
     if beyond and float(energy[last]) > SUSPECT * start:
-        warnings.warn(f"{found}; does the film run backwards?", stacklevel=4)
+        warnings.warn(f"{found}; {cause}", stacklevel=4)
 
 
 def check_order(scene: Scene, track: Track, label: str) -> None:
-    """No two frames in each other's place."""
+    """No two frames in each other's place, and no stretch in reverse."""
     fall = scene.gravity.double() * track.dt**2
 
     def rough(points: Tensor) -> float:
         return float((points[2:] - 2 * points[1:-1] + points[:-2] - fall).square().sum())
 
-    now, best, pair = rough(track.points), math.inf, (0, 0)
+    now, best, pair = rough(track.points), math.inf, (0, 0, "")
     for i, j in combinations(range(scene.frames), 2):
-        swapped = track.points.clone()
+        swapped, reverse = track.points.clone(), track.points.clone()
         swapped[[i, j]] = track.points[[j, i]]
-        best, pair = min((best, pair), (rough(swapped), (i, j)))
+        best, pair = min((best, pair), (rough(swapped), (i, j, f"frames {i} and {j} seem to be in each other's place: swapping")))
+        if 3 <= j - i < scene.frames - 1:
+            reverse[i : j + 1] = track.points[i : j + 1].flip(0)
+            best, pair = min((best, pair), (rough(reverse), (i, j, f"frames {i} to {j} seem to be in reverse order: turning")))
     floor = 6 * scene.frames * track.noise**2  # of second differences of noise
     if now > SWAPPED * (best + floor):
-        raise DataError(f"{label}: frames {pair[0]} and {pair[1]} seem to be in each other's place: swapping them makes the "
-                        f"object's path {now / best:.3g} times smoother; put them in order, or restrict scene.frames")
+        raise DataError(f"{label}: {pair[2]} them makes the object's path {now / best:.3g} times smoother; put them in order, or "
+                        "restrict scene.frames")

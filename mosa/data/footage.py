@@ -203,5 +203,8 @@ def footage_of(
     w2c = np.stack([w for _, w in calibration.values()])
     cameras = Cameras(torch.tensor(K, dtype=torch.float32), torch.tensor(w2c, dtype=torch.float32), coverage.shape[3],
                       coverage.shape[2], tuple(calibration))
-    return Footage(cameras, tuple(frames), torch.tensor(times, dtype=torch.float64).float(), torch.from_numpy(stack),
+    moments = np.array(times)
+    if np.spacing(np.abs(moments).max(), dtype=np.float32) > 0.1 * TIME_JITTER * np.diff(moments).min():
+        moments -= moments[0]  # seconds of a clock, which single precision does not keep
+    return Footage(cameras, tuple(frames), torch.from_numpy(moments).float(), torch.from_numpy(stack),
                    torch.from_numpy(coverage), torch.ones(3))

@@ -100,8 +100,9 @@ def read_listing(
         camera, frame = found[2], int(found[3])
         K = matrix(entry["intrinsic"], (3, 3), f"{where}, intrinsic")
         w2c = world_to_camera(matrix(entry["c2w"], (3, 4), f"{where}, c2w"), f"{where}, c2w")
-        if not same_camera(calibration.setdefault(camera, (K, w2c)), K, w2c):
-            raise DataError(f"{where}: camera {camera} has another pose or intrinsics than before; cameras must not move")
+        if not same_camera(known := calibration.setdefault(camera, (K, w2c)), K, w2c):
+            other = "another pose" if same_camera(known, K, known[1]) else "other intrinsics"
+            raise DataError(f"{where}: camera {camera} has {other} than before; cameras must not move, focus or zoom")
         if frame >= 0:
             merge_time(times, frame, number(entry["time"], f"{where}, time"), where, fps)
     return dict(sorted(calibration.items(), key=lambda item: int(item[0]))), times

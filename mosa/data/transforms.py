@@ -33,6 +33,9 @@ from mosa.types import Scene
 LONGEST = 1000
 """Characters of a path: a file system takes 4096 bytes, of names of 255 each."""
 EXTENSIONS = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG")
+JITTER = 0.01
+"""By how much poses of a camera that stands still may differ: radians, and shares of the cameras' distance from their middle. Where
+each image's is solved for itself they differ by about a pixel, 0.002."""
 CUT = 1e-3
 """Share of a matte that undoing a lens may cut off before it is said."""
 
@@ -57,9 +60,9 @@ def read_transforms(path: str | Path, *, frames=None, fps: float | None = None, 
 
     Top level or per entry: fl_x, fl_y, cx, cy [px] or camera_angle_x [rad], w, h, the lens' k1 to k4, p1, p2, camera_model (see
     `mosa.data.lens`: it is undone, images and mattes are then those of a pinhole). Per entry: file_path (extension may be left
-    out), transform_matrix (camera to world, OpenGL axes), time [s] (left out: the last number in the file name counts
-    frames at fps; where all entries have one and fps is given, evenly spaced times take their place), mask_path (grey, white =
-    object; left out: the image's alpha), camera (left out: entries with one pose and intrinsics are one camera). fill: holes
+    out), transform_matrix (camera to world, OpenGL axes), time [s] (left out: the last number in the file names that differs
+    counts frames at fps; where all entries have one and fps is given, evenly spaced times take their place), mask_path (grey,
+    white = object; left out: the image's alpha), camera (left out: entries with one pose are one camera). fill: holes
     of mattes up to this many pixels of the file are covered. Errors: DataError naming file and entry, ConfigError.
     """
     file = Path(path)
@@ -107,6 +110,7 @@ def read_shots(file: Path, document, fps: float | None) -> list[Shot]:
         raise DataError(f"{file}: expected an object with a list `frames`, one entry per image")
     shared = {k: number(v, f"{file}, {k}") for k, v in document.items() if k in intrinsic_keys()}
     shots = []
+    counting = counting_place([str(e.get("file_path")) for e in document["frames"] if isinstance(e, dict) and "time" not in e])
     for i, entry in enumerate(document["frames"]):
         where = f"{file}, frames[{i}]"
         for key in ("file_path", "transform_matrix"):
@@ -123,7 +127,7 @@ def read_shots(file: Path, document, fps: float | None) -> list[Shot]:
         pose = matrix(entry["transform_matrix"], (3, 4), f"{where}, transform_matrix")
         time = number(entry["time"], f"{where}, time") if entry.get("time") is not None else None
         if time is None:
-            time = counted_time(image, fps, where)
+            time = counted_time(image, fps, where, counting)
         camera = str(entry["camera"]) if entry.get("camera") is not None else None
         shots.append(Shot(where, image, mask, time, intrinsics, world_to_camera(pose, where), camera, fisheye))
     return shots
@@ -144,42 +148,59 @@ def locate(folder: Path, name: str, where: str) -> Path:
     raise DataError(f"{folder / name}: image not found ({where})")
 
 
-def counted_time(image: Path, fps: float | None, where: str) -> float:
-    """Time [s] from the last number in a file name."""
+def counted_time(image: Path, fps: float | None, where: str, place: int) -> float:
+    """Time [s] from the number at that place of a file name."""
     counter = re.findall(r"\d+", image.stem)
     if fps is None or not counter:
         raise DataError(f"{where}: expected a time in seconds, found none; add `time`, or number the files and set scene.fps")
-    return int(counter[-1]) / fps
+    return int(counter[place]) / fps
+
+
+def counting_place(names: list[str]) -> int:
+    """Which of the numbers in file names counts frames: the last that is not the same in all of them (`0_003_v2`: 003)."""
+    numbers = [re.findall(r"\d+", Path(name).stem) for name in names]
+    differ = [k for k, each in enumerate(zip(*numbers)) if len(set(each)) > 1]
+    return differ[-1] if differ and len({len(each) for each in numbers}) == 1 else -1
 
 
 def group(shots: list[Shot], file: Path) -> tuple[dict[str, Shot], dict[str, list[Shot]]]:
-    """Camera name -> its first shot, and all its shots; by label, or by equal pose and intrinsics.
+    """Camera name -> the shot whose pose is nearest to the mean, and all its shots; by label, or by equal pose.
 
-    Errors: DataError where a labelled camera moves, or unlabelled ones all do.
+    A warning where the poses of a label differ by a little. Errors: DataError where a camera has several intrinsics or moves, or
+    unlabelled ones all do.
     """
-    first: dict[str, Shot] = {}
     members: dict[str, list[Shot]] = {}
     for shot in shots:
-        name = shot.camera
-        if name is None:
-            same = (
-                n
-                for n, s in first.items()
-                if s.camera is None and shot.intrinsics == s.intrinsics and same_camera((np.eye(3), s.w2c), np.eye(3), shot.w2c)
-            )
-            name = next(same, str(len(first)))
-        known = first.setdefault(name, shot)
-        if known.intrinsics != shot.intrinsics or not same_camera((np.eye(3), known.w2c), np.eye(3), shot.w2c):
-            raise DataError(
-                f"{shot.where}: camera {name} has another pose or intrinsics than in {known.where}; cameras must not move"
-            )
-        members.setdefault(name, []).append(shot)
-    if len(shots) > 2 and len(first) == len(shots):
-        raise DataError(
-            f"{file}: {len(shots)} entries with {len(first)} different poses: expected cameras that stand still and see "
-            "every frame; a single moving camera cannot be used"
-        )
-    return first, members
+        same = (n for n, (s, *_) in members.items() if s.camera is None and same_camera((np.eye(3), s.w2c), np.eye(3), shot.w2c))
+        members.setdefault(next(same, str(len(members))) if shot.camera is None else shot.camera, []).append(shot)
+    places = np.array([-s.w2c[:3, :3].T @ s.w2c[:3, 3] for s in shots])
+    spread = float(np.linalg.norm(places - places.mean(0), axis=1).max()) or 1.0
+
+    def apart(a: Shot, b: Shot) -> float:
+        turn, way = a.w2c[:3, :3] - b.w2c[:3, :3], a.w2c[:3, :3].T @ a.w2c[:3, 3] - b.w2c[:3, :3].T @ b.w2c[:3, 3]
+        return max(float(np.abs(turn).max()), float(np.linalg.norm(way)) / spread)
+
+    if len(shots) > 2 and len(members) == len(shots):
+        close = sum(any(apart(a, b) < JITTER for b in shots if b is not a) for a in shots)
+        still = 2 * close > len(shots) >= 2 * len({shot.time for shot in shots})
+        cause = ("they seem to, with poses solved for each image: name the camera of each entry (`camera`)"
+                 if still else "a single moving camera cannot be used")
+        raise DataError(f"{file}: {len(shots)} entries with {len(members)} different poses: expected cameras that stand still and "
+                        f"see every frame; {cause}")
+    for name, (known, *others) in members.items():
+        for shot in others:
+            if key := next((k for k in intrinsic_keys() if known.intrinsics.get(k) != shot.intrinsics.get(k)), None):
+                raise DataError(f"{shot.where}: camera {name} has {key} = {shot.intrinsics.get(key)}, {known.intrinsics.get(key)} "
+                                f"in {known.where}: expected one lens, focus and zoom a camera; write one set in all its entries")
+        off, where = max(((apart(known, shot), shot.where) for shot in others), default=(0.0, ""))
+        found = (f"{where}: camera {name} has another pose than in {known.where}, {off:.2%} away (of a radian, or of the cameras' "
+                 "distance from their middle)")
+        if off > JITTER:
+            raise DataError(f"{found}; cameras must not move")
+        if off > 1e-5:
+            warnings.warn(f"{found}: solved for each image? The pose nearest to the mean is taken for all", stacklevel=4)
+    middle = {name: np.mean([shot.w2c for shot in own], 0) for name, own in members.items()}
+    return {name: min(own, key=lambda shot: float(np.abs(shot.w2c - middle[name]).sum())) for name, own in members.items()}, members
 
 
 def synchronise(by_camera: dict[str, list[Shot]], fps: float | None) -> tuple[list[float], list[list[Shot]]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import warnings
+from dataclasses import replace
 
 import torch
 
@@ -12,6 +13,7 @@ from mosa.data.agreement import check_agreement, holes_report
 from mosa.data.falling import check_fall
 from mosa.data.footage import TIME_JITTER
 from mosa.data.outlines import check_outlines, check_particles
+from mosa.data.tangents import check_pictures
 from mosa.errors import DataError
 from mosa.types import Scene
 
@@ -25,6 +27,8 @@ below 0.04."""
 DRIFT = 0.15
 """By which it may change over a film, averaged over all learning cameras, so that what turns into one's view leaves another's: a
 body in one light that is exposed the same stays below 0.075 in the built-in films, at 0.022 in the bird's."""
+CORNER = 0.1
+"""Share of an image's size from its corner within which a principal point was measured from the image's centre."""
 SQUARE, NEARLY = 2.0, 1.05
 """Ratios of the two focal lengths of a camera from which on they are refused, and warned of: sensors have square pixels."""
 
@@ -55,18 +59,35 @@ def validate(scene: Scene) -> Scene:
     check_times(scene, label)
     check_mattes(scene, label)
     check_borders(scene, label)
-    check_agreement(scene, label)
-    for frame in range(1, scene.frames):
-        check_agreement(scene, label, frame)
-    check_fall(scene, label)
+    learned = scene.training_cameras
+    check_film(replace(scene, images=scene.images[learned], mattes=scene.mattes[learned], cameras=scene.cameras.select(learned),
+                       holdout_cameras=()) if scene.holdout_cameras else scene, label)  # fmt: skip
+    if scene.holdout_cameras:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # they are said
+                check_film(scene, label)
+        except DataError as error:
+            warnings.warn(f"{error} (nothing is learned from cameras that are held out; figures of their images count on them)",
+                          stacklevel=2)
     if not scene.synthetic:
         check_colors(scene, label)
-        check_outlines(scene, label)
-        check_particles(scene, label)
     holes = None if scene.synthetic else holes_report(scene)
     if holes:
         warnings.warn(f"{label}: {holes}", stacklevel=2)
     return scene
+
+
+def check_film(scene: Scene, label: str) -> None:
+    """All cameras see one object, at every moment, and it moves as one that falls. Errors: DataError."""
+    check_agreement(scene, label)
+    check_pictures(scene, label)
+    for frame in range(1, scene.frames):
+        check_agreement(scene, label, frame)
+    check_fall(scene, label)
+    if not scene.synthetic:
+        check_outlines(scene, label)
+        check_particles(scene, label)
 
 
 def check_cameras(scene: Scene, label: str) -> None:
@@ -84,11 +105,16 @@ def check_cameras(scene: Scene, label: str) -> None:
         if float((R @ R.T - torch.eye(3, dtype=R.dtype)).abs().max()) > 2e-3 or float(torch.linalg.det(R)) < 0:
             raise DataError(f"{label}: camera {name}: expected a rotation in its pose, found {R.tolist()}")
         cx, cy = cameras.K[v, 0, 2].item(), cameras.K[v, 1, 2].item()
-        if not (0 < cx < cameras.width and 0 < cy < cameras.height):
-            raise DataError(
-                f"{label}: camera {name}: the principal point ({cx:.1f}, {cy:.1f}) px lies outside of its {cameras.width}x"
-                f"{cameras.height} px images: intrinsics of another resolution?"
-            )
+        inside = 0 < cx < cameras.width and 0 < cy < cameras.height
+        centred = max(abs(cx) / cameras.width, abs(cy) / cameras.height) < CORNER
+        said = (f"{label}: camera {name}: the principal point cx, cy = ({cx:.1f}, {cy:.1f}) px lies "
+                f"{'in the corner' if inside else 'outside'} of its {cameras.width}x{cameras.height} px images: ")
+        said += ("measured from their centre? Expected from the upper left corner: add half of their size" if centred else
+                 "intrinsics of another resolution?")
+        if not inside:
+            raise DataError(said)
+        if centred:
+            warnings.warn(said, stacklevel=3)
 
 
 def check_pixels(K: torch.Tensor, label: str) -> None:

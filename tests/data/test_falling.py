@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from mosa.data.builtin.renderer import ring_of_cameras
-from mosa.data.falling import check_fall, parabola, track_of
+from mosa.data.falling import check_direction, check_fall, parabola, track_of
 from mosa.data.scene import load_scene
 from mosa.data.validation import validate
 from mosa.errors import DataError
@@ -99,6 +99,29 @@ def test_a_film_that_runs_backwards_is_refused(scene):
         validate(reordered(scene, list(range(FRAMES))[::-1]))
 
 
+def test_a_film_that_begins_after_contact_is_named_as_that(scene):
+    """Pressed flat, it is thrown up by what it has stored."""
+    heights = torch.tensor([0.1, 0.11, 0.15, 0.23, 0.30, 0.36, 0.41, 0.45, 0.47, 0.49, 0.5, 0.5]).double()
+    track = track_of(scene)
+    late = track._replace(points=torch.stack([0 * heights, heights, 0 * heights], 1), low=heights - RADIUS)
+    with pytest.raises(DataError, match=r"a film that begins after contact \(start it earlier, scene\.frames\), or"):
+        check_direction(scene, late, "scene", 9.8)
+    with pytest.raises(DataError, match="a film that runs backwards"):
+        check_direction(scene, late._replace(points=late.points + 0.2, low=late.low + 0.2), "scene", 9.8)
+
+
+def test_doubled_frames_are_named_as_that(scene):
+    with pytest.raises(DataError, match=r"the same in frames 0 to 1 of all cameras, .* \(6 such stretches\)"):
+        validate(reordered(scene, [t // 2 for t in range(FRAMES)]))
+
+
+def test_a_stretch_in_reverse_is_named(scene):
+    order = list(range(FRAMES))
+    order[2:7] = order[2:7][::-1]
+    with pytest.raises(DataError, match="frames 2 to 6 seem to be in reverse order: turning them"):
+        validate(reordered(scene, order))
+
+
 def test_equal_frames_are_refused(scene):
     with pytest.raises(DataError, match="all 12 frames are identical"):
         validate(reordered(scene, [0] * FRAMES))
@@ -138,7 +161,7 @@ def test_a_camera_that_is_a_frame_late_is_named(scene):
     order = [0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10]
     mattes = scene.mattes.clone()
     mattes[1] = scene.mattes[1, order]
-    with pytest.raises(DataError, match=r"do not see one object in frame \d+: .* 1 by"):
+    with pytest.raises(DataError, match=r"camera 1, frames 4 to 11: .* as pictures of frames 3 to 10 they fit to 0.0"):
         validate(replace(scene, mattes=mattes))
 
 

@@ -3,6 +3,7 @@
 import json
 import warnings
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -60,9 +61,35 @@ def shifted(height):
     return moved(matrix)
 
 
+def jittered(size, labels=True):
+    """Poses as they are solved for each image: another one every time."""
+
+    def change(entries):
+        rng = np.random.default_rng(1)
+        for e in entries:
+            matrix = np.array(e["transform_matrix"])
+            matrix[:3, :3] = cv2.Rodrigues(rng.normal(size=3) * size)[0] @ matrix[:3, :3]
+            matrix[:3, 3] += rng.normal(size=3) * size
+            e.update(transform_matrix=matrix.tolist())
+            if not labels:
+                e.pop("camera")
+
+    return change
+
+
+def moving(entries):
+    """One camera, which goes on by a little from image to image."""
+    pose = np.array(entries[0]["transform_matrix"])
+    for i, e in enumerate(entries):
+        turn = np.eye(4)
+        turn[:3, :3] = cv2.Rodrigues(np.array([0, 0.004 * i, 0]))[0]
+        e.update(transform_matrix=(turn @ pose).tolist(), time=i / 50)
+        e.pop("camera")
+
+
 Z_UP = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
 WRONG = {
-    "exchanged": (exchanged("0", "2"), "the outlines of frame"),
+    "exchanged": (exchanged("0", "2"), "camera 0, frames 0 to 4: .* as pictures of camera 2 they fit to 0.0"),
     "mirrored": (mirrored, "the outlines of frame"),
     "another axis is up": (moved(Z_UP), "scene.ground.height: expected the object above the ground"),
     "the ground is higher": (shifted(-0.15), "scene.ground.height: expected the object above the ground"),
@@ -71,6 +98,16 @@ WRONG = {
     "stretched": (lambda entries: [e.update(fl_x=1.3 * e["fl_x"]) for e in entries], "expected focal lengths of square pixels"),
     "a rational lens": (lambda entries: [e.update(k6=0.1) for e in entries], "k6: expected a lens of k1, k2, k3, p1, p2"),
     "a camera's name": (lambda entries: [e.update(camera=f"a\n{e['camera']}") for e in entries], "at most 100 printable"),
+    "a moving camera": (moving, "see every frame; a single moving camera cannot be used"),
+    "moving cameras": (jittered(0.05), r"camera 0 has another pose than in .*; cameras must not move"),
+    "jitter without names": (jittered(1e-3, labels=False), "poses solved for each image: name the camera of each entry"),
+    "jitter": (jittered(1e-3), r"camera 0 has another pose than in .*: solved for each image\? The pose nearest to the mean"),
+    "zoom": (lambda entries: entries[7].update(fl_x=1.01 * entries[7]["fl_x"]), "has fl_x = .*: expected one lens, focus and zoom"),
+    "zoom without names": (
+        lambda entries: [(e.pop("camera"), e.update(cx=e["cx"] + 1e-3 * i)) for i, e in enumerate(entries)], "has cx = .*one lens"),
+    "cx from the centre": (lambda entries: [e.update(cx=0.0, cy=-0.5) for e in entries], r"outside .*measured from their centre\?"),
+    "cx from the centre, a little more": (
+        lambda entries: [e.update(cx=0.5, cy=0.7) for e in entries], r"\(0.5, 0.7\) px lies in the corner of .* their centre\?"),
     "no affine pose": (lambda entries: entries[0]["transform_matrix"][3].__setitem__(3, 2.0), "0, 0, 0, 1 in the fourth row"),
 }
 
@@ -82,6 +119,33 @@ def test_what_contradicts_the_outlines_is_named(film, name):
     with warnings.catch_warnings(), pytest.raises((DataError, UserWarning), match=message):
         warnings.simplefilter("error")
         changed(film[0], change)
+
+
+def test_poses_that_jitter_are_one_camera(film):
+    """Six cameras of five frames, at poses within the jitter of the right ones."""
+    with pytest.warns(UserWarning, match="solved for each image"):
+        scene = changed(film[0], jittered(1e-3))
+    assert (len(scene.cameras), scene.frames) == (6, 5)
+    assert float((scene.cameras.w2c - film[2].cameras.w2c).abs().max()) < 5e-3
+
+
+@pytest.mark.parametrize("name", ["{camera}_{frame:03d}_v2", "v2_{camera}_{frame}", "shot{frame:05d}"])
+def test_the_number_that_counts_frames_is_one_that_differs(film, tmp_path, name):
+    def change(entries):
+        for e in entries:
+            place = tmp_path / e["camera"]
+            place.mkdir(exist_ok=True)
+            file = place / (name.format(camera=e["camera"], frame=round(50 * e.pop("time"))) + ".png")
+            file.write_bytes((film[0] / e["file_path"]).read_bytes())
+            e.update(file_path=str(file))
+
+    scene = changed(film[0], change, fps=50.0)
+    assert torch.allclose(scene.times, torch.arange(5) / 50) and torch.equal(scene.mattes, changed(film[0], lambda e: None).mattes)
+
+
+def test_times_of_a_clock_are_as_good_as_any(film):
+    scene = changed(film[0], lambda entries: [e.update(time=e["time"] + 1764155129.5) for e in entries])
+    assert torch.allclose(scene.times, torch.arange(5) / 50, atol=1e-6)
 
 
 def test_a_film_as_it_is_passes_without_a_word(film):

@@ -4,13 +4,17 @@ import json
 import re
 import shutil
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from mosa.data.export import export_transforms
+from mosa.data.falling import check_still, track_of
 from mosa.data.scene import load_scene
+from mosa.data.validation import validate
 from mosa.errors import DataError
 
 WORLD = {"gravity": [0, -9.8, 0], "box": [[-0.7, -0.1, -0.7], [0.7, 1.0, 0.7]], "ground": {"height": 0.0}}
@@ -117,3 +121,69 @@ def test_an_exposure_that_changes_over_a_film_is_said(film, tmp_path, factors, s
 def test_a_frame_that_no_camera_shows_is_refused_where_a_later_one_is_seen(film, tmp_path):
     with pytest.raises(DataError, match="0 of 6 cameras have a matte of the object in frame 2, and more of them in a later one"):
         spoiled(film, tmp_path, empty, frame=2)
+
+
+HELD, LAST = [0, 1, 2, 3, 3], [0, 0, 1, 2, 3]
+SPOILED = {
+    "one camera freezes": ([3], lambda x: x[HELD], "camera 3, frame 4: .* as pictures of frame 3 they fit to 0.0"),
+    "one camera is late": ([3], lambda x: x[LAST], "camera 3, frames 1, 2, 4: .* as pictures of frames 0, 1, 3 they fit to 0.0"),
+    "two frames of a camera are swapped": ([1], lambda x: x[[0, 2, 1, 3, 4]], "camera 1, frames 1 to 2: .* frames 2, 1 they fit"),
+    "one camera is mirrored": ([2], lambda x: x.flip(2), r"camera 2, frames 0 to 4: .* mirrored they fit to 0.0.*cameras=\[2\]"),
+    "one camera is mirrored in two frames": (
+        [5], lambda x: torch.cat([x[:3], x[3:].flip(2)]), "camera 5, frames 3 to 4: .*; mirrored they fit to 0.0"),
+    "one camera is shifted": ([0], lambda x: x.roll(3, 2), "camera 0, frames 0 to 4: .*: another moment or camera, mirrored or"),
+    "all cameras freeze": (range(6), lambda x: x[HELD], "found the same in frames 3 to 4 of all cameras"),
+    "all cameras begin again": (range(6), lambda x: x[[0, 1, 2, 0, 1]], "those of frame 0 in frame 3 of all cameras, after"),
+    "all frames are doubled": (range(6), lambda x: x[[0, 0, 1, 1, 2]], r"in frames 0 to 1 of all cameras, .*\(2 such stretches\)"),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return replace(load_scene(format="builtin", name="tiny", scale=0.5), synthetic=False)
+
+
+def with_pictures(scene, cameras, change):
+    """The scene with the images (T, H, W, 3) and mattes (T, H, W) of some cameras changed."""
+    images, mattes = scene.images.clone(), scene.mattes.clone()
+    for v in cameras:
+        images[v], mattes[v] = change(scene.images[v]), change(scene.mattes[v])
+    return replace(scene, images=images, mattes=mattes)
+
+
+@pytest.mark.parametrize("name", SPOILED)
+def test_what_the_other_cameras_contradict_is_named(scene, name):
+    cameras, change, message = SPOILED[name]
+    with warnings.catch_warnings(), pytest.raises((DataError, UserWarning), match=message):
+        warnings.simplefilter("error")
+        validate(with_pictures(scene, cameras, change))
+
+
+def test_a_stretch_of_another_camera_is_named(scene):
+    images, mattes = scene.images.clone(), scene.mattes.clone()
+    images[1, 2:], mattes[1, 2:] = scene.images[2, 2:], scene.mattes[2, 2:]
+    with pytest.raises(DataError, match=r"camera 1, frames 2 to 4: .* as pictures of camera 2 they fit to 0\.0"):
+        validate(replace(scene, images=images, mattes=mattes))
+
+
+def test_a_camera_that_is_held_out_may_be_wrong(scene):
+    """The way out that the error names is one: a warning is left, and nothing else is said."""
+    spoiled_one = replace(with_pictures(scene, [3], lambda x: x[LAST]), holdout_cameras=(3,))
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        assert validate(spoiled_one) is spoiled_one
+    assert len(found) == 1
+    assert re.search("camera 3, frames 1, 2, 4: .*nothing is learned from cameras that are held out", str(found[0].message))
+
+
+def test_a_body_at_rest_may_look_the_same_to_the_bit(scene):
+    """What counts is that the object moves from one frame to the next where the pictures stop or go on."""
+    track = track_of(scene)
+    frozen = with_pictures(scene, range(6), lambda x: x[HELD])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_still(frozen, track._replace(points=track.points[[3, 3, 3, 3, 3]]), "scene")
+        released = track.points[0] + torch.tensor([[0.0, 0, 0], [0, 0, 0], [0, -0.00196, 0], [0, -0.00784, 0], [0, -0.0176, 0]])
+        check_still(with_pictures(scene, range(6), lambda x: x[[0, 0, 1, 2, 3]]), track._replace(points=released), "scene")
+    with pytest.raises(DataError, match="found the same in frames 3 to 4"):
+        check_still(frozen, track, "scene")
