@@ -179,35 +179,3 @@ def make_plane_functions(scalar):
         return r
 
     return collide, adj_collide
-
-
-def make_normal_adjoint(scalar):
-    """Warp function adj_collide_normal: transposed Jacobian of `collide` in the normal, applied to a (moving colliders)."""
-    vec3 = wp.types.vector(length=3, dtype=scalar)
-
-    @wp.func
-    def adj_collide_normal(u: vec3, normal: vec3, mode: int, friction: scalar, a: vec3):
-        r = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
-        un = wp.dot(u, normal)
-        # t = u - un n:  dt = -(u.dn) n - un dn
-        if mode == 1:
-            r = -wp.dot(a, normal) * u - un * a
-        if mode == 2:
-            if un < scalar(0.0):
-                at = a
-                aun = scalar(0.0)
-                if friction > scalar(0.0):
-                    t = u - un * normal
-                    length = wp.length(t)
-                    keep = length + friction * un
-                    at = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
-                    if keep > scalar(0.0):
-                        d = t / length
-                        along = wp.dot(d, a)
-                        # r = t + friction un t/|t|
-                        at = a + (friction * un / length) * (a - along * d)
-                        aun = friction * along
-                r = (aun - wp.dot(at, normal)) * u - un * at
-        return r
-
-    return adj_collide_normal
