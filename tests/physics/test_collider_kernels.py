@@ -114,7 +114,8 @@ def test_adjoint_against_differences(name, mode, friction):
     R = exponential(leaf)
     gradients = backward(colliders, *values[:3], [values[3], R.detach(), *values[5:]], bodies, seeds)
     (gradients[4],) = torch.autograd.grad(R, leaf, gradients[4])
-    g, rounding = torch.Generator().manual_seed(5), 1e-15 * abs(float(loss(values))) + 1e-12 * sum(float(s.abs().sum()) for s in seeds)
+    g = torch.Generator().manual_seed(5)
+    rounding = 1e-15 * abs(float(loss(values))) + 1e-12 * sum(float(s.abs().sum()) for s in seeds)
     names = ("v", "x", "spring", "position", "rotation", "linear", "angular")
     for i, (size, name_) in enumerate(zip((1e-5, 1e-8, 1.0, 1e-8, 1e-7, 1e-6, 1e-6), names)):
         for _attempt in range(6):

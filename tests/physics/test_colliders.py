@@ -11,6 +11,7 @@ from mosa.physics.contact.colliders import Box, Capsule, Collider, Cylinder, Hal
 from mosa.physics.contact.motion import Motion, Trajectory, exponential
 from mosa.physics.contact.planes import Plane
 from mosa.physics.contact.reference import signed_distance
+from mosa.physics.contact.touch import GRIP
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.engine.time_step import required_substeps
 from mosa.types import ParticleState
@@ -60,36 +61,37 @@ def test_a_resting_half_space_or_box_is_the_plane(friction, make_block):
     assert (free.x - plane.x).abs().max() > 1e-3 and free.reactions is None
 
 
-def turned_drop(kind: str, mode: str, friction: float, degrees: float, shape=HalfSpace()):
-    """(positions of a block of 1000 particles at 10 frames, reactions), both turned back, of a drop from 0.3 m (2.4 m/s) onto a
-    solid, the whole world turned by an angle about an axis that is not the grid's."""
+def turned_drop(shape, top: float, mode: str, friction: float, degrees: float):
+    """(positions of a block of 1000 particles at 10 frames, reactions), both turned back, of a tilted fall from 0.3 m (2.4 m/s)
+    onto a solid whose origin is `top` [m] below its surface. The whole world is turned, about an axis that is none of the grid's.
+    """
     R = exponential(math.radians(degrees) * torch.tensor([0.8, 0.6, 0.0]).double())
     x = lattice((0.2, 0.2, 0.2))
     tilt = exponential(torch.tensor([0.3, 0.0, 0.2]).double())
-    x = x @ tilt.T
-    x = x + torch.tensor([0.03, -0.02, 0.0]).double()
+    x = x @ tilt.T + torch.tensor([0.03, -0.02, 0.0]).double()
     x[:, 2] += 0.012 - x[:, 2].min()
-    motion = Motion(R @ torch.tensor([0.0, 0.0, -0.5 * {"box": 0.2, "plane": 0.0}.get(kind, 0.3)]).double(), R)
+    motion = Motion(R @ torch.tensor([0.0, 0.0, -top]).double(), R)
     eye = torch.eye(3).double().expand(len(x), 3, 3).contiguous()
     v = torch.tensor([0.3, 0.0, -2.4]).double() @ R.T
     start = ParticleState((x @ R.T).contiguous(), v.expand_as(x).contiguous(), 0 * eye, eye, eye)
-    result = rollout(start, [Collider(shape, mode, friction, motion)], frames=10, law="neo_hookean", gravity=(R @ torch.tensor(DOWN).double()))
+    pull = R @ torch.tensor(DOWN).double()
+    result = rollout(start, [Collider(shape, mode, friction, motion)], frames=10, law="neo_hookean", gravity=pull)
     return result.x @ R, result.reactions.unflatten(-1, (2, 3)) @ R
 
 
-@pytest.mark.parametrize("kind, shape, mode, friction", [
-    ("plane", HalfSpace(), "sticky", 0.0), ("plane", HalfSpace(), "touch", 0.4), ("plane", HalfSpace(), "slip", 0.0),
-    ("box", Box((0.3, 0.3, 0.2)), "separate", 0.4), ("sphere", Sphere(0.15), "touch", 0.3),
+@pytest.mark.parametrize("shape, top, mode, friction", [
+    (HalfSpace(), 0.0, "sticky", 0.0), (HalfSpace(), 0.0, "touch", 0.4), (HalfSpace(), 0.0, "slip", 0.0),
+    (Box((0.3, 0.3, 0.2)), 0.1, "separate", 0.4), (Sphere(0.15), 0.15, "touch", 0.3),
 ])  # fmt: skip
-def test_a_world_that_is_turned_has_the_same_motion(kind, shape, mode, friction):
-    """To a quarter of a cell. Nodes in contact in place of particles: 1 to 3 cells."""
-    flat, force = turned_drop(kind, mode, friction, 0.0, shape)
-    assert float(force[..., 0, 2].min()) < -50 and float((flat[-1] - flat[0])[:, 2].mean()) > -0.1  # it has landed and turns back
+def test_a_world_that_is_turned_has_the_same_motion(shape, top, mode, friction):
+    """To a quarter of a cell, and the same impulse. With nodes in contact in place of particles it was up to two cells."""
+    flat, force = turned_drop(shape, top, mode, friction, 0.0)
+    impulse = force[..., 0, :].sum((0, 1, 2))
+    assert float(impulse.norm()) * 4e-4 > 8.0 * 2.4  # a block of 8 kg is stopped and thrown back
     for degrees in (10.0, 30.0):
-        found, felt = turned_drop(kind, mode, friction, degrees, shape)
+        found, felt = turned_drop(shape, top, mode, friction, degrees)
         assert float((found - flat).norm(dim=-1).square().mean(1).sqrt().max()) < 0.25 * DX
-        torch.testing.assert_close(felt[..., 0, :].sum((0, 1, 2)), force[..., 0, :].sum((0, 1, 2)), rtol=0,
-                                   atol=0.02 * float(force[..., 0, :].sum((0, 1, 2)).norm()))  # fmt: skip
+        torch.testing.assert_close(felt[..., 0, :].sum((0, 1, 2)), impulse, rtol=0, atol=0.02 * float(impulse.norm()))
 
 
 def test_galilean_invariance(make_block):
@@ -187,7 +189,8 @@ def test_body_flows_around_and_does_not_enter():
 
 @pytest.mark.parametrize("turn", [0.0, 20.0])
 def test_block_slips_at_the_friction_angle(turn):
-    """Along the grid and 20 degrees out of it: one degree below the friction angle it holds, one above it slides."""
+    """Along the grid and 20 degrees out of it: one degree below the friction angle it holds, one above it slides. What holds is
+    a friction of at most GRIP of a particle's velocity in a substep: it gives way until that is the pull of all layers above."""
     friction, seen = 0.3, []
     R = exponential(torch.tensor([0.0, math.radians(turn), 0.0]).double())
     for degrees in (-1.0, 1.0, 3.0):
@@ -203,35 +206,33 @@ def test_block_slips_at_the_friction_angle(turn):
         seen.append((acceleration(result.times[10:], along[10:]), 9.8 * (math.sin(angle) - friction * math.cos(angle)),
                      float((result.v[-1].mean(0) @ R)[0])))  # fmt: skip
     (_, _, held), *sliding = seen
-    assert abs(held) < 2e-3
+    pull = 9.8 * math.sin(math.atan(friction) - math.radians(1.0))
+    assert held == pytest.approx(pull * (0.024 / 45) * (0.12 / SPACING) / GRIP, rel=0.15)
     for found, expected, velocity in sliding:
         assert found == pytest.approx(expected, abs=0.2 * 9.8 * math.radians(1.0)) and velocity > 0.1
 
 
 def test_sphere_rolls_down_an_incline():
-    """5/7 g sin(angle) without slipping. The grid holds the sphere up half a cell early, so it rolls on a radius larger by that:
-    1/(1 + 2/5 (R/h)^2) with h the height of its centre, which is matched to 3 %. A contact that fades in would brake it."""
+    """5/7 g sin(angle) without slipping; 0.95 and 0.96 of it at 7 and 10 cells, as contact that opens and closes takes energy."""
     cells, radius, angle = 7, 0.1, math.radians(20)
     dx = radius / cells
     x = lattice((2.4 * radius,) * 3, dx / 2)
-    x = x[x.norm(dim=1) < radius] + torch.tensor([0.0, 0.0, radius + 0.5 * dx]).double()
+    x = x[x.norm(dim=1) < radius] + torch.tensor([0.0, 0.0, radius]).double()
     mu, lam = lame(torch.tensor(5e5).double(), torch.tensor(0.3).double())
     substeps = required_substeps(float(lam + 2 * mu), DENSITY, 0.02, dx, 3.0)
     simulator = Simulator("neo_hookean", dx=dx, substeps=substeps, frame_dt=0.02, dtype=torch.float32,
                           gravity=(9.8 * math.sin(angle), 0.0, -9.8 * math.cos(angle)),
-                          colliders=[Collider(HalfSpace(), "separate", 0.6)])  # fmt: skip
+                          colliders=[Collider(HalfSpace(), "touch", 0.6)])  # fmt: skip
     start = at_rest(x)
     start = ParticleState(*(getattr(start, k).float() for k in ("x", "v", "C_affine", "F", "F_tot")))
     result = simulator.rollout(start, {"mu": mu, "lam": lam}, torch.full((len(x),), (dx / 2) ** 3), DENSITY, 26)
     centre = result.x.double().mean(1)
     found = acceleration(result.times[8:].double(), centre[8:, 0]) / (9.8 * math.sin(angle))
-    height = float(centre[8:, 2].mean())
-    assert found == pytest.approx(1 / (1 + 0.4 * (radius / height) ** 2), rel=0.03)
-    assert found == pytest.approx(5 / 7, rel=0.05)
+    assert found == pytest.approx(5 / 7, rel=0.06)
     # rolling, not sliding: it spins as fast as it goes, less what it lost when it landed
     arm, v = result.x[-1].double() - centre[-1], result.v[-1].double()
     spin = float((v[:, 0] * arm[:, 2] - v[:, 2] * arm[:, 0]).sum() / (arm[:, [0, 2]] ** 2).sum())
-    assert spin * height == pytest.approx(float(v[:, 0].mean()), rel=0.15)
+    assert spin * radius == pytest.approx(float(v[:, 0].mean()), rel=0.1)
 
 
 def test_squeezed_block_answers_with_the_uniaxial_stress():

@@ -9,10 +9,7 @@ import torch
 
 from mosa.errors import ConfigError
 from mosa.physics.contact.colliders import (
-    Box,
-    Capsule,
     Collider,
-    Cylinder,
     HalfSpace,
     Sphere,
     colliders_from_config,
