@@ -5,11 +5,10 @@ import torch
 import warp as wp
 
 from mosa.physics.contact.collider_kernels import collider_kernels
-from mosa.physics.contact.colliders import Box, Capsule, Collider, Cylinder, HalfSpace, Sphere, pack_colliders
+from mosa.physics.contact.colliders import HOLD, Box, Capsule, Collider, Cylinder, HalfSpace, Sphere, pack_colliders
 from mosa.physics.contact.mesh import SignedDistanceField
 from mosa.physics.contact.motion import exponential
 from mosa.physics.contact.reference import collide
-from mosa.physics.contact.touch import GRIP
 
 DT, COUNT = 0.01, 1000
 KERNELS = collider_kernels(wp.float64)
@@ -143,7 +142,7 @@ def test_what_a_solid_does_to_one_particle():
     stiff = DT * 1e4 * 0.002
     for mode, friction, expected in (("touch", 0.5, (3 - 0.5 * stiff, -1 + stiff)), ("slip", 0.0, (3.0, -1 + 2.4 * stiff)),
                                      ("separate", 0.5, (3 - 1.2 * stiff, -1 + 2.4 * stiff)),
-                                     ("sticky", 0.0, (3 - GRIP * 2, -1 + 2.4 * stiff))):  # fmt: skip
+                                     ("sticky", 0.0, (3 - HOLD * 2, -1 + 2.4 * stiff))):  # fmt: skip
         found, force, _ = forward([Collider(HalfSpace(), mode, friction)], v, x, 1e4 * ones, [none, eye, moves, none],
                                   (2 * ones, 1e-6 * ones))  # fmt: skip
         torch.testing.assert_close(found[0], torch.tensor([expected[0], 0.0, expected[1]]).double())

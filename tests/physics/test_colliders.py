@@ -353,8 +353,16 @@ def test_continued_rollout_takes_the_motion_up(make_block):
     assert torch.equal(again.x, whole.x)
 
 
-def test_domain_walls_keep_a_body_in():
-    walls = domain_walls(torch.tensor([[-0.2, -0.2, -0.2], [0.2, 0.2, 0.2]]), "separate")
+def test_a_layer_of_particles_on_what_sticks_stays():
+    """Nodes below it hold nothing else, so that all it is given comes back to it."""
+    x = lattice((0.12, 0.12, 0.02)) + torch.tensor([0.0, 0.0, 0.012]).double()
+    found = rollout(at_rest(x, (1.0, 0.0, -0.1)), [Collider(HalfSpace(), "sticky")], frames=11)
+    assert found.v[-1].abs().max() < 0.2 and (found.x[-1] - found.x[0])[:, 0].abs().max() < 0.02
+
+
+@pytest.mark.parametrize("mode", ["separate", "touch"])
+def test_domain_walls_keep_a_body_in(mode):
+    walls = domain_walls(torch.tensor([[-0.2, -0.2, -0.2], [0.2, 0.2, 0.2]]), mode)
     result = rollout(at_rest(lattice((0.12, 0.12, 0.12)), (3.0, -2.0, -1.0)), planes=walls, frames=16)
     assert result.x.abs().max() < 0.2 + 0.5 * DX
     assert result.x[:, :, 0].max() > 0.15 and result.v[-1][:, 0].mean() < 2.0

@@ -3,7 +3,7 @@
 A particle at x, a ball of radius r, R = x - position, is in the collider's axes at q = Q^T R, at distance phi(q) of its surface
 with outward normal n = Q grad phi/|grad phi|. It moves with u = v - V relative to the solid, whose velocity there is
 V = linear + angular x R. Where phi < r it is met as by a plane of mode `touch` (`contact.touch`); u_t: tangential part of u:
-    j = dt stiffness k (r - phi),    v' = v + j n - min(GRIP, friction j / |u_t|) u_t
+    j = dt stiffness k (r - phi),    v' = v + j n - min(grip, friction j / |u_t|) u_t
     force on the collider f = -m (v' - v)/dt,    torque R x f
 No grid takes part in it, so that it is the same at any angle to the grid.
 Colliders act in the order given, after the planes. The pose is the one at the start of the substep. Worlds have the same solids,
@@ -71,7 +71,7 @@ def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
         out = v
         if phi < r:
             V = linear[substep, c] + wp.cross(angular[substep, c], R)
-            out = v + pushed(v - V, Q * wp.normalize(g), kick * shapes[k, 8] * (r - phi), shapes[k, 3])
+            out = v + pushed(v - V, Q * wp.normalize(g), kick * shapes[k, 8] * (r - phi), shapes[k, 3], shapes[k, 9])
         return out
 
     @wp.kernel(module=module, enable_backward=False)
@@ -134,10 +134,10 @@ def collider_kernels(scalar, exact: bool = False) -> SimpleNamespace:
                 push = kick * stiffness * (r - phi)
                 # v' = v + D,  f = -(m/dt) D,  torque = R x f
                 at = adj_torque[substep, c]
-                f = -(mass[p] / dt) * pushed(u, n, push, shapes[k, 3])
+                f = -(mass[p] / dt) * pushed(u, n, push, shapes[k, 3], shapes[k, 9])
                 aD = a - (mass[p] / dt) * (adj_force[substep, c] + wp.cross(at, R))
                 aR = wp.cross(f, at)
-                au, an, aj = adj_pushed(u, n, push, shapes[k, 3], aD)
+                au, an, aj = adj_pushed(u, n, push, shapes[k, 3], shapes[k, 9], aD)
                 spring = spring + dt * stiffness * (r - phi) * aj
                 # u = v - V, V = linear + angular x R
                 a = a + au

@@ -20,6 +20,7 @@ from mosa.physics.contact.keys import check_keys
 from mosa.physics.contact.mesh import SignedDistanceField, field_of_mesh
 from mosa.physics.contact.motion import Motion, Trajectory, exponential
 from mosa.physics.contact.planes import MODES, Plane
+from mosa.physics.contact.touch import GRIP
 from mosa.schema import is_number
 from mosa.types import RUBBING
 
@@ -61,6 +62,9 @@ class Box:
 
 STIFFER = 2.4
 """Springs of solids that squeeze, over those of mode `touch`: plates then press with the force of the body's own law, to 1 %."""
+HOLD = 1.75
+"""Of its sliding velocity that a particle loses in a substep on what sticks, where nothing bounds the force: by twice of it or more
+one whose nodes hold nothing else would go back faster than it came."""
 Shape = HalfSpace | Sphere | Capsule | Cylinder | Box | SignedDistanceField
 KINDS = {HalfSpace: packing.HALF_SPACE, Sphere: packing.SPHERE, Capsule: packing.CAPSULE, Cylinder: packing.CYLINDER,
          Box: packing.BOX, SignedDistanceField: packing.FIELD}  # fmt: skip
@@ -83,8 +87,8 @@ class Collider:
 
 
 class PackedColliders(NamedTuple):
-    """K colliders for the kernels, without their motion. shapes: (K, 9): size 3, friction, lattice origin 3 and spacing,
-    stiffness; codes: (K, 5) int32: kind, lattice nodes 3, offset; fields: (M,) lattice values [m]."""
+    """K colliders for the kernels, without their motion. shapes: (K, 10): size 3, friction, lattice origin 3 and spacing,
+    stiffness, grip; codes: (K, 5) int32: kind, lattice nodes 3, offset; fields: (M,) lattice values [m]."""
 
     shapes: Tensor
     codes: Tensor
@@ -113,7 +117,8 @@ def pack_colliders(colliders: Sequence[Collider], dtype: torch.dtype, device: to
             if not 0 < value < math.inf:
                 raise ConfigError(f"{where}: {type(shape).__name__}: expected positive lengths [m], found {shape}")
             shapes[i, packing.SIZE + j] = value
-        shapes[i, packing.FRICTION] = math.inf if collider.mode == "sticky" else collider.friction
+        sticks = collider.mode == "sticky"
+        shapes[i, packing.FRICTION], shapes[i, packing.HOLD] = (math.inf, HOLD) if sticks else (collider.friction, GRIP)
         shapes[i, packing.STIFFNESS] = 1.0 if collider.mode == "touch" else STIFFER
         codes[i, packing.KIND] = KINDS[type(shape)]
         if isinstance(shape, SignedDistanceField):

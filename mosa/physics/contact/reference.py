@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from mosa.physics.contact.colliders import STIFFER, Box, Capsule, Collider, Cylinder, HalfSpace, Sphere
+from mosa.physics.contact.colliders import HOLD, STIFFER, Box, Capsule, Collider, Cylinder, HalfSpace, Sphere
 from mosa.physics.contact.mesh import SignedDistanceField
 from mosa.physics.contact.touch import GRIP
 
@@ -63,7 +63,7 @@ def collide(
         u = v[near] - linear - torch.linalg.cross(angular.expand_as(r), r)
         push = dt * spring[near] * (1 if collider.mode == "touch" else STIFFER) * (radius[near] - phi)
         tangential = u - (u * n).sum(1, keepdim=True) * n
-        lost = torch.full_like(push, GRIP)
+        lost = torch.full_like(push, HOLD)
         if collider.mode != "sticky":
             lost = (collider.friction * push / tangential.norm(dim=1)).clamp_max(GRIP)
         change = push[:, None] * n - lost[:, None] * tangential

@@ -37,7 +37,7 @@ def springs(modulus: Tensor, mass: Tensor, volume: Tensor, dx: float) -> Tensor:
 def touch_functions(scalar) -> SimpleNamespace:
     """Warp functions radius(volume), pushed and adj_pushed for wp.float32 or wp.float64."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
-    grip, third = GRIP, 1.0 / 3.0
+    third = 1.0 / 3.0
 
     @wp.func
     def radius(volume: scalar):
@@ -45,17 +45,18 @@ def touch_functions(scalar) -> SimpleNamespace:
         return scalar(0.5) * wp.pow(volume, scalar(wp.static(third)))
 
     @wp.func
-    def pushed(u: vec3, n: vec3, j: scalar, friction: scalar):
-        """Change of the velocity of a particle that moves with u relative to a surface of normal n and is pushed by j > 0."""
+    def pushed(u: vec3, n: vec3, j: scalar, friction: scalar, grip: scalar):
+        """Change of the velocity of a particle that moves with u relative to a surface of normal n and is pushed by j > 0. grip:
+        most of its sliding that friction takes."""
         t = u - wp.dot(u, n) * n
         length = wp.length(t)
         lost = scalar(0.0)
         if length > scalar(0.0):
-            lost = wp.min(scalar(wp.static(grip)), friction * j / length)
+            lost = wp.min(grip, friction * j / length)
         return j * n - lost * t
 
     @wp.func
-    def adj_pushed(u: vec3, n: vec3, j: scalar, friction: scalar, a: vec3):
+    def adj_pushed(u: vec3, n: vec3, j: scalar, friction: scalar, grip: scalar, a: vec3):
         """(adjoints of u, n, j) of the adjoint a of what `pushed` returns."""
         un = wp.dot(u, n)
         t = u - un * n
@@ -64,13 +65,13 @@ def touch_functions(scalar) -> SimpleNamespace:
         aj = wp.dot(a, n)
         if length > scalar(0.0):
             lost = friction * j / length
-            if lost < scalar(wp.static(grip)):
+            if lost < grip:
                 d = t / length
                 along = wp.dot(d, a)
                 at = lost * (along * d - a)
                 aj = aj - friction * along
             else:
-                at = -scalar(wp.static(grip)) * a
+                at = -grip * a
         # t = u - un n
         tilt = wp.dot(at, n)
         return at - tilt * n, j * a - tilt * u - un * at, aj
@@ -84,7 +85,7 @@ def touch_kernels(scalar) -> SimpleNamespace:
     vec3 = wp.types.vector(length=3, dtype=scalar)
     functions = touch_functions(scalar)
     radius, pushed, adj_pushed = functions.radius, functions.pushed, functions.adj_pushed
-    module = f"mosa.physics.touch_{scalar.__name__}"
+    module, grip = f"mosa.physics.touch_{scalar.__name__}", scalar(GRIP)
 
     @wp.func
     def met(v: vec3, x: vec3, r: scalar, planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int, kick: scalar):
@@ -95,7 +96,7 @@ def touch_kernels(scalar) -> SimpleNamespace:
                 n = vec3(planes[i, 0], planes[i, 1], planes[i, 2])
                 depth = r - (wp.dot(x, n) - planes[i, 3])
                 if depth > scalar(0.0):
-                    u = u + pushed(u, n, kick * depth, planes[i, 4])
+                    u = u + pushed(u, n, kick * depth, planes[i, 4], grip)
         return u
 
     @wp.kernel(module=module, enable_backward=False)
@@ -126,7 +127,7 @@ def touch_kernels(scalar) -> SimpleNamespace:
                 depth = r - (wp.dot(x[p], n) - planes[i, 3])
                 if depth > scalar(0.0):
                     u = met(v[p], x[p], r, planes, modes, i, kick)
-                    au, _an, aj = adj_pushed(u, n, kick * depth, planes[i, 4], a)
+                    au, _an, aj = adj_pushed(u, n, kick * depth, planes[i, 4], grip, a)
                     a = a + au
                     ax = ax - (kick * aj) * n
                     spring = spring + dt * depth * aj
