@@ -112,8 +112,8 @@ class Placement(Release):
     """
 
     steps: int = 60
-    low: float = 0.15
-    high: float = 0.25
+    low: float = 0.08
+    high: float = 0.14
     near: float = 0.04
     lean: float = math.radians(20.0)
     still: float = 0.3
@@ -306,7 +306,7 @@ class Pushing(Task):
 
     @property
     def first(self) -> tuple[float, float, float]:
-        """Where the paddle begins [m]; its lower edge is over the ground by the contact's thickness."""
+        """Where the paddle begins [m]; its lower edge is over the ground by `ABOVE`."""
         return -(0.5 * self.extents[0] + self.apart + 0.5 * self.size[0] + 0.02), ABOVE + 0.5 * self.size[1], 0.0
 
     def solids(self) -> list[Mapping[str, Any]]:
