@@ -63,8 +63,8 @@ class Box:
 STIFFER = 2.4
 """Springs of solids that squeeze, over those of mode `touch`: plates then press with the force of the body's own law, to 1 %."""
 HOLD = 1.75
-"""Of its sliding velocity that a particle loses in a substep on what sticks, where nothing bounds the force: by twice of it or more
-one whose nodes hold nothing else would go back faster than it came."""
+"""Share of its sliding velocity that a particle loses in a substep on a solid of mode `sticky`. No friction coefficient bounds the
+force there, and from 2 on a particle that is alone in its cells would go back as fast as it came, or faster."""
 Shape = HalfSpace | Sphere | Capsule | Cylinder | Box | SignedDistanceField
 KINDS = {HalfSpace: packing.HALF_SPACE, Sphere: packing.SPHERE, Capsule: packing.CAPSULE, Cylinder: packing.CYLINDER,
          Box: packing.BOX, SignedDistanceField: packing.FIELD}  # fmt: skip
