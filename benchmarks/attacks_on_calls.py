@@ -61,7 +61,7 @@ def colliders(_: Path) -> Iterator[Attack]:
     body = cube()
     ball = {"type": "sphere", "radius": 0.05, "position": [0, -0.3, 0]}
     for key, values in {
-        "radius": [0, -1, math.inf, math.nan, True, "a", [1], 1e300], "thickness": [math.inf, -1, "a", True],
+        "radius": [0, -1, math.inf, math.nan, True, "a", [1], 1e300], "thickness": [0.02, "a"],
         "friction": [math.inf, -1, "a", 0.5], "mode": ["bouncy", ["slip"], 5], "type": ["cone", ["sphere"], None, 5],
         "position": [[0, 0], "abc", [0, True, 0], [0, math.nan, 0], 5],
         "rotation": [[0, 0, 0, 1], [1, 0, 0], "abc", [math.nan] * 4],

@@ -7,8 +7,7 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
@@ -18,11 +17,11 @@ from torch import Tensor
 from mosa.errors import ConfigError, DataError
 from mosa.modules.body import Body, Ready, Start, World
 from mosa.modules.learned_numbers import each_law
-from mosa.physics.contact.colliders import SMOOTH, differentiable_thickness, reach, thickness_on
+from mosa.physics.contact.colliders import reach
 from mosa.physics.contact.motion import Poses, exponential, rotation_matrices, rotation_vector
 from mosa.physics.engine.clock import Moment
 from mosa.physics.engine.numerics import State, flat
-from mosa.twin_start import asks_for_gradients, check_wants_no_gradients
+from mosa.twin_start import check_wants_no_gradients
 from mosa.types import ParticleState
 
 TWISTS, TARGETS = ("velocity", "angular_velocity"), ("position", "rotation")
@@ -84,8 +83,7 @@ class Episode:
 
     starts: one, or B of them; laws: (B, numbers) of the body as `identification.read_numbers` gives them, None for the body's own
     in all worlds; gravity: (B, 3) [m/s^2], None for the world's. frames: whose fall the time step allows for, as `Body.simulate`;
-    differentiable: whether gradients go through; other arguments as `Body.simulate`. A collider whose motion gradients are asked
-    of, while its contact is too thin for them, is warned of, once. Errors: ConfigError.
+    differentiable: whether gradients go through; other arguments as `Body.simulate`. Errors: ConfigError.
     """
 
     def __init__(
@@ -115,8 +113,6 @@ class Episode:
             self._driven = torch.zeros(len(self.colliders), dtype=torch.bool)
             self._moment, self._poses = moment, self._placed(moment, 0)
             self._starts, self._first = starts, self._poses
-            self._warned: set[int] = set()
-            self._warn_of_jumps(k for k, collider in enumerate(self.colliders) if asks_for_gradients(collider.motion))
 
     @property
     def substeps(self) -> int | None:
@@ -160,7 +156,6 @@ class Episode:
             check_wants_no_gradients(action=action)
         with self._gradients():
             commands = self._checked(action or {})
-            self._warn_of_jumps(k for k, command in commands.items() if asks_for_gradients(command))
             driven = self._driven.clone()
             driven[list(commands)] = True
             speed = None if not bool(driven.any()) else self._speed(commands, driven)
@@ -204,23 +199,6 @@ class Episode:
 
     def _gradients(self):
         return torch.set_grad_enabled(self.differentiable and torch.is_grad_enabled())
-
-    def _warn_of_jumps(self, moved: Iterable[int]) -> None:
-        """moved: numbers of colliders whose motion gradients are asked of. What stands still, or moves as no gradient asks, makes
-        nodes change sides at the same moments whatever the numbers that gradients are asked of: there they are right."""
-        if not torch.is_grad_enabled():
-            return
-        dx = self._stepper.prepared.numerics.dx
-        for k in set(moved) - self._warned:
-            self._warned.add(k)
-            found, least = thickness_on(self.colliders[k], dx), differentiable_thickness(self.colliders[k], dx)
-            if found < least * (1 - 1e-6):
-                less = f"; a wider solid needs less, and mode sticky {SMOOTH:g} cells" if least > SMOOTH * dx else ""
-                warnings.warn(
-                    f"collider {self.names[k]}: gradients of its motion leave out jumps at the grid's nodes and can be far off: "
-                    f"expected a thickness of at least {least:.3g} m ({least / dx:.3g} cells), found {found:.3g} m "
-                    f"({found / dx:.2g} cells){less} (docs/twin.md, Gradients)", stacklevel=4,
-                )  # fmt: skip
 
     def _leading(self) -> tuple[int, ...]:
         return () if self.worlds is None else (self.worlds,)

@@ -14,7 +14,7 @@ from mosa.physics.engine.simulator import Simulator
 from mosa.types import ParticleState
 
 FLOOR = Plane((0, 0.02, 0), (0, 1, 0), "separate", 0.3)
-SOLID = Collider(Sphere(0.06), "separate", 0.2, thickness=0.02)
+SOLID = Collider(Sphere(0.06), "separate", 0.2)
 
 
 @pytest.fixture

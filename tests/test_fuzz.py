@@ -58,7 +58,7 @@ def test_configurations(data):
 THREE = st.lists(st.one_of(st.floats(-1, 1), numbers), min_size=3, max_size=3)
 SHAPES = [{"type": "sphere", "radius": 0.1}, {"type": "box", "size": [0.2, 0.1, 0.3]}, {"type": "plane", "normal": [0, 1, 0]},
           {"type": "capsule", "radius": 0.1, "length": 0.2}, {"type": "cylinder", "radius": 0.1, "length": 0.2}]  # fmt: skip
-MORE = {"mode": "separate", "friction": 0.3, "thickness": 0.02, "position": [0.0, -0.4, 0.0], "rotation": [0, 0, 1, 30],
+MORE = {"mode": "separate", "friction": 0.3, "position": [0.0, -0.4, 0.0], "rotation": [0, 0, 1, 30],
         "motion": {"velocity": [0, 1.0, 0], "angular_velocity": [0, 0, 1.0], "times": [0.0]}}  # fmt: skip
 WAY = {"waypoints": [{"time": 0.0, "position": [0, -0.4, 0]}, {"time": 0.1, "position": [0, -0.3, 0], "rotation": [1, 0, 0, 10]}]}
 

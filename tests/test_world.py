@@ -31,8 +31,7 @@ def twin(world=WORLD):
 def test_a_plate_presses_the_body_down():
     free = twin().simulate(frames=8)
     assert free.reactions is None
-    plate = PLATE | {"thickness": 0.0}  # not felt before it touches
-    for rollout in (twin().simulate(frames=8, colliders=[plate]), twin(WORLD | {"colliders": [plate]}).simulate(frames=8)):
+    for rollout in (twin().simulate(frames=8, colliders=[PLATE]), twin(WORLD | {"colliders": [PLATE]}).simulate(frames=8)):
         top = rollout.x[-1, :, 1].max()
         assert top < 0.16 + 0.06 < free.x[-1, :, 1].max() + 0.06
         assert top < free.x[-1, :, 1].max() - 0.01

@@ -20,8 +20,8 @@ from mosa.environments.task import CLEARANCE, Quantity, Task, Trials, View
 from mosa.errors import ConfigError
 from mosa.physics.contact.motion import exponential
 
-THICKNESS = 0.035
-"""[m] over which every solid's contact fades in: the same in simulators of different grids."""
+ABOVE = 0.035
+"""[m] from the ground to the paddle's lower edge."""
 FRICTION = 0.6
 
 
@@ -112,8 +112,8 @@ class Placement(Release):
     """
 
     steps: int = 60
-    low: float = 0.15
-    high: float = 0.25
+    low: float = 0.08
+    high: float = 0.14
     near: float = 0.04
     lean: float = math.radians(20.0)
     still: float = 0.3
@@ -139,7 +139,7 @@ class Placement(Release):
 
     def solids(self) -> list[Mapping[str, Any]]:
         return [{"type": "box", "name": "box", "size": [self.edge, self.top, self.edge], "position": [0, 0.5 * self.top, 0],
-                 "mode": "separate", "friction": FRICTION, "thickness": THICKNESS}]  # fmt: skip
+                 "mode": "separate", "friction": FRICTION}]  # fmt: skip
 
     def targets(self, trials: Trials) -> Tensor:
         return torch.tensor([0.0, self.top, 0.0]).expand(len(trials), 3)
@@ -229,7 +229,7 @@ class Hanging(Release):
         return 0.5 * self.extents[2] + self.OPEN
 
     def solids(self) -> list[Mapping[str, Any]]:
-        touch = {"mode": "separate", "friction": FRICTION, "thickness": THICKNESS}
+        touch = {"mode": "separate", "friction": FRICTION}
         z = self.apart + 0.5 * self.JAW[2]
         jaws = [{"type": "box", "name": f"jaw {side}", "size": list(self.JAW), "position": [0, self.grip, sign * z], **touch}
                 for side, sign in SIDES]  # fmt: skip
@@ -306,12 +306,12 @@ class Pushing(Task):
 
     @property
     def first(self) -> tuple[float, float, float]:
-        """Where the paddle begins [m]; its lower edge is over the ground by the contact's thickness."""
-        return -(0.5 * self.extents[0] + self.apart + 0.5 * self.size[0] + 0.02), THICKNESS + 0.5 * self.size[1], 0.0
+        """Where the paddle begins [m]; its lower edge is over the ground by `ABOVE`."""
+        return -(0.5 * self.extents[0] + self.apart + 0.5 * self.size[0] + 0.02), ABOVE + 0.5 * self.size[1], 0.0
 
     def solids(self) -> list[Mapping[str, Any]]:
         return [{"type": "box", "name": "paddle", "size": list(self.size), "position": list(self.first), "mode": "separate",
-                 "friction": 0.3, "thickness": THICKNESS}]  # fmt: skip
+                 "friction": 0.3}]  # fmt: skip
 
     def starts(self, trials: Trials, action: Tensor | None, rest: Tensor, gravity: float) -> list[dict]:
         still = (0.0, 0.0, 0.0)

@@ -348,7 +348,8 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
                             self.background)  # fmt: skip
             terms = {"image": losses.image_loss(shown.images, seen.images), "mask": losses.mask_loss(shown.mattes, seen.mattes)}
             loss = sum(self.weights.get(name, 0.0) * float(value) for name, value in terms.items())
-            values = {"loss": loss, "psnr": metrics.psnr(shown.images.clamp(0, 1), seen.images)}
+            psnr = metrics.psnr(shown.images.clamp(0, 1).flatten(0, 1), seen.images.flatten(0, 1))
+            values = {"loss": loss, "psnr": psnr}
         self.log_dict({f"val/{name}": value for name, value in values.items()}, batch_size=1)
         self.log_dict({f"val/{part.name}/{name}": value for name, value in values.items()}, batch_size=1)
 

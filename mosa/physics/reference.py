@@ -11,8 +11,7 @@ from torch import Tensor
 
 from mosa.errors import ConfigError
 from mosa.physics.constitutive.laws import law_named
-from mosa.physics.contact.planes import SLOW, THICKNESS, TOUCHING, Plane
-from mosa.physics.contact.reference import fade
+from mosa.physics.contact.planes import SLOW, THICKNESS, TOUCHING, WHOLE, Plane
 from mosa.physics.contact.touch import GRIP, springs
 from mosa.types import ParticleState
 
@@ -202,6 +201,14 @@ def meet(x: Tensor, v: Tensor, planes: Sequence[Plane], volume: Tensor, spring: 
     return v
 
 
+def fade(phi: Tensor, thickness: float) -> Tensor:
+    """Weight of the contact of nodes at distances phi (M,) [m]: 1 up to `WHOLE` of the thickness, then a smooth step to 0."""
+    if thickness == 0:
+        return (phi <= TOUCHING).to(phi)
+    s = ((phi / thickness - WHOLE) / (1 - WHOLE)).clamp(0, 1)
+    return torch.where(phi <= TOUCHING, torch.ones_like(phi), (1 - s) ** 2 * (1 + 2 * s))
+
+
 def collide(v: Tensor, y: Tensor, planes: Sequence[Plane], dx: float) -> Tensor:
     """Node velocities (M, 3) after contact; y: (M, 3) node positions [m]."""
     for plane in planes:
@@ -233,7 +240,7 @@ def substep(law: str, state: ParticleState, p: dict[str, Tensor], volume: Tensor
     x, v, C, F = state.x, state.v, state.C_affine, state.F
     tau = adapted_stress(law, F, p, operator, C)
     mass = density * volume
-    v = meet(x, v, planes, volume, springs(law_named(law).wave_modulus(p).detach(), mass, volume, dx), dt)
+    v = meet(x, v, planes, volume, springs(law_named(law).wave_modulus(p), mass, volume, dx), dt)
     base = torch.floor(x.detach() / dx - 0.5)
     f = x / dx - base
     weights = torch.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2])

@@ -73,13 +73,13 @@ def test_a_plain_trainer_fits_as_the_command_does(fitted, cfg, cache, tmp_path):
 def test_what_lightning_s_callbacks_left(fitted):
     folder, _, module, trainer = fitted
     rows = (folder / "csv" / "version_0" / "metrics.csv").read_text()
-    assert "lr-Adam/material" in rows and "val/loss" in rows and "val/cameras/psnr" in rows and "id/E" in rows
+    assert "lr/material" in rows and "val/loss" in rows and "val/cameras/psnr" in rows and "id/E" in rows
     assert (folder / "best.ckpt").is_file() and (folder / "last.ckpt").is_file()
     assert trainer.current_epoch >= sum(stage.iterations for stage in module.stages if stage.newton)
 
 
 def test_a_checkpoint_is_fitted_on_validated_tested_and_predicts(fitted, cfg, tmp_path):
-    folder, data, module, _ = fitted
+    _, data, module, _ = fitted
     begun = L.Trainer(**QUIET, max_epochs=2, default_root_dir=tmp_path, callbacks=[ModelCheckpoint(tmp_path, save_last=True)])
     begun.fit(LitMosa(cfg), datamodule=SceneDataModule(cfg))
     loaded = LitMosa.load_from_checkpoint(tmp_path / "last.ckpt")

@@ -183,9 +183,9 @@ def test_gradients_of_the_loss_reach_the_policy(name):
 
 def test_descent_through_the_simulator_lowers_the_loss():
     train, check = arena("pushing", 2), arena("pushing", 2)
-    found = by_gradient(train, check, Search(iterations=4, batch=2, rate=0.2, every=4, validation=2), seed=0)
+    found = by_gradient(train, check, Search(iterations=4, batch=2, rate=0.05, every=4, validation=2), seed=0)
     losses = [entry["loss"] for entry in found.history]
-    assert len(losses) == 2 and losses[1] < losses[0] - 0.02 and found.trials == 4 * 2 + 2 * 2
+    assert len(losses) == 2 and losses[1] < losses[0] - 0.1 and found.trials == 4 * 2 + 2 * 2
     validation = check.task.draw(2, torch.Generator().manual_seed(10**6))
     kept, _ = play_all(check, validation, LinearPolicy.read(check.task, found.policy.written()))
     assert float(kept.mean()) == pytest.approx(min(losses))
@@ -260,11 +260,11 @@ def test_a_stroke_is_one_decision_after_which_the_paddle_stands():
 
 def test_the_best_of_drawn_policies_lead():
     """Without gradients: candidates see the same trials, and their numbers are those of their own worlds."""
-    search = Search(iterations=8, batch=1, every=8, validation=4, candidates=8, spread=0.3)
+    search = Search(iterations=8, batch=1, every=8, validation=4, candidates=8, spread=0.2)
     train, check = arena("pushing", 8), arena("pushing", 4)
     found = by_evolution(train, check, search, seed=1)
     losses = [entry["loss"] for entry in found.history]
-    assert losses[-1] < losses[0] - 0.2 and found.trials == 8 * 8 + 2 * 4
+    assert losses[-1] < losses[0] - 0.1 and found.trials == 8 * 8 + 2 * 4
     policy = LinearPolicy(check.task)
     numbers = torch.randn(3, sum(p.numel() for p in policy.parameters()), generator=torch.Generator().manual_seed(0))
     seen = torch.randn(6, len(check.task.observations), generator=torch.Generator().manual_seed(1))

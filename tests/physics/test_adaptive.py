@@ -66,7 +66,7 @@ def test_gradient_is_exact_for_the_counts_taken(law, make_block):
     plate = Box((0.4, 0.04, 0.4))
 
     def roll(**timing):
-        collider = Collider(plate, "sticky", motion=Motion((0.15, 0.15, 0.11), velocity=leaves["twist"]))
+        collider = Collider(plate, "sticky", motion=Motion((0.15, 0.13, 0.11), velocity=leaves["twist"]))
         sim = simulator(law, dx=0.04, frame_dt=0.012, colliders=[collider])
         start = replace(state, v=state.v + leaves["v0"])
         extra = {"yield_stress": 2e4} if law == "von_mises" else {}

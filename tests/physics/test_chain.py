@@ -111,7 +111,7 @@ def test_a_chain_is_its_segments(device, law, plastic, penalised, source, make_b
         assert_same(found, expected, 1e-11 if device == "cpu" else 1e-9)
 
 
-BALL = Collider(Sphere(0.05), "separate", 0.3, Motion(position=(0.04, -0.03, 0.04), velocity=(0.0, 2.0, 0.0)))
+BALL = Collider(Sphere(0.05), "separate", 0.3, Motion(position=(0.15, -0.015, 0.11), velocity=(0.0, 2.0, 0.0)))
 KINDS = {
     "colliders": {"colliders": [BALL]}, "worlds": {"worlds": 3}, "worlds, colliders": {"worlds": 2, "colliders": [BALL]},
     "replayed": {"timing": Replay([4, 11, 6])}, "replayed, colliders": {"timing": Replay([5, 9, 7], 0.0), "colliders": [BALL]},

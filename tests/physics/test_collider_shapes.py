@@ -31,7 +31,7 @@ def evaluate(
 
 def run(shape, q, b=None):
     """(phi (M,), gradient (M, 3), curvature along b (M, 3)); a mesh before it, so that offsets are not 0."""
-    packed = pack_colliders([Collider(CUBE_FIELD), Collider(shape)], torch.float64, torch.device("cpu"), 0.1)
+    packed = pack_colliders([Collider(CUBE_FIELD), Collider(shape)], torch.float64, torch.device("cpu"))
     b = torch.zeros_like(q) if b is None else b
     phi, g, h = torch.zeros(len(q)).double(), torch.zeros_like(q), torch.zeros_like(q)
     kinds = [wp.vec3d, wp.vec3d, wp.float64, wp.int32, wp.float64, wp.float64, wp.vec3d, wp.vec3d]

@@ -11,6 +11,7 @@ from mosa.physics.contact.colliders import Box, Capsule, Collider, Cylinder, Hal
 from mosa.physics.contact.motion import Motion, Trajectory, exponential
 from mosa.physics.contact.planes import Plane
 from mosa.physics.contact.reference import signed_distance
+from mosa.physics.contact.touch import GRIP
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.engine.time_step import required_substeps
 from mosa.types import ParticleState
@@ -47,20 +48,50 @@ def acceleration(times, position):
     return float(torch.linalg.lstsq(A, position).solution[2])
 
 
-@pytest.mark.parametrize("mode, friction, thickness", [("sticky", 0.0, 0.0), ("slip", 0.0, 0.0), ("separate", 0.0, 0.0),
-                                                       ("separate", 0.4, 0.0), ("separate", 0.4, None), ("slip", 0.0, 0.05)])
-def test_a_resting_half_space_or_box_is_the_plane(mode, friction, thickness, make_block):
-    """Where contact fades in, a plane's is with what is slow alone: there half space and box are compared with each other."""
+@pytest.mark.parametrize("friction", [0.0, 0.4])
+def test_a_resting_half_space_or_box_is_the_plane(friction, make_block):
     state = make_block()
-    plane = rollout(state, planes=[Plane((0, 0, 0), (0, 1, 0), mode, friction, thickness)], gravity=(0.0, -9.8, 0.0))
-    turned = Motion(rotation=(-math.pi / 2, 0.0, 0.0))
-    slab = Motion(position=(0.0, -1.0, 0.0))
-    found = [rollout(state, [collider], gravity=(0.0, -9.8, 0.0)) for collider in (
-        Collider(HalfSpace(), mode, friction, turned, thickness), Collider(Box((9.0, 2.0, 9.0)), mode, friction, slab, thickness))]
-    torch.testing.assert_close(found[0].x, found[1].x, rtol=0, atol=1e-14)
-    assert torch.allclose(found[0].x, plane.x, rtol=0, atol=1e-14) == (thickness == 0.0)
+    plane = rollout(state, planes=[Plane((0, 0.01, 0), (0, 1, 0), "touch", friction)], gravity=(0.0, -9.8, 0.0))
+    turned = Motion((0.0, 0.01, 0.0), (-math.pi / 2, 0.0, 0.0))
+    slab = Motion(position=(0.0, -0.99, 0.0))
+    for collider in (Collider(HalfSpace(), "touch", friction, turned), Collider(Box((9.0, 2.0, 9.0)), "touch", friction, slab)):
+        found = rollout(state, [collider], gravity=(0.0, -9.8, 0.0))
+        torch.testing.assert_close(found.x, plane.x, rtol=0, atol=1e-14)
     free = rollout(state, gravity=(0.0, -9.8, 0.0))
     assert (free.x - plane.x).abs().max() > 1e-3 and free.reactions is None
+
+
+def turned_drop(shape, top: float, mode: str, friction: float, degrees: float):
+    """(positions of a block of 1000 particles at 10 frames, reactions), both turned back, of a tilted fall from 0.3 m (2.4 m/s)
+    onto a solid whose origin is `top` [m] below its surface. The whole world is turned, about an axis that is none of the grid's.
+    """
+    R = exponential(math.radians(degrees) * torch.tensor([0.8, 0.6, 0.0]).double())
+    x = lattice((0.2, 0.2, 0.2))
+    tilt = exponential(torch.tensor([0.3, 0.0, 0.2]).double())
+    x = x @ tilt.T + torch.tensor([0.03, -0.02, 0.0]).double()
+    x[:, 2] += 0.012 - x[:, 2].min()
+    motion = Motion(R @ torch.tensor([0.0, 0.0, -top]).double(), R)
+    eye = torch.eye(3).double().expand(len(x), 3, 3).contiguous()
+    v = torch.tensor([0.3, 0.0, -2.4]).double() @ R.T
+    start = ParticleState((x @ R.T).contiguous(), v.expand_as(x).contiguous(), 0 * eye, eye, eye)
+    pull = R @ torch.tensor(DOWN).double()
+    result = rollout(start, [Collider(shape, mode, friction, motion)], frames=10, law="neo_hookean", gravity=pull)
+    return result.x @ R, result.reactions.unflatten(-1, (2, 3)) @ R
+
+
+@pytest.mark.parametrize("shape, top, mode, friction", [
+    (HalfSpace(), 0.0, "sticky", 0.0), (HalfSpace(), 0.0, "touch", 0.4), (HalfSpace(), 0.0, "slip", 0.0),
+    (Box((0.3, 0.3, 0.2)), 0.1, "separate", 0.4), (Sphere(0.15), 0.15, "touch", 0.3),
+])  # fmt: skip
+def test_a_world_that_is_turned_has_the_same_motion(shape, top, mode, friction):
+    """To a quarter of a cell, and the same impulse. With nodes in contact in place of particles it was up to two cells."""
+    flat, force = turned_drop(shape, top, mode, friction, 0.0)
+    impulse = force[..., 0, :].sum((0, 1, 2))
+    assert float(impulse.norm()) * 4e-4 > 8.0 * 2.4  # a block of 8 kg is stopped and thrown back
+    for degrees in (10.0, 30.0):
+        found, felt = turned_drop(shape, top, mode, friction, degrees)
+        assert float((found - flat).norm(dim=-1).square().mean(1).sqrt().max()) < 0.25 * DX
+        torch.testing.assert_close(felt[..., 0, :].sum((0, 1, 2)), impulse, rtol=0, atol=0.02 * float(impulse.norm()))
 
 
 def test_galilean_invariance(make_block):
@@ -69,8 +100,8 @@ def test_galilean_invariance(make_block):
     w = torch.tensor([4.0, 0.0, -4.0]).double()
     results = []
     for boost in (0 * w, w):
-        motion = Motion((0.15, -0.06, 0.11), (0.3, 0.0, 0.1), torch.tensor([0.1, 0.3, 0.0]).double() + boost, (2.0, -3.0, 1.0))
-        collider = Collider(Capsule(0.05, 0.1), "separate", 0.3, motion, thickness=0.03)
+        motion = Motion((0.15, -0.005, 0.11), (0.3, 0.0, 0.1), torch.tensor([0.1, 0.3, 0.0]).double() + boost, (2.0, -3.0, 1.0))
+        collider = Collider(Capsule(0.05, 0.1), "separate", 0.3, motion)
         shifted = replace(state, v=state.v + boost)
         results.append(rollout(shifted, [collider], frames=2, substeps=1))
     assert float(results[0].reactions[0, 0, 0, :3].norm()) > 1
@@ -108,7 +139,7 @@ def test_action_is_reaction(mode, friction, make_block):
     motions = [Motion((0.16, -0.03, 0.12), (0.2, 0.1, 0.0), (0.1, 0.5, 0.0), (1.0, 5.0, 0.0)),
                Motion((0.3, 0.1, 0.1), velocity=(-1.5, 0.0, 0.0))]  # fmt: skip
     colliders = [Collider(Box((0.3, 0.1, 0.2)), mode, friction, motions[0]),
-                 Collider(Cylinder(0.06, 0.3), mode, friction, motions[1], thickness=0.02)]  # fmt: skip
+                 Collider(Cylinder(0.06, 0.3), mode, friction, motions[1])]  # fmt: skip
     result = rollout(state, colliders, gravity=(0, 0, 0), frames=4)
     mass, dt = DENSITY * SPACING**3, 4e-4
     x = torch.stack([m.sample(3, 25, dt)[0] for m in motions], 1).reshape(3, 25, 2, 3)
@@ -144,7 +175,7 @@ def test_body_flows_around_and_does_not_enter():
     it passes through."""
     x = lattice((0.24, 0.24, 0.24)) + torch.tensor([0.0, 0.0, 0.28]).double()
     shapes = [(Sphere(0.12), Motion((0.02, 0.0, 0.0))), (Capsule(0.08, 0.3), Motion((-0.12, 0.0, 0.02), (math.pi / 2, 0.0, 0.0)))]
-    colliders = [Collider(shape, "separate", 0.1, motion, thickness=0.0) for shape, motion in shapes]
+    colliders = [Collider(shape, "separate", 0.1, motion) for shape, motion in shapes]
     mu, lam = lame(torch.tensor(2e4).double(), torch.tensor(0.3).double())
     soft = {"frames": 26, "law": "von_mises", "parameters": {"mu": mu, "lam": lam, "yield_stress": 500.0}}
     result, passed = (rollout(at_rest(x, (0.0, 0.0, -1.5)), solid, **soft) for solid in (colliders, []))
@@ -158,7 +189,8 @@ def test_body_flows_around_and_does_not_enter():
 
 @pytest.mark.parametrize("turn", [0.0, 20.0])
 def test_block_slips_at_the_friction_angle(turn):
-    """Along the grid and 20 degrees out of it: one degree below the friction angle it holds, one above it slides."""
+    """Along the grid and 20 degrees out of it: one degree below the friction angle it holds, one above it slides. What holds is
+    a friction of at most GRIP of a particle's velocity in a substep: it gives way until that is the pull of all layers above."""
     friction, seen = 0.3, []
     R = exponential(torch.tensor([0.0, math.radians(turn), 0.0]).double())
     for degrees in (-1.0, 1.0, 3.0):
@@ -174,35 +206,33 @@ def test_block_slips_at_the_friction_angle(turn):
         seen.append((acceleration(result.times[10:], along[10:]), 9.8 * (math.sin(angle) - friction * math.cos(angle)),
                      float((result.v[-1].mean(0) @ R)[0])))  # fmt: skip
     (_, _, held), *sliding = seen
-    assert abs(held) < 2e-3
+    pull = 9.8 * math.sin(math.atan(friction) - math.radians(1.0))
+    assert held == pytest.approx(pull * (0.024 / 45) * (0.12 / SPACING) / GRIP, rel=0.15)
     for found, expected, velocity in sliding:
         assert found == pytest.approx(expected, abs=0.2 * 9.8 * math.radians(1.0)) and velocity > 0.1
 
 
 def test_sphere_rolls_down_an_incline():
-    """5/7 g sin(angle) without slipping. The grid holds the sphere up half a cell early, so it rolls on a radius larger by that:
-    1/(1 + 2/5 (R/h)^2) with h the height of its centre, which is matched to 3 %. A contact that fades in would brake it."""
+    """5/7 g sin(angle) without slipping; 0.95 and 0.96 of it at 7 and 10 cells, as contact that opens and closes takes energy."""
     cells, radius, angle = 7, 0.1, math.radians(20)
     dx = radius / cells
     x = lattice((2.4 * radius,) * 3, dx / 2)
-    x = x[x.norm(dim=1) < radius] + torch.tensor([0.0, 0.0, radius + 0.5 * dx]).double()
+    x = x[x.norm(dim=1) < radius] + torch.tensor([0.0, 0.0, radius]).double()
     mu, lam = lame(torch.tensor(5e5).double(), torch.tensor(0.3).double())
     substeps = required_substeps(float(lam + 2 * mu), DENSITY, 0.02, dx, 3.0)
     simulator = Simulator("neo_hookean", dx=dx, substeps=substeps, frame_dt=0.02, dtype=torch.float32,
                           gravity=(9.8 * math.sin(angle), 0.0, -9.8 * math.cos(angle)),
-                          colliders=[Collider(HalfSpace(), "separate", 0.6, thickness=0.0)])  # fmt: skip
+                          colliders=[Collider(HalfSpace(), "touch", 0.6)])  # fmt: skip
     start = at_rest(x)
     start = ParticleState(*(getattr(start, k).float() for k in ("x", "v", "C_affine", "F", "F_tot")))
     result = simulator.rollout(start, {"mu": mu, "lam": lam}, torch.full((len(x),), (dx / 2) ** 3), DENSITY, 26)
     centre = result.x.double().mean(1)
     found = acceleration(result.times[8:].double(), centre[8:, 0]) / (9.8 * math.sin(angle))
-    height = float(centre[8:, 2].mean())
-    assert found == pytest.approx(1 / (1 + 0.4 * (radius / height) ** 2), rel=0.03)
-    assert found == pytest.approx(5 / 7, rel=0.05)
+    assert found == pytest.approx(5 / 7, rel=0.06)
     # rolling, not sliding: it spins as fast as it goes, less what it lost when it landed
     arm, v = result.x[-1].double() - centre[-1], result.v[-1].double()
     spin = float((v[:, 0] * arm[:, 2] - v[:, 2] * arm[:, 0]).sum() / (arm[:, [0, 2]] ** 2).sum())
-    assert spin * height == pytest.approx(float(v[:, 0].mean()), rel=0.15)
+    assert spin * radius == pytest.approx(float(v[:, 0].mean()), rel=0.1)
 
 
 def test_squeezed_block_answers_with_the_uniaxial_stress():
@@ -236,17 +266,17 @@ def test_squeezed_block_answers_with_the_uniaxial_stress():
 
 
 CASES = {
-    "glued box": (Box((0.3, 0.1, 0.25)), "sticky", 0.0, 0.05),
-    "rubbing sphere": (Sphere(0.12), "separate", 0.3, 0.04),
-    "slipping capsule": (Capsule(0.07, 0.15), "slip", 0.0, 0.0),
-    "rubbing cylinder": (Cylinder(0.09, 0.3), "separate", 0.3, 0.03),
+    "glued box": (Box((0.3, 0.1, 0.25)), "sticky", 0.0),
+    "rubbing sphere": (Sphere(0.12), "separate", 0.3),
+    "slipping capsule": (Capsule(0.07, 0.15), "slip", 0.0),
+    "rubbing cylinder": (Cylinder(0.09, 0.3), "touch", 0.3),
 }
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_gradient_of_a_rollout(name, make_block, monkeypatch):
     """In pose, velocities (per frame), the body's position and velocity and its stiffness; loss on the state and the reactions."""
-    shape, mode, friction, thickness = CASES[name]
+    shape, mode, friction = CASES[name]
     monkeypatch.setattr("mosa.physics.engine.stepping.SEGMENT", 8)
     state = make_block(velocity=(0.0, -0.8, 0.0))
     leaves = {"position": [0.15, -0.05, 0.11], "rotation": [0.2, -0.1, 0.3], "velocity": [[0.2, 0.4, 0.0], [0.0, 0.6, -0.2]],
@@ -254,7 +284,7 @@ def test_gradient_of_a_rollout(name, make_block, monkeypatch):
     leaves = {k: torch.tensor(v, dtype=torch.float64, requires_grad=True) for k, v in leaves.items()}
     simulator = Simulator("corotated", dx=DX, substeps=15, frame_dt=6e-3, gravity=(0, 0, 0), dtype=torch.float64,
                           colliders=[Collider(Sphere(0.05), "slip", motion=Motion((0.15, 0.13, 0.1))),
-                                     Collider(shape, mode, friction, thickness=thickness)])  # fmt: skip
+                                     Collider(shape, mode, friction)])  # fmt: skip
     g = torch.Generator().manual_seed(3)
     weights = {k: torch.randn(s, generator=g, dtype=torch.float64) for k, s in
                {"x": (3, 64, 3), "v": (3, 64, 3), "F": (3, 64, 3, 3), "reactions": (2, 15, 2, 6)}.items()}  # fmt: skip
@@ -292,16 +322,19 @@ def test_gradient_of_a_rollout(name, make_block, monkeypatch):
         assert min(abs(value - e) / abs(e) for e in estimates) < allowed, (key, value, estimates)
 
 
-def test_thickness_makes_a_flat_face_differentiable_in_position():
-    """With thickness 0 a node is in contact or not: no gradient sees the height of a resting plate; with it, the gradient does."""
+def test_a_flat_face_is_differentiable_in_its_height():
+    """A resting plate's height, against differences: no jump as a particle comes to touch it."""
     x = lattice((0.12, 0.12, 0.12)) + torch.tensor([0.0, 0.0, 0.07]).double()
-    gradients = []
-    for thickness in (0.0, DX):
-        height = torch.tensor([0.0, 0.0, -0.025], dtype=torch.float64, requires_grad=True)
-        collider = Collider(HalfSpace(), "separate", 0.0, Motion(height), thickness)
-        result = rollout(at_rest(x, (0.0, 0.0, -1.0)), [collider])
-        gradients.append(float(torch.autograd.grad(result.x[-1][:, 2].mean(), height)[0][2]))
-    assert gradients[0] == 0 and gradients[1] > 0.01
+
+    def height_after(z):
+        motion = Motion(torch.stack([0 * z, 0 * z, z]))
+        return rollout(at_rest(x, (0.0, 0.0, -1.0)), [Collider(HalfSpace(), "separate", 0.0, motion)]).x[-1][:, 2].mean()
+
+    z = torch.tensor(0.0, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(height_after(z), z)
+    with torch.no_grad():
+        difference = (height_after(z + 1e-3) - height_after(z - 1e-3)) / 2e-3
+    assert float(slope) > 0.01 and float(slope) == pytest.approx(float(difference), rel=0.02)
 
 
 def test_continued_rollout_takes_the_motion_up(make_block):
@@ -320,8 +353,16 @@ def test_continued_rollout_takes_the_motion_up(make_block):
     assert torch.equal(again.x, whole.x)
 
 
-def test_domain_walls_keep_a_body_in():
-    walls = domain_walls(torch.tensor([[-0.2, -0.2, -0.2], [0.2, 0.2, 0.2]]), "separate")
+def test_a_layer_of_particles_on_what_sticks_stays():
+    """Nodes below it hold nothing else, so that all it is given comes back to it."""
+    x = lattice((0.12, 0.12, 0.02)) + torch.tensor([0.0, 0.0, 0.012]).double()
+    found = rollout(at_rest(x, (1.0, 0.0, -0.1)), [Collider(HalfSpace(), "sticky")], frames=11)
+    assert found.v[-1].abs().max() < 0.2 and (found.x[-1] - found.x[0])[:, 0].abs().max() < 0.02
+
+
+@pytest.mark.parametrize("mode", ["separate", "touch"])
+def test_domain_walls_keep_a_body_in(mode):
+    walls = domain_walls(torch.tensor([[-0.2, -0.2, -0.2], [0.2, 0.2, 0.2]]), mode)
     result = rollout(at_rest(lattice((0.12, 0.12, 0.12)), (3.0, -2.0, -1.0)), planes=walls, frames=16)
     assert result.x.abs().max() < 0.2 + 0.5 * DX
     assert result.x[:, :, 0].max() > 0.15 and result.v[-1][:, 0].mean() < 2.0

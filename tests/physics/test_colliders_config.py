@@ -9,17 +9,12 @@ import torch
 
 from mosa.errors import ConfigError
 from mosa.physics.contact.colliders import (
-    Box,
-    Capsule,
     Collider,
-    Cylinder,
     HalfSpace,
     Sphere,
     colliders_from_config,
-    differentiable_thickness,
     pack_colliders,
     reach,
-    thickness_on,
 )
 from mosa.physics.contact.keys import KEYS
 from mosa.physics.contact.motion import Motion
@@ -36,12 +31,12 @@ def test_every_type(tmp_path):
         {"type": "plane", "normal": [0, 2, 0], "position": [0, 1, 0], "mode": "separate", "friction": 0.3},
         {"type": "sphere", "radius": 0.1, "motion": {"velocity": [1, 0, 0], "angular_velocity": [0, 0, 1]}},
         {"type": "capsule", "radius": 0.1, "length": 0.4, "rotation": [0, 0, 1, 90]},
-        {"type": "cylinder", "radius": 0.3, "length": 0.4, "thickness": 0.02, "name": "roll"},
+        {"type": "cylinder", "radius": 0.3, "length": 0.4, "mode": "touch", "name": "roll"},
         {"type": "box", "size": [1, 2, 2], "motion": {"waypoints": [
             {"time": 0.0, "position": [0, 0, 0]}, {"time": 1.0, "position": [0, 0, 1], "rotation": [1, 0, 0, 90]}]}},
-        {"type": "mesh", "path": str(tmp_path / "cube.obj"), "spacing": 0.1, "scale": 2.0, "thickness": 0.3},
+        {"type": "mesh", "path": str(tmp_path / "cube.obj"), "spacing": 0.1, "scale": 2.0, "margin": 0.6},
     ])  # fmt: skip
-    pack_colliders(made, torch.float32, torch.device("cpu"), 0.1)
+    pack_colliders(made, torch.float32, torch.device("cpu"))
     plane, sphere, capsule, roll, box, mesh = made
     assert plane.mode == "separate" and plane.friction == 0.3
     up = plane.motion.sample(1, 1, 0.1)[1][0] @ torch.tensor([0.0, 0.0, 1.0]).double()
@@ -49,23 +44,14 @@ def test_every_type(tmp_path):
     assert sphere.shape == Sphere(0.1) and sphere.motion.max_speed(2.0) == pytest.approx(3.0)
     turned = capsule.motion.sample(1, 1, 0.1)[1][0]
     torch.testing.assert_close(turned[:, 0], torch.tensor([0.0, 1.0, 0.0]).double(), rtol=0, atol=1e-15)
-    assert (roll.name, roll.thickness) == ("roll", 0.02) and reach(roll.shape) == pytest.approx(math.hypot(0.3, 0.2))
+    assert (roll.name, roll.mode) == ("roll", "touch") and reach(roll.shape) == pytest.approx(math.hypot(0.3, 0.2))
     assert reach(box.shape) == pytest.approx(1.5) and reach(capsule.shape) == pytest.approx(0.3) and reach(plane.shape) == 0
     x, R, *_ = box.motion.sample(3, 1, 0.5)
     torch.testing.assert_close(x[1], torch.tensor([0.0, 0.0, 0.5]).double())
     torch.testing.assert_close(R[2] @ R[2], torch.diag(torch.tensor([1.0, -1.0, -1.0])).double(), rtol=0, atol=1e-12)
     centre = torch.ones(1, 3).double()
     assert float(signed_distance(mesh.shape, centre)) == pytest.approx(-1.0, abs=0.06)
-    # a quarter of a cell; inside of what may let go: 1.8 cells less the half width, over 0.6, and where there are edges 1.4 cells
-    thin, slab, beam = (0.18 - 0.05) / 0.6, Box((0.1, 1.0, 1.0)), Capsule(0.05, 0.4)
-    for shape, mode, least in ((HalfSpace(), "separate", 0.025), (Sphere(0.02), "slip", 0.025), (slab, "sticky", 0.025),
-                               (slab, "slip", thin), (slab, "separate", thin), (box.shape, "slip", 0.14), (beam, "slip", thin),
-                               (Capsule(0.2, 0.4), "slip", 0.025), (Cylinder(0.3, 0.1), "slip", thin), (roll.shape, "slip", 0.14),
-                               (mesh.shape, "sticky", 0.025), (mesh.shape, "slip", 0.14)):  # fmt: skip
-        assert differentiable_thickness(Collider(shape, mode), 0.1) == pytest.approx(least)
-    assert differentiable_thickness(Collider(mesh.shape, "slip"), 2.0) == pytest.approx((3.6 - 1.0) / 0.6, rel=0.03)
-    assert (thickness_on(roll, 0.1), thickness_on(box, 0.1)) == (0.02, pytest.approx(0.14))
-    assert thickness_on(Collider(mesh.shape), 1.0) == mesh.shape.margin < 1.4
+    assert mesh.shape.margin == 0.6
 
 
 def test_the_page_about_the_twin_lists_every_type_and_key():
@@ -81,7 +67,7 @@ def test_the_page_about_the_twin_lists_every_type_and_key():
             given = {"type": kind, **{key: needed[key] for key in keys if key in needed}}
             assert colliders_from_config([given])[0].mode == "sticky"  # needs no other key
     common = set(KEYS) - {key for keys in own.values() for key in keys}
-    assert common == set(rows) - set(own) - {"type"} and "| 1.4 cells, of a mesh at most its `margin` |" in section
+    assert common == set(rows) - set(own) - {"type"}
     turned, facing = colliders_from_config([{"type": "plane", "rotation": [1, 0, 0, -90]}, {"type": "plane", "normal": [0, 1, 0]}])
     poses = [collider.motion.sample(1, 1, 0.1)[1][0] for collider in (turned, facing)]
     torch.testing.assert_close(*poses, rtol=0, atol=1e-15)
@@ -109,9 +95,9 @@ def test_the_page_about_the_twin_lists_every_type_and_key():
         ({"type": "box", "size": [1, 1]}, r"\[0\]\.size"),
         ({"type": "box", "size": [1, 1, 0]}, r"\[0\]\.size"),
         ({"type": "box", "size": "111"}, r"\[0\]\.size"),
-        ({"type": "sphere", "radius": 1, "thickness": math.inf}, r"\[0\]\.thickness"),
+        ({"type": "sphere", "radius": 1, "thickness": 0.02}, r"\[0\]: unknown: thickness; a sphere takes radius, name, mode"),
         ({"type": "sphere", "radius": 1, "friction": math.inf, "mode": "separate"}, r"\[0\]\.friction"),
-        ({"type": "sphere", "radius": 1, "friction": 0.5}, r"\[0\]\.friction: acts on mode separate"),
+        ({"type": "sphere", "radius": 1, "friction": 0.5}, r"\[0\]\.friction: acts on modes separate and touch"),
         ({"type": "sphere", "radius": 1, "mode": ["slip"]}, r"\[0\]\.mode"),
         ({"type": "sphere", "radius": 1, "position": [0, math.nan, 0]}, r"\[0\]\.position"),
         ({"type": "sphere", "radius": 1, "position": [0, True, 0]}, r"\[0\]\.position"),
@@ -134,16 +120,16 @@ def test_errors_of_a_configuration(item, match):
     [
         (Collider(Sphere(0.0)), "collider 0: Sphere: expected positive"),
         (Collider(Sphere(1.0), "bouncy", name="ball"), "collider ball: mode.*'bouncy'"),
-        (Collider(Sphere(1.0), "slip", 0.2), "separate only"),
-        (Collider(Sphere(1.0), thickness=-1.0), "thickness"),
-        (Collider(Sphere(1.0), thickness=math.inf), "thickness"),
+        (Collider(Sphere(1.0), "slip", 0.2), "separate and touch only"),
+        (Collider(Sphere(1.0), "touch", -1.0), "friction"),
+        (Collider(Sphere(1.0), "touch", math.inf), "friction"),
         (Collider(Sphere(math.inf)), "positive lengths"),
         (Collider("sphere"), "shape: expected one of HalfSpace"),
     ],
 )
 def test_packing_errors(collider, match):
     with pytest.raises(ConfigError, match=match):
-        pack_colliders([collider], torch.float64, torch.device("cpu"), 0.1)
+        pack_colliders([collider], torch.float64, torch.device("cpu"))
 
 
 def test_motions_of_another_number(make_block):

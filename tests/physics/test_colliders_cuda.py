@@ -19,7 +19,7 @@ def run(state, shape, device, dtype):
     rotation = torch.tensor([0.2 - torch.pi / 2, -0.1, 0.3], device=device, dtype=dtype, requires_grad=True)
     mu = torch.full((), 4e4, device=device, dtype=dtype, requires_grad=True)
     motion = Motion((0.15, -0.05, 0.11), rotation, velocity, (1.0, 0.0, 2.0))
-    colliders = [Collider(shape, "separate", 0.3, motion, 0.03), Collider(Sphere(0.05), "slip", motion=Motion((0.15, 0.13, 0.1)))]
+    colliders = [Collider(shape, "separate", 0.3, motion), Collider(Sphere(0.05), "slip", motion=Motion((0.15, 0.13, 0.1)))]
     simulator = Simulator("corotated", dx=0.04, substeps=10, frame_dt=4e-3, dtype=dtype, device=device, colliders=colliders)
     volume = torch.full((len(state.x),), 8e-6, device=device, dtype=dtype)
     result = simulator.rollout(state, {"mu": mu, "lam": 5e4}, volume, 1000.0, 4)  # the third segment replays a graph

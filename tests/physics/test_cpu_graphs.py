@@ -45,7 +45,7 @@ def test_captured_segments_are_those_launched_one_by_one(kept, tight, collides, 
     monkeypatch.setattr(workspace.Workspace, "_launch", lambda *a: (launches.append(1), send(*a)))
     state = make_block(velocity=(1.0, -4.0, 0.5))
     state = replace(state, v=state.v + 5 * (state.x - state.x.mean(0)))
-    ball = Collider(Sphere(0.1), motion=Motion(position=(*state.x.mean(0)[:1].tolist(), -0.5, 0.1)), thickness=0.02)
+    ball = Collider(Sphere(0.1), motion=Motion(position=(*state.x.mean(0)[:1].tolist(), -0.5, 0.1)))
 
     def simulator():
         return Simulator("corotated", dx=0.04, substeps=12, frame_dt=12 * 1e-3, gravity=(0.0, -90.0, 0.0), dtype=torch.float64,

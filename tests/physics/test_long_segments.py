@@ -15,7 +15,7 @@ from mosa.physics.engine.solver import SegmentSolver
 from mosa.types import Ground
 
 PARAMETERS = {"mu": 4e4, "lam": 5e4}
-COLLIDER = Collider(Sphere(0.06), "separate", 0.3, Motion((0.15, 0.0, 0.1), velocity=(0.0, 1.0, 0.0)), 0.02)
+COLLIDER = Collider(Sphere(0.06), "separate", 0.3, Motion((0.15, 0.0, 0.1), velocity=(0.0, 1.0, 0.0)))
 
 
 def run(state, long, *, substeps=70, dt=2e-4, parameters=PARAMETERS, frames=3, **options):

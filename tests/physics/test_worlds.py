@@ -21,15 +21,15 @@ GRAVITY = torch.tensor([[0.0, -9.8 - b, 0.4 * b] for b in range(WORLDS)], dtype=
 
 
 def simulator(law="corotated", gravity=(0.0, -9.8, 0.0), dtype=torch.float64, **options):
-    solids = [Collider(Sphere(0.06), "separate", 0.2, thickness=0.02), Collider(Sphere(0.05))]
+    solids = [Collider(Sphere(0.06), "separate", 0.2), Collider(Sphere(0.05))]
     floor = Plane((0, 0.02, 0), (0, 1, 0), "separate", 0.3)
     return Simulator(law, dx=0.04, substeps=SUBSTEPS, frame_dt=SUBSTEPS * DT, dtype=dtype, gravity=gravity, up=(0, 1, 0),
                      planes=[floor], colliders=options.pop("colliders", solids), **options)  # fmt: skip
 
 
 def motions(world):
-    return [Motion((0.15, -0.03 + 0.01 * world, 0.1), velocity=(0.0, 0.5 * world, 0.1)),
-            Motion((0.15, 0.18, 0.1), velocity=(0.1 * world, -1.0, 0.0))]  # fmt: skip
+    return [Motion((0.15, -0.02 + 0.01 * world, 0.1), velocity=(0.0, 0.5 * world, 0.1)),
+            Motion((0.15, 0.16, 0.1), velocity=(0.1 * world, -1.0, 0.0))]  # fmt: skip
 
 
 def operator(world, strength=0.1):

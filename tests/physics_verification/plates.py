@@ -24,9 +24,9 @@ def uniaxial(stretch: float) -> float:
     return (2 * MU * (stretch - 1) * stretch + LAM * (J - 1) * J) / stretch
 
 
-def squeezed(cells: int, *, angle: float = 0.0, thickness: float | None = None) -> float:
+def squeezed(cells: int, *, angle: float = 0.0, mode: str = "separate") -> float:
     """Mean force on the plates, without friction, over that of 30 % of stroke. cells: of the cylinder's height; angle [degrees]:
-    of its axis out of the grid; thickness: of the contact, in cells, None for the default."""
+    of its axis out of the grid; mode: of the plates' contact."""
     dx = HEIGHT / cells
     h, n, t = dx / 2, 2 * cells, math.radians(angle)
     R = torch.eye(3, dtype=torch.float64)
@@ -34,7 +34,7 @@ def squeezed(cells: int, *, angle: float = 0.0, thickness: float | None = None) 
     along = (torch.arange(n).double() + 0.5) * h
     rest = torch.stack(torch.meshgrid(along - RADIUS, along, along - RADIUS, indexing="ij"), -1).reshape(-1, 3)
     rest = rest[rest[:, 0] ** 2 + rest[:, 2] ** 2 < RADIUS**2]
-    offset = R @ torch.tensor([0.0, 0.3 * dx if angle else 0.0, 0.0], dtype=torch.float64)  # no node on the plates' faces
+    offset = R @ torch.tensor([0.0, 0.3 * dx if angle else 0.0, 0.0], dtype=torch.float64)
     axis, z = R[:, 1], torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     plates = []
     for side, height in ((1, 0.0), (-1, HEIGHT)):
@@ -43,7 +43,7 @@ def squeezed(cells: int, *, angle: float = 0.0, thickness: float | None = None) 
         first, last = offset + height * axis, offset + (height + side * 0.5 * STROKE * HEIGHT) * axis
         places = [p.tolist() for p in (first, last, last)]
         motion = Motion.waypoints([0, RAMP, RAMP + HOLD + 1], places, torch.stack([attitude] * 3))
-        plates.append(Collider(HalfSpace(), "separate", 0.0, motion, None if thickness is None else thickness * dx))
+        plates.append(Collider(HalfSpace(), mode, 0.0, motion))
     substeps = math.ceil(FRAME * math.sqrt((LAM + 2 * MU) / DENSITY) / (0.4 * dx))
     simulator = Simulator("corotated", dx=dx, substeps=substeps, frame_dt=FRAME, gravity=(0, 0, 0), up=(0, 1, 0), colliders=plates,
                           dtype=torch.float64)  # fmt: skip

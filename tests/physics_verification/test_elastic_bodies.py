@@ -112,4 +112,4 @@ def test_29_plates_feel_the_force_of_their_stroke_on_any_grid(angle):
     """A cylinder of 6 and 9 cells, squeezed by 30 %: both within 3 % of the uniaxial force."""
     coarse, fine = squeezed(6, angle=angle), squeezed(9, angle=angle)
     assert coarse == pytest.approx(1.0, abs=0.03) and fine == pytest.approx(1.0, abs=0.03)
-    assert squeezed(6, angle=angle, thickness=0.0) < 0.7
+    assert 0.8 < squeezed(6, angle=angle, mode="touch") < 0.9  # the softer contact of films

@@ -38,8 +38,10 @@ class ColliderBuffers:
             return [tensor for tensor, _ in made], [array for _, array in made]
 
         self.poses, self._poses = buffers(pose)
+        _, self._v_struck = work.array((work.particles, 3), vec3)
+
         def sums(tensors):
-            """What nodes add to, of which `tensors` are made: exact sums, or the tensors themselves (None)."""
+            """What particles add to, of which `tensors` are made: exact sums, or the tensors themselves (None)."""
             if not work.exact:
                 return None
             shapes = [(*t.shape[:2], prod(t.shape[2:]), COLUMNS) for t in tensors]
@@ -51,12 +53,6 @@ class ColliderBuffers:
             self.adj_poses, self._adj_poses = buffers(pose)
             self._adj_sums = sums(self.adj_poses)
             self.adj_reaction, self._adj_reaction = buffers(pose[2:])
-
-    def set_nodes(self, nodes: int) -> None:
-        """Buffers for so many grid nodes, for the adjoint."""
-        if self.with_adjoint:
-            self.before, self.before_wp = self._work.array((nodes, 4), self.kernels.vec4)
-            self.adj_mass, self._adj_mass = self._work.array((nodes,), self._scalar)
 
     def load(self, poses: tuple[Tensor, ...]) -> None:
         """Copy the poses of a segment's substeps in."""
@@ -90,24 +86,21 @@ class ColliderBuffers:
             flat = [wp.from_torch(added.view(-1, COLUMNS)), wp.from_torch(target.view(-1), dtype=self._scalar)]
             self._work.run(settle, target.numel(), flat)
 
-    def _arguments(self, place: list, step: int, time: float) -> list:
-        return [*place, 1.0 / time, self.count, step, *self._packed, *self._poses]
+    def _arguments(self, met: list, step: int, time: float) -> list:
+        return [*met, time, self._work.size, self.count, step, *self._packed, *self._poses]
 
-    def update(self, step: int, place: list, time: float, velocity, cleared) -> None:
-        """The grid update of substep `step` with contact. place, velocity, cleared: as `update_kernels` takes them; time [s]: for
-        which the substep's forces act."""
-        self._work.over_nodes(self.kernels.update_and_collide, [
-            *self._arguments(place, step, time), velocity, cleared, *self._added_to(self._reaction, self._reaction_sums),
+    def strike(self, step: int, met: list, time: float, again: bool) -> wp.array:
+        """Velocities of particles after contact in substep `step`. met: x, v, volume, springs, mass; time [s]: for which the
+        substep's forces act; again: the reaction is known already."""
+        reaction = [None, None] if again else self._added_to(self._reaction, self._reaction_sums)
+        self._work.run(self.kernels.strike, self._work.particles, [
+            *self._arguments(met, step, time), self._v_struck, *reaction,
         ])  # fmt: skip
+        return self._v_struck
 
-    def adjoint(self, step: int, place: list, time: float, adj_velocity) -> None:
-        """Turns the adjoint of node velocities after contact into that before it; `before` holds those velocities. place: grid,
-        cutoff, dx."""
-        self._work.over_nodes(self.kernels.adj_collide_nodes, [
-            *self._arguments(place, step, time), self.before_wp, *self._adj_reaction, adj_velocity, self._adj_mass,
+    def adjoint(self, step: int, met: list, time: float, adj_x, adj_v, adj_springs) -> None:
+        """Turns the adjoint of velocities after contact into that before it; adds to the others."""
+        self._work.run(self.kernels.adj_strike, self._work.particles, [
+            *self._arguments(met, step, time), *self._adj_reaction, adj_x, adj_v, adj_springs,
             *self._added_to(self._adj_poses, self._adj_sums),
         ])  # fmt: skip
-
-    def add_mass(self, adj_grid) -> None:
-        """The reaction's part of the adjoint of node masses, after the grid's own."""
-        self._work.over_nodes(self.kernels.add_mass, [self._adj_mass, adj_grid])

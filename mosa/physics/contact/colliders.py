@@ -1,7 +1,7 @@
 """Rigid colliders that move along a prescribed motion: what a user describes, and what the kernels get.
 
-A collider is a shape, a mode (sticky | slip | separate) with Coulomb friction, and a motion (`motion`). Its effect on the
-grid is in `collider_kernels`, the shapes' distances in `shapes`. A collider should be at least two grid cells thick: a
+A collider is a shape, a mode (sticky | slip | separate | touch) with Coulomb friction, and a motion (`motion`). Its effect on
+particles is in `collider_kernels`, the shapes' distances in `shapes`. A collider should be at least two grid cells thick: a
 B-spline grid lets material on both sides of a thinner one touch.
 """
 
@@ -19,8 +19,10 @@ from mosa.physics.contact import shapes as packing
 from mosa.physics.contact.keys import check_keys
 from mosa.physics.contact.mesh import SignedDistanceField, field_of_mesh
 from mosa.physics.contact.motion import Motion, Trajectory, exponential
-from mosa.physics.contact.planes import NODE_MODES, THICKNESS, Plane
+from mosa.physics.contact.planes import MODES, Plane
+from mosa.physics.contact.touch import GRIP
 from mosa.schema import is_number
+from mosa.types import RUBBING
 
 
 @dataclass(frozen=True)
@@ -58,11 +60,11 @@ class Box:
     size: tuple[float, float, float]
 
 
-SMOOTH = 0.25
-"""Cells: a contact that fades in over them joins a node smoothly enough for a gradient; over none it does so by a jump."""
-DEEP, KEPT = 1.8, 0.6
-"""Cells from particles that a solid keeps off, by the share `KEPT` of its thickness, to its middle, from which on nodes there no
-longer matter (a particle's weights reach 1.5 cells): measured with plates of 0.5 to 5 cells, docs/twin.md, Gradients."""
+STIFFER = 2.4
+"""Springs of solids that squeeze, over those of mode `touch`: plates then press with the force of the body's own law, to 1 %."""
+HOLD = 1.75
+"""Share of its sliding velocity that a particle loses in a substep on a solid of mode `sticky`. No friction coefficient bounds the
+force there, and from 2 on a particle that is alone in its cells would go back as fast as it came, or faster."""
 Shape = HalfSpace | Sphere | Capsule | Cylinder | Box | SignedDistanceField
 KINDS = {HalfSpace: packing.HALF_SPACE, Sphere: packing.SPHERE, Capsule: packing.CAPSULE, Cylinder: packing.CYLINDER,
          Box: packing.BOX, SignedDistanceField: packing.FIELD}  # fmt: skip
@@ -70,30 +72,23 @@ KINDS = {HalfSpace: packing.HALF_SPACE, Sphere: packing.SPHERE, Capsule: packing
 
 @dataclass(frozen=True)
 class Collider:
-    """A moving rigid solid. mode, friction: as for a plane, relative to the solid's velocity at the node.
+    """A moving rigid solid, which particles meet at its surface, at any angle to the grid (`collider_kernels`).
 
-    thickness [m]: over this distance above the surface the contact fades in: whole in the share `planes.WHOLE` of it next to
-    the surface, then falling to nothing, at any speed (a plane's is with what is slow alone). None: `planes.THICKNESS` cells of
-    the grid (of a mesh at most its margin). Plates then squeeze a body with the force of its own law, whatever dx, and a shaken
-    block stays where friction holds it; but an impact is felt up to a cell and a half early, and rolling is braked. 0: a node is
-    in contact or not, as for planes without friction; a ball rolls as it should, and each plate squeezes a body by about a quarter
-    of a cell less than its stroke. With a thickness the result is differentiable in the collider's position also where its surface
-    is flat; with 0 a node that changes sides is a jump that no gradient sees, and positions act through curvature, lever arms and
-    velocities only. The fade is per substep: a node of small weight still comes to a stop within as many substeps as its weight is
-    small.
+    mode: how a particle that touches it slides: `sticky` not at all, `slip` freely, `separate` and `touch` with Coulomb
+    `friction`. In all modes a body comes off freely. `touch` is a ground's mode of that name, softer than the others: a body loses
+    less of its bounce, and plates press with too little force (docs/verification.md).
     """
 
     shape: Shape
     mode: str = "sticky"
     friction: float = 0.0
     motion: Motion | Trajectory = field(default_factory=Motion)
-    thickness: float | None = None
     name: str = ""
 
 
 class PackedColliders(NamedTuple):
-    """K colliders for the kernels, without their motion. shapes: (K, 9): size 3, thickness, friction, lattice origin 3 and spacing;
-    codes: (K, 6) int32: kind, mode, lattice nodes 3, offset; fields: (M,) lattice values [m]."""
+    """K colliders for the kernels, without their motion. shapes: (K, 10): size 3, friction, lattice origin 3 and spacing,
+    stiffness, grip; codes: (K, 5) int32: kind, lattice nodes 3, offset; fields: (M,) lattice values [m]."""
 
     shapes: Tensor
     codes: Tensor
@@ -103,41 +98,8 @@ class PackedColliders(NamedTuple):
         return len(self.codes)
 
 
-def thickness_on(collider: Collider, dx: float) -> float:
-    """[m] of its contact on a grid of spacing dx [m]: its own, or the one of a collider without any."""
-    if collider.thickness is not None:
-        return collider.thickness
-    usual = THICKNESS * dx
-    return min(usual, collider.shape.margin) if isinstance(collider.shape, SignedDistanceField) else usual
-
-
-def differentiable_thickness(collider: Collider, dx: float) -> float:
-    """[m], on a grid of spacing dx [m]: from which on the gradient in the collider's pose and velocity is what differences of a
-    per cent find, to a few per cent of it (docs/twin.md, Gradients).
-
-    Where it is thinner, nodes change their velocity by a jump as the solid passes over them, which no derivative sees: at the
-    surface where nothing fades in; and inside of the solid where the nearest face becomes another one, in modes that act along
-    its normal alone. Those nodes matter as long as they carry mass of particles outside: behind the middle of a thin solid, and
-    next to the edges of boxes, cylinders and meshes. Half spaces have none inside, and spheres a single point.
-    """
-    shape, least = collider.shape, SMOOTH * dx
-    if collider.mode == "sticky" or isinstance(shape, HalfSpace | Sphere):
-        return least
-    least = max(least, (DEEP * dx - half_width(shape)) / KEPT)
-    return least if isinstance(shape, Capsule) else max(least, THICKNESS * dx)
-
-
-def half_width(shape: Shape) -> float:
-    """Distance [m] from the surface to the deepest point inside; infinite for a half space."""
-    if isinstance(shape, SignedDistanceField):
-        return max(0.0, -float(shape.values.min()))
-    if isinstance(shape, Capsule):
-        return shape.radius
-    return min(_sizes(shape), default=math.inf)
-
-
-def pack_colliders(colliders: Sequence[Collider], dtype: torch.dtype, device: torch.device, dx: float) -> PackedColliders:
-    """dx [m]: of the grid. Errors: ConfigError naming the collider and the field."""
+def pack_colliders(colliders: Sequence[Collider], dtype: torch.dtype, device: torch.device) -> PackedColliders:
+    """Errors: ConfigError naming the collider and the field."""
     shapes = torch.zeros(len(colliders), packing.SHAPE_COLUMNS, dtype=torch.float64)
     codes = torch.zeros(len(colliders), packing.CODE_COLUMNS, dtype=torch.int32)
     fields, offset = [torch.zeros(1, dtype=torch.float64)], 1
@@ -145,26 +107,21 @@ def pack_colliders(colliders: Sequence[Collider], dtype: torch.dtype, device: to
         where, shape = f"collider {collider.name or i}", collider.shape
         if type(shape) not in KINDS:
             raise ConfigError(f"{where}: shape: expected one of {', '.join(k.__name__ for k in KINDS)}, found {shape!r}")
-        if collider.mode not in NODE_MODES:
-            raise ConfigError(f"{where}: mode: expected one of {', '.join(NODE_MODES)}, found {collider.mode!r}")
-        given, thickness = collider.thickness, thickness_on(collider, dx)
-        for name, value in (("friction", collider.friction), ("thickness", thickness)):
-            if isinstance(value, bool) or not 0 <= value < math.inf:
-                raise ConfigError(f"{where}: {name}: expected a finite number >= 0, found {value}")
-        if collider.friction > 0 and collider.mode != "separate":
-            raise ConfigError(f"{where}: friction acts on mode separate only, found mode {collider.mode!r}")
+        if collider.mode not in MODES:
+            raise ConfigError(f"{where}: mode: expected one of {', '.join(MODES)}, found {collider.mode!r}")
+        if isinstance(collider.friction, bool) or not 0 <= collider.friction < math.inf:
+            raise ConfigError(f"{where}: friction: expected a finite number >= 0, found {collider.friction}")
+        if collider.friction > 0 and collider.mode not in RUBBING:
+            raise ConfigError(f"{where}: friction acts on modes {' and '.join(RUBBING)} only, found mode {collider.mode!r}")
         for j, value in enumerate(_sizes(shape)):
             if not 0 < value < math.inf:
                 raise ConfigError(f"{where}: {type(shape).__name__}: expected positive lengths [m], found {shape}")
             shapes[i, packing.SIZE + j] = value
-        shapes[i, packing.THICKNESS], shapes[i, packing.FRICTION] = thickness, collider.friction
-        codes[i, packing.KIND], codes[i, packing.MODE] = KINDS[type(shape)], NODE_MODES[collider.mode]
+        sticks = collider.mode == "sticky"
+        shapes[i, packing.FRICTION], shapes[i, packing.HOLD] = (math.inf, HOLD) if sticks else (collider.friction, GRIP)
+        shapes[i, packing.STIFFNESS] = 1.0 if collider.mode == "touch" else STIFFER
+        codes[i, packing.KIND] = KINDS[type(shape)]
         if isinstance(shape, SignedDistanceField):
-            if given is not None and shape.margin < thickness:
-                raise ConfigError(
-                    f"{where}: thickness: the field of the mesh reaches {shape.margin:.3g} m beyond it, less than {thickness}: "
-                    "make it with a larger margin"
-                )
             shapes[i, packing.ORIGIN : packing.ORIGIN + 3] = torch.as_tensor(shape.origin, dtype=torch.float64)
             shapes[i, packing.SPACING] = shape.spacing
             codes[i, packing.DIMS : packing.DIMS + 3] = torch.tensor(shape.values.shape)
@@ -197,12 +154,12 @@ def reach(shape: Shape) -> float:
 
 def domain_walls(box: Tensor, mode: str = "separate", friction: float = 0.0) -> list[Plane]:
     """Six planes that keep a body inside box (2, 3) [m]. Errors: ConfigError naming the key of `world.walls`."""
-    if not isinstance(mode, str) or mode not in NODE_MODES:
-        raise ConfigError(f"world.walls.mode: expected one of {', '.join(NODE_MODES)}, found {mode!r}")
+    if not isinstance(mode, str) or mode not in MODES:
+        raise ConfigError(f"world.walls.mode: expected one of {', '.join(MODES)}, found {mode!r}")
     if not is_number(friction) or friction < 0:
         raise ConfigError(f"world.walls.friction: expected a finite number >= 0, found {friction!r}")
-    if friction > 0 and mode != "separate":
-        raise ConfigError(f"world.walls.friction: acts with mode separate only, found mode {mode!r}")
+    if friction > 0 and mode not in RUBBING:
+        raise ConfigError(f"world.walls.friction: acts with modes {' and '.join(RUBBING)} only, found mode {mode!r}")
     low, high = torch.as_tensor(box).double().tolist()
     planes = []
     for axis in range(3):
@@ -215,14 +172,14 @@ def domain_walls(box: Tensor, mode: str = "separate", friction: float = 0.0) -> 
 
 _FIELDS = {"plane": (HalfSpace, ()), "sphere": (Sphere, ("radius",)), "capsule": (Capsule, ("radius", "length")),
            "cylinder": (Cylinder, ("radius", "length")), "box": (Box, ("size",)), "mesh": (None, ("path",))}  # fmt: skip
-_COMMON = ("type", "name", "mode", "friction", "thickness", "position", "rotation", "motion")
+_COMMON = ("type", "name", "mode", "friction", "position", "rotation", "motion")
 
 
 def colliders_from_config(items: Sequence[dict | Collider], field_name: str = "world.colliders") -> tuple[Collider, ...]:
     """Colliders of plain containers, as a YAML file has them; a `Collider` is passed on.
 
     Each: type: plane | sphere | capsule | cylinder | box | mesh, with radius, length [m], size (3 edges) [m], or path (OBJ or PLY,
-    with spacing [m] of the lattice, and scale); plane takes `normal` instead of rotation; mode, friction, thickness, name;
+    with spacing [m] of the lattice, and scale); plane takes `normal` instead of rotation; mode, friction, name;
     position (3,) [m]; rotation (ax, ay, az, degrees); motion: {velocity, angular_velocity [rad/s], times} or
     {waypoints: [{time, position, rotation}, ...]}. Errors: ConfigError naming the entry and the field.
     """
@@ -247,22 +204,20 @@ def _collider(item: Mapping, where: str) -> Collider:
         raise ConfigError(f"{where}: a {kind} needs {', '.join(missing)}")
     check_keys(item, where)
     item = {key: value for key, value in item.items() if value is not None}
-    if item.get("friction", 0) > 0 and item.get("mode", "sticky") != "separate":
-        raise ConfigError(f"{where}.friction: acts on mode separate only, found mode {item.get('mode', 'sticky')!r}")
+    mode = item.get("mode", "sticky")
+    if item.get("friction", 0) > 0 and mode not in RUBBING:
+        raise ConfigError(f"{where}.friction: acts on modes {' and '.join(RUBBING)} only, found mode {mode!r}")
     try:
         if kind == "mesh":
             options = {key: float(item[key]) for key in extra if item.get(key) is not None}
-            if "thickness" in item:
-                options.setdefault("margin", 2.0 * float(item["thickness"]))
             shape = field_of_mesh(Path(item["path"]), **options)
         else:
             shape = make(*(tuple(map(float, item[k])) if k == "size" else float(item[k]) for k in needed))
         motion = _motion(item)
         friction = float(item.get("friction", 0.0))
-        thickness = float(item["thickness"]) if "thickness" in item else None
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from error
-    return Collider(shape, item.get("mode", "sticky"), friction, motion, thickness, str(item.get("name", "")))
+    return Collider(shape, mode, friction, motion, str(item.get("name", "")))
 
 
 def _motion(item: dict) -> Motion:

@@ -34,7 +34,7 @@ def update_kernels(scalar) -> SimpleNamespace:
         """Weight of plane i's contact of a node at y that comes with velocity u, and its slope in u's normal part [s/m]."""
         normal = vec3(planes[i, 0], planes[i, 1], planes[i, 2])
         phi = wp.dot(y, normal) - planes[i, 3]
-        w, _slope = fade(phi, planes[i, 5])
+        w = fade(phi, planes[i, 5])
         change = scalar(0.0)
         if w > scalar(0.0) and phi > scalar(wp.static(TOUCHING)):
             slow, slope = slowness(wp.dot(u, normal))

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from mosa.errors import ConfigError
-from mosa.physics.contact.planes import NODE_MODES
+from mosa.physics.contact.planes import MODES
 from mosa.schema import SECTION, WEIGHT, Kind, is_number, number, one_of
 
 FARTHEST = 1e6
@@ -40,8 +40,8 @@ VELOCITY = either(f"three finite numbers within {FARTHEST:g}, or such a triple f
 RISING = rows(Kind("", is_number), "")
 KEYS = {
     "radius": LENGTH, "length": LENGTH, "size": numbers("three lengths above 0 [m]", 3, lambda v: min(v) > 0),
-    "path": TEXT, "spacing": LENGTH, "scale": LENGTH, "margin": number(0, FARTHEST), "mode": one_of(*NODE_MODES),
-    "friction": WEIGHT, "thickness": number(0, FARTHEST), "name": TEXT, "position": THREE, "rotation": TURN, "motion": SECTION,
+    "path": TEXT, "spacing": LENGTH, "scale": LENGTH, "margin": number(0, FARTHEST), "mode": one_of(*MODES),
+    "friction": WEIGHT, "name": TEXT, "position": THREE, "rotation": TURN, "motion": SECTION,
     "normal": numbers("a non-zero vector of three finite numbers", 3, any),
 }  # fmt: skip
 MOTION = {

@@ -26,11 +26,10 @@ from mosa.physics.contact.touch import TOUCH
 from mosa.types import RUBBING, Ground
 
 NODE_MODES = {"sticky": 0, "slip": 1, "separate": 2}
-"""How nodes of a grid meet a solid."""
+"""How nodes of a grid meet a plane."""
 MODES = NODE_MODES | {"touch": TOUCH}
 THICKNESS = 1.4
-"""Cells: of a contact whose thickness is not given. With it and `WHOLE` a body that is squeezed between plates answers to their
-stroke with the force of its own law, on coarse grids as on fine ones, and a shaken block stays (docs/verification.md)."""
+"""Cells: of a contact whose thickness is not given. With it a shaken block stays (docs/verification.md)."""
 WHOLE = 0.45
 """Share of the thickness, next to the surface, in which a node is in contact as those inside are."""
 
@@ -38,7 +37,7 @@ SLOW = 0.05
 """m/s: of a node along a plane's normal, at which the contact above the plane counts half. What shakes a resting body moves at
 g H/c, hundredths of it for the softest; a tenth of a second's fall is twenty times as fast."""
 TOUCHING = 1e-6
-"""m: above a plane or solid, where a node counts as inside."""
+"""m: above a plane, where a node counts as inside."""
 
 
 @dataclass(frozen=True)
@@ -95,20 +94,18 @@ def pack_planes(planes: list[Plane], dtype: torch.dtype, device: torch.device, d
 
 
 def make_fade(scalar):
-    """Warp function fade(phi, thickness): (weight of the contact of a node at distance phi [m], its slope in phi)."""
+    """Warp function fade(phi, thickness): weight of the contact of a node at distance phi [m]."""
     whole, rest = WHOLE, 1.0 - WHOLE
 
     @wp.func
     def fade(phi: scalar, thickness: scalar):
         w = scalar(0.0)
-        slope = scalar(0.0)
         if phi <= wp.max(scalar(wp.static(TOUCHING)), scalar(wp.static(whole)) * thickness):
             w = scalar(1.0)
         elif phi < thickness:
             s = (phi / thickness - scalar(wp.static(whole))) / scalar(wp.static(rest))
             w = (scalar(1.0) - s) * (scalar(1.0) - s) * (scalar(1.0) + scalar(2.0) * s)
-            slope = scalar(-6.0) * s * (scalar(1.0) - s) / (scalar(wp.static(rest)) * thickness)
-        return w, slope
+        return w
 
     return fade
 
@@ -179,35 +176,3 @@ def make_plane_functions(scalar):
         return r
 
     return collide, adj_collide
-
-
-def make_normal_adjoint(scalar):
-    """Warp function adj_collide_normal: transposed Jacobian of `collide` in the normal, applied to a (moving colliders)."""
-    vec3 = wp.types.vector(length=3, dtype=scalar)
-
-    @wp.func
-    def adj_collide_normal(u: vec3, normal: vec3, mode: int, friction: scalar, a: vec3):
-        r = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
-        un = wp.dot(u, normal)
-        # t = u - un n:  dt = -(u.dn) n - un dn
-        if mode == 1:
-            r = -wp.dot(a, normal) * u - un * a
-        if mode == 2:
-            if un < scalar(0.0):
-                at = a
-                aun = scalar(0.0)
-                if friction > scalar(0.0):
-                    t = u - un * normal
-                    length = wp.length(t)
-                    keep = length + friction * un
-                    at = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
-                    if keep > scalar(0.0):
-                        d = t / length
-                        along = wp.dot(d, a)
-                        # r = t + friction un t/|t|
-                        at = a + (friction * un / length) * (a - along * d)
-                        aun = friction * along
-                r = (aun - wp.dot(at, normal)) * u - un * at
-        return r
-
-    return adj_collide_normal

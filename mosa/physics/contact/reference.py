@@ -1,22 +1,11 @@
-"""Pure torch float64 twin of the colliders: slow and obvious, for tests; gradients by plain autograd.
-
-Their thickness has to be given.
-"""
+"""Pure torch float64 twin of the colliders: slow and obvious, for tests; gradients by plain autograd."""
 
 import torch
 from torch import Tensor
 
-from mosa.physics.contact.colliders import Box, Capsule, Collider, Cylinder, HalfSpace, Sphere
+from mosa.physics.contact.colliders import HOLD, STIFFER, Box, Capsule, Collider, Cylinder, HalfSpace, Sphere
 from mosa.physics.contact.mesh import SignedDistanceField
-from mosa.physics.contact.planes import TOUCHING, WHOLE
-
-
-def fade(phi: Tensor, thickness: float) -> Tensor:
-    """Weight of the contact of nodes at distances phi (M,) [m]: 1 up to `WHOLE` of the thickness, then a smooth step to 0."""
-    if thickness == 0:
-        return (phi <= TOUCHING).to(phi)
-    s = ((phi / thickness - WHOLE) / (1 - WHOLE)).clamp(0, 1)
-    return torch.where(phi <= TOUCHING, torch.ones_like(phi), (1 - s) ** 2 * (1 + 2 * s))
+from mosa.physics.contact.touch import GRIP
 
 
 def signed_distance(shape, q: Tensor) -> Tensor:
@@ -54,41 +43,32 @@ def _trilinear(field: SignedDistanceField, q: Tensor) -> Tensor:
 
 
 def collide(
-    u: Tensor, m: Tensor, y: Tensor, colliders: list[Collider], poses: tuple[Tensor, ...], dt: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """(velocities (M, 3) after contact, force (K, 3), torque (K, 3)) of nodes at y (M, 3) with mass m (M,).
+    v: Tensor, x: Tensor, mass: Tensor, radius: Tensor, spring: Tensor, colliders: list[Collider], poses: tuple[Tensor, ...],
+    dt: float,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """(velocities (M, 3) after contact, force (K, 3), torque (K, 3)) of particles at x (M, 3) with mass, radius and spring (M,).
 
     poses: position (K, 3), rotation (K, 3, 3), linear (K, 3), angular (K, 3) of one substep.
     """
     forces, torques = [], []
-    for collider, x, Q, linear, angular in zip(colliders, *poses):
-        near = signed_distance(collider.shape, (y - x) @ Q).detach() <= max(collider.thickness, TOUCHING)
-        r = (y - x)[near]
+    for collider, origin, Q, linear, angular in zip(colliders, *poses):
+        near = signed_distance(collider.shape, (x - origin) @ Q).detach() < radius
+        r = (x - origin)[near]
         q = r @ Q
         if not q.requires_grad:
             q = q.detach().requires_grad_()
         phi = signed_distance(collider.shape, q)
         (gradient,) = torch.autograd.grad(phi.sum(), q, create_graph=True)
         n = (gradient / gradient.norm(dim=1, keepdim=True)) @ Q.mT
-        V = linear + torch.linalg.cross(angular.expand_as(r), r)
-        hit = V + _collide_each(u[near] - V, n, collider)
-        w = fade(phi, collider.thickness)
-        change = w[:, None] * (hit - u[near])
-        f = -(m[near] / dt)[:, None] * change
+        u = v[near] - linear - torch.linalg.cross(angular.expand_as(r), r)
+        push = dt * spring[near] * (1 if collider.mode == "touch" else STIFFER) * (radius[near] - phi)
+        tangential = u - (u * n).sum(1, keepdim=True) * n
+        lost = torch.full_like(push, HOLD)
+        if collider.mode != "sticky":
+            lost = (collider.friction * push / tangential.norm(dim=1)).clamp_max(GRIP)
+        change = push[:, None] * n - lost[:, None] * tangential
+        f = -(mass[near] / dt)[:, None] * change
         forces.append(f.sum(0))
         torques.append(torch.linalg.cross(r, f).sum(0))
-        u = u.index_put((near,), u[near] + change)
-    return u, torch.stack(forces), torch.stack(torques)
-
-
-def _collide_each(u: Tensor, n: Tensor, collider: Collider) -> Tensor:
-    """The plane's rule with a normal for each node."""
-    if collider.mode == "sticky":
-        return torch.zeros_like(u)
-    un = (u * n).sum(1, keepdim=True)
-    tangential = u - un * n
-    if collider.mode == "slip":
-        return tangential
-    length = tangential.norm(dim=1, keepdim=True)
-    keep = (length + collider.friction * un).clamp_min(0) / length
-    return torch.where(un < 0, keep * tangential if collider.friction > 0 else tangential, u)
+        v = v.index_put((near,), v[near] + change)
+    return v, torch.stack(forces), torch.stack(torques)

@@ -18,9 +18,9 @@ import warp as wp
 
 HALF_SPACE, SPHERE, CAPSULE, CYLINDER, BOX, FIELD = range(6)
 
-# columns of the packed shapes (K, 9) and codes (K, 6)
-SIZE, THICKNESS, FRICTION, ORIGIN, SPACING, SHAPE_COLUMNS = 0, 3, 4, 5, 8, 9
-KIND, MODE, DIMS, OFFSET, CODE_COLUMNS = 0, 1, 2, 5, 6
+# columns of the packed shapes (K, 10) and codes (K, 5)
+SIZE, FRICTION, ORIGIN, SPACING, STIFFNESS, HOLD, SHAPE_COLUMNS = 0, 3, 4, 7, 8, 9, 10
+KIND, DIMS, OFFSET, CODE_COLUMNS = 0, 1, 4, 5
 
 _SPHERE = wp.constant(SPHERE)
 _CAPSULE = wp.constant(CAPSULE)
@@ -33,7 +33,7 @@ _FIELD = wp.constant(FIELD)
 def shape_functions(scalar) -> SimpleNamespace:
     """Warp functions signed_distance -> (phi, gradient) and curvature -> Hessian of phi times a vector, for float32 or float64.
 
-    Arguments: shape k, point q (3,) in its axes [m], packed shapes (K, 9), codes (K, 6) and fields (flat lattice values, z
+    Arguments: shape k, point q (3,) in its axes [m], packed shapes (K, 10), codes (K, 5) and fields (flat lattice values, z
     fastest). Sizes: sphere radius; capsule and cylinder radius, half length; box half edges.
     """
     vec3 = wp.types.vector(length=3, dtype=scalar)
@@ -83,16 +83,16 @@ def shape_functions(scalar) -> SimpleNamespace:
     @wp.func
     def lattice(q: vec3, k: int, shapes: wp.array2d(dtype=scalar), codes: wp.array2d(dtype=int)):
         """(flat index of the cell's lowest node, -1 outside the lattice; place in the cell, in [0, 1])."""
-        h = shapes[k, 8]
-        t = (q - vec3(shapes[k, 5], shapes[k, 6], shapes[k, 7])) / h
+        h = shapes[k, 7]
+        t = (q - vec3(shapes[k, 4], shapes[k, 5], shapes[k, 6])) / h
         i = wp.floor(t[0])
         j = wp.floor(t[1])
         l = wp.floor(t[2])
         z = scalar(0.0)
         n = int(-1)
         if i >= z and j >= z and l >= z:
-            if i < scalar(codes[k, 2] - 1) and j < scalar(codes[k, 3] - 1) and l < scalar(codes[k, 4] - 1):
-                n = codes[k, 5] + (int(i) * codes[k, 3] + int(j)) * codes[k, 4] + int(l)
+            if i < scalar(codes[k, 1] - 1) and j < scalar(codes[k, 2] - 1) and l < scalar(codes[k, 3] - 1):
+                n = codes[k, 4] + (int(i) * codes[k, 2] + int(j)) * codes[k, 3] + int(l)
         return n, vec3(t[0] - i, t[1] - j, t[2] - l)
 
     @wp.func
@@ -121,10 +121,10 @@ def shape_functions(scalar) -> SimpleNamespace:
                     wy, sy = corner(f[1], j)
                     for l in range(2):
                         wz, sz = corner(f[2], l)
-                        value = fields[n + (i * codes[k, 3] + j) * codes[k, 4] + l]
+                        value = fields[n + (i * codes[k, 2] + j) * codes[k, 3] + l]
                         phi = phi + wx * wy * wz * value
                         g = g + value * vec3(sx * wy * wz, wx * sy * wz, wx * wy * sz)
-            g = g / shapes[k, 8]
+            g = g / shapes[k, 7]
         return phi, g
 
     @wp.func
@@ -140,12 +140,12 @@ def shape_functions(scalar) -> SimpleNamespace:
                     wy, sy = corner(f[1], j)
                     for l in range(2):
                         wz, sz = corner(f[2], l)
-                        value = fields[n + (i * codes[k, 3] + j) * codes[k, 4] + l]
+                        value = fields[n + (i * codes[k, 2] + j) * codes[k, 3] + l]
                         xy = sx * sy * wz
                         yz = wx * sy * sz
                         zx = sx * wy * sz
                         r = r + value * vec3(xy * b[1] + zx * b[2], xy * b[0] + yz * b[2], zx * b[0] + yz * b[1])
-            r = r / (shapes[k, 8] * shapes[k, 8])
+            r = r / (shapes[k, 7] * shapes[k, 7])
         return r
 
     @wp.func

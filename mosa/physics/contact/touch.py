@@ -10,6 +10,7 @@ Coulomb friction acts on what slides:
 r: half the cube root s of the particle's volume; phi: its height above the plane. k = STIFFNESS M / (density dx s), M: modulus of
 longitudinal waves: the spring is about as stiff as a cell of the material. A stiffer one gains no height and loses the bounce, as a
 grid swallows what goes to single particles. The grip is greater than one because a particle's neighbours share what it is given.
+Solids are met in the same way (`collider_kernels`).
 """
 
 from functools import cache
@@ -28,15 +29,63 @@ GRIP = 3.0
 
 def springs(modulus: Tensor, mass: Tensor, volume: Tensor, dx: float) -> Tensor:
     """k (N,) [1/s^2] of particles with these moduli [Pa], masses [kg] and volumes [m^3] (N,). dx [m]: of the grid."""
-    return STIFFNESS * modulus * volume.pow(2 / 3) / (mass * dx)
+    # in float64: in float32 a power has other last digits in another place of a tensor
+    return (STIFFNESS * modulus.double() * volume.double().pow(2 / 3) / (mass.double() * dx)).to(mass)
+
+
+@cache
+def touch_functions(scalar) -> SimpleNamespace:
+    """Warp functions radius(volume), pushed and adj_pushed for wp.float32 or wp.float64."""
+    vec3 = wp.types.vector(length=3, dtype=scalar)
+    third = 1.0 / 3.0
+
+    @wp.func
+    def radius(volume: scalar):
+        """Of a particle's ball: half its spacing."""
+        return scalar(0.5) * wp.pow(volume, scalar(wp.static(third)))
+
+    @wp.func
+    def pushed(u: vec3, n: vec3, j: scalar, friction: scalar, grip: scalar):
+        """Change of the velocity of a particle that moves with u relative to a surface of normal n and is pushed by j > 0. grip:
+        most of its sliding that friction takes."""
+        t = u - wp.dot(u, n) * n
+        length = wp.length(t)
+        lost = scalar(0.0)
+        if length > scalar(0.0):
+            lost = wp.min(grip, friction * j / length)
+        return j * n - lost * t
+
+    @wp.func
+    def adj_pushed(u: vec3, n: vec3, j: scalar, friction: scalar, grip: scalar, a: vec3):
+        """(adjoints of u, n, j) of the adjoint a of what `pushed` returns."""
+        un = wp.dot(u, n)
+        t = u - un * n
+        length = wp.length(t)
+        at = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
+        aj = wp.dot(a, n)
+        if length > scalar(0.0):
+            lost = friction * j / length
+            if lost < grip:
+                d = t / length
+                along = wp.dot(d, a)
+                at = lost * (along * d - a)
+                aj = aj - friction * along
+            else:
+                at = -grip * a
+        # t = u - un n
+        tilt = wp.dot(at, n)
+        return at - tilt * n, j * a - tilt * u - un * at, aj
+
+    return SimpleNamespace(radius=radius, pushed=pushed, adj_pushed=adj_pushed)
 
 
 @cache
 def touch_kernels(scalar) -> SimpleNamespace:
     """Kernels meet and adj_meet for wp.float32 or wp.float64 fields."""
     vec3 = wp.types.vector(length=3, dtype=scalar)
-    module = f"mosa.physics.touch_{scalar.__name__}"
-    grip, third = scalar(GRIP), scalar(1.0 / 3.0)
+    functions = touch_functions(scalar)
+    radius, pushed, adj_pushed = functions.radius, functions.pushed, functions.adj_pushed
+    module, grip = f"mosa.physics.touch_{scalar.__name__}", scalar(GRIP)
 
     @wp.func
     def met(v: vec3, x: vec3, r: scalar, planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int, kick: scalar):
@@ -47,13 +96,7 @@ def touch_kernels(scalar) -> SimpleNamespace:
                 n = vec3(planes[i, 0], planes[i, 1], planes[i, 2])
                 depth = r - (wp.dot(x, n) - planes[i, 3])
                 if depth > scalar(0.0):
-                    j = kick * depth
-                    t = u - wp.dot(u, n) * n
-                    length = wp.length(t)
-                    lost = scalar(0.0)
-                    if length > scalar(0.0):
-                        lost = wp.min(grip, planes[i, 4] * j / length)
-                    u = u + j * n - lost * t
+                    u = u + pushed(u, n, kick * depth, planes[i, 4], grip)
         return u
 
     @wp.kernel(module=module, enable_backward=False)
@@ -62,20 +105,21 @@ def touch_kernels(scalar) -> SimpleNamespace:
         planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int, dt: scalar, v_met: wp.array(dtype=vec3),
     ):  # fmt: skip
         p = wp.tid()
-        v_met[p] = met(v[p], x[p], scalar(0.5) * wp.pow(volume[p], third), planes, modes, count, dt * springs[p])
+        v_met[p] = met(v[p], x[p], radius(volume[p]), planes, modes, count, dt * springs[p])
 
     @wp.kernel(module=module, enable_backward=False)
     def adj_meet(
         x: wp.array(dtype=vec3), v: wp.array(dtype=vec3), volume: wp.array(dtype=scalar), springs: wp.array(dtype=scalar),
         planes: wp.array2d(dtype=scalar), modes: wp.array(dtype=int), count: int, dt: scalar,
-        adj_x: wp.array(dtype=vec3), adj_v: wp.array(dtype=vec3),
+        adj_x: wp.array(dtype=vec3), adj_v: wp.array(dtype=vec3), adj_springs: wp.array(dtype=scalar),
     ):  # fmt: skip
-        """Turns adj_v from that of the velocities after it to that of those before, and adds to adj_x."""
+        """Turns adj_v from that of the velocities after it to that of those before, and adds to adj_x and adj_springs."""
         p = wp.tid()
-        r = scalar(0.5) * wp.pow(volume[p], third)
+        r = radius(volume[p])
         kick = dt * springs[p]
         a = adj_v[p]
         ax = adj_x[p]
+        spring = scalar(0.0)
         for reverse in range(count):
             i = count - 1 - reverse
             if modes[i] == TOUCH:
@@ -83,24 +127,19 @@ def touch_kernels(scalar) -> SimpleNamespace:
                 depth = r - (wp.dot(x[p], n) - planes[i, 3])
                 if depth > scalar(0.0):
                     u = met(v[p], x[p], r, planes, modes, i, kick)
-                    j = kick * depth
-                    t = u - wp.dot(u, n) * n
-                    length = wp.length(t)
-                    of_j = wp.dot(a, n)
-                    at = a - of_j * n
-                    back = a
-                    if length > scalar(0.0):
-                        lost = planes[i, 4] * j / length
-                        if lost < grip:
-                            d = t / length
-                            along = wp.dot(d, at)
-                            back = a - lost * (at - along * d)
-                            of_j = of_j - planes[i, 4] * along
-                        else:
-                            back = a - grip * at
-                    a = back
-                    ax = ax - (kick * of_j) * n
+                    au, _an, aj = adj_pushed(u, n, kick * depth, planes[i, 4], grip, a)
+                    a = a + au
+                    ax = ax - (kick * aj) * n
+                    spring = spring + dt * depth * aj
         adj_v[p] = a
         adj_x[p] = ax
+        adj_springs[p] = adj_springs[p] + spring
 
-    return SimpleNamespace(meet=meet, adj_meet=adj_meet)
+    @wp.kernel(module=module, enable_backward=False)
+    def loosen(adj_springs: wp.array(dtype=scalar), slopes: wp.array2d(dtype=scalar), adj_parameters: wp.array2d(dtype=scalar)):
+        """Adds what springs (N,) with `slopes` (N, S) in packed parameters add to the adjoint of these."""
+        p = wp.tid()
+        for i in range(slopes.shape[1]):
+            adj_parameters[p, i] = adj_parameters[p, i] + adj_springs[p] * slopes[p, i]
+
+    return SimpleNamespace(meet=meet, adj_meet=adj_meet, loosen=loosen)

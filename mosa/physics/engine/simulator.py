@@ -96,7 +96,7 @@ class Simulator:
         all_planes = ([ground_plane(ground, up)] if ground is not None else []) + list(planes)
         values, modes = pack_planes(all_planes, dtype, self.device, float(dx))
         self.colliders = tuple(colliders)
-        packed_colliders = pack_colliders(self.colliders, dtype, self.device, float(dx)) if self.colliders else None
+        packed_colliders = pack_colliders(self.colliders, dtype, self.device) if self.colliders else None
         touching = any(plane.mode == "touch" for plane in all_planes)
         # a ground that particles meet yields a little, and the box may end at it
         low, high = corners(box, float(dx) if touching else 0.0)

@@ -102,11 +102,16 @@ class Workspace:
         self.impulses, self.impulses_wp = self._per_slot(2, (worlds, 3), self.kernels.vec3)
         self.planes_wp = wp.from_torch(numerics.planes, dtype=self.scalar)
         self.modes_wp = wp.from_torch(numerics.modes, dtype=wp.int32)
-        if numerics.touching:
+        self.colliders, self.springs = None, None
+        if numerics.touching or numerics.colliders is not None:
             self.touch = touch_kernels(self.scalar)
             self.v_met, self.v_met_wp = self.array((n, 3), self.kernels.vec3)
             self.springs, self.springs_wp = self.array((n,), self.scalar)
-        self.colliders = None
+            if with_adjoint:
+                _, self.adj_springs_wp = self.array((n,), self.scalar)
+                # of the springs in the packed parameters
+                self.slopes, self.slopes_wp = self.array((n, SLOTS), self.scalar)
+                self.adj_slots_wp = wp.from_torch(self.adj_held["parameters"], dtype=self.scalar)
         if numerics.colliders is not None:
             self.colliders = ColliderBuffers(numerics.colliders, self.scalar, substeps, self, with_adjoint)
         self.cutoff = 0.0
@@ -182,8 +187,6 @@ class Workspace:
         self.grid_wp, self.velocity_wp = ([wp.from_torch(t, dtype=vec4) for t in slots] for slots in self.fields)
         if self.exact:
             self.sums, self.sums_wp = self.array((4 * count, COLUMNS), wp.int64, torch.int64)
-        if self.colliders is not None:
-            self.colliders.set_nodes(count)
         if self.with_adjoint:
             self.adj_grid, self.adj_grid_wp = self.array((count, 4), vec4)
             _, self.adj_velocity_wp = self._per_slot(2, (count, 4), vec4)
@@ -231,14 +234,18 @@ class Workspace:
         self._tighten(held.get("parameters"))
 
     def _tighten(self, parameters: Tensor | None) -> None:
-        """Springs of the planes that particles meet, of packed parameters (N, SLOTS); the mass has to be there."""
-        if self.numerics.touching and parameters is not None:
-            law = self.numerics.law
-            values = {
-                name: parameters[:, law.offsets[name] : law.offsets[name] + size].detach().squeeze(-1)
-                for name, size in law.parameters.items()
-            }
-            self.springs.copy_(springs(law.wave_modulus(values), self.mass, self.volume, self.numerics.dx))
+        """Springs of what particles meet, of packed parameters (N, SLOTS); the mass has to be there."""
+        if self.springs is None or parameters is None:
+            return
+        law, parameters = self.numerics.law, parameters.detach()
+        with torch.set_grad_enabled(self.with_adjoint):
+            parameters = parameters.requires_grad_(self.with_adjoint)
+            values = {name: parameters[:, law.offsets[name] : law.offsets[name] + size].squeeze(-1)
+                      for name, size in law.parameters.items()}  # fmt: skip
+            found = springs(law.wave_modulus(values), self.mass, self.volume, self.numerics.dx)
+            if found.requires_grad:
+                self.slopes.copy_(torch.autograd.grad(found.sum(), parameters)[0])
+        self.springs.copy_(found.detach())
 
     def final(self) -> State:
         """Copies of the state after the segment."""
@@ -306,12 +313,21 @@ class Workspace:
             self.numerics.plane_count, self._kick(step),
         ]  # fmt: skip
 
-    def _met(self, state: int, step: int) -> wp.array:
-        """Velocities of a state that go to the grid: after the planes that particles meet, where there are such."""
-        if not self.numerics.touching:
-            return self.v_wp[state]
-        self.run(self.touch.meet, self.particles, [*self._touch_arguments(state, step), self.v_met_wp])
-        return self.v_met_wp
+    def _met(self, state: int, step: int, again: bool = False) -> wp.array:
+        """Velocities of a state that go to the grid: after the planes and solids that particles meet, where there are such.
+        again: in the adjoint, where reactions are known."""
+        v = self.v_wp[state]
+        if self.numerics.touching:
+            self.run(self.touch.meet, self.particles, [*self._touch_arguments(state, step), self.v_met_wp])
+            v = self.v_met_wp
+        if self.colliders is not None:
+            v = self.colliders.strike(step, self._struck(state), self._kick(step), again)
+        return v
+
+    def _struck(self, state: int) -> list:
+        """What solids act on: particles after the planes that they meet."""
+        v = self.v_met_wp if self.numerics.touching else self.v_wp[state]
+        return [self.x_wp[state], v, self.volume_wp, self.springs_wp, self.mass_wp]
 
     def _stress_arguments(self, state: int, slot: int) -> list:
         held = self.held_wp
@@ -343,10 +359,7 @@ class Workspace:
                 *(geometry if step else kicked), int(numerics.check_J), step, self.flags_wp, self._added_to(self.grid_wp[g]),
             ])  # fmt: skip
             self._settle(self.grid_wp[g])
-            if self.colliders is None:
-                self.over_nodes(self.update.grid_update, [*self._grid_arguments(g, step), self.velocity_wp[g], cleared])
-            else:
-                self.colliders.update(step, self._grid_arguments(g, step), self._kick(step), self.velocity_wp[g], cleared)
+            self.over_nodes(self.update.grid_update, [*self._grid_arguments(g, step), self.velocity_wp[g], cleared])
             self.run(kernels.g2p, n, [
                 self.x_wp[a], self.F_tot_wp[a], self.velocity_wp[g], *geometry, low, high, step, self.flags_wp,
                 self.x_wp[b], self.v_wp[b], self.C_affine_wp[b], self.F_tot_wp[b],
@@ -363,6 +376,8 @@ class Workspace:
         kernels, numerics, n, held = self.kernels, self.numerics, self.particles, self.adj_held_wp
         geometry, kicked = self._geometry(self.steps.dt), self._geometry(self.steps.kick)
         (self.adj_operator_wp if more else self.all_adj_wp).zero_()
+        if self.springs is not None:
+            self.adj_springs_wp.zero_()
         if self.colliders is not None and first + count == self.substeps:
             self.colliders.reset_adjoint()
         for step in reversed(range(first, first + count)):
@@ -383,23 +398,23 @@ class Workspace:
                 self.adj_x_wp[a], self.adj_F_tot_wp[a], self._added_to(adj_velocity),
             ])  # fmt: skip
             self._settle(adj_velocity)
-            if self.colliders is not None:
-                # the velocities that the colliders found are cheaper to compute again than to keep
-                self.over_nodes(self.update.grid_update, [*self._grid_arguments(step, step), self.colliders.before_wp, None])
-                place = [self.grid_wp[step], self.cutoff, numerics.dx]
-                self.colliders.adjoint(step, place, self._kick(step), adj_velocity)
             self.over_nodes(self.update.adj_grid, [*self._grid_arguments(step, step), adj_velocity, self.adj_grid_wp, cleared])
-            if self.colliders is not None:
-                self.colliders.add_mass(self.adj_grid_wp)
             self.run(kernels.adj_p2g, n, [
-                self.x_wp[step], self._met(step, step), self.C_affine_wp[step], self.tau_wp[step], self.mass_wp, self.volume_wp,
-                *(geometry if step else kicked), self.adj_grid_wp, self.adj_x_wp[a], self.adj_v_wp[a], self.adj_C_affine_wp[a],
-                self.adj_tau_wp,
+                self.x_wp[step], self._met(step, step, True), self.C_affine_wp[step], self.tau_wp[step], self.mass_wp,
+                self.volume_wp, *(geometry if step else kicked), self.adj_grid_wp, self.adj_x_wp[a], self.adj_v_wp[a],
+                self.adj_C_affine_wp[a], self.adj_tau_wp,
             ])  # fmt: skip
+            if self.colliders is not None:
+                of_met = self.adj_x_wp[a], self.adj_v_wp[a], self.adj_springs_wp
+                self.colliders.adjoint(step, self._struck(step), self._kick(step), *of_met)
             if numerics.touching:
-                self.run(self.touch.adj_meet, n, [*self._touch_arguments(step, step), self.adj_x_wp[a], self.adj_v_wp[a]])
+                self.run(self.touch.adj_meet, n, [
+                    *self._touch_arguments(step, step), self.adj_x_wp[a], self.adj_v_wp[a], self.adj_springs_wp,
+                ])  # fmt: skip
             self.run(self.stress, n, self._stress_arguments(step, step), [
                 self.adj_F_wp[a], self.adj_C_affine_wp[a], held["parameters"], held["G"], held["h"], self.adj_tau_wp,
             ])  # fmt: skip
+        if self.springs is not None:
+            self.run(self.touch.loosen, n, [self.adj_springs_wp, self.slopes_wp, self.adj_slots_wp])
         if self.colliders is not None and first == 0:
             self.colliders.settle_adjoint()
