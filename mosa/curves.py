@@ -73,4 +73,4 @@ def unit_in(tag: str, law: str) -> str:
         if re.fullmatch(pattern, tag):
             return unit
     kind, _, name = tag.removeprefix("final/").partition("/")
-    return unit_of(law, name) if kind in ("id", "id_prior") else ""
+    return unit_of(law, name) if law and kind in ("id", "id_prior") else ""

@@ -236,6 +236,11 @@ class Rollout:
     reactions: Tensor | None = None
     counts: tuple[int, ...] = ()
 
+    def to(self, device: torch.device | str) -> Rollout:
+        moved = {name: getattr(self, name).to(device) for name in ("x", "v", "F", "F_tot", "times")}
+        final = ParticleState(*(getattr(self.final, f.name).to(device) for f in fields(self.final)))
+        return replace(self, **moved, final=final, reactions=None if self.reactions is None else self.reactions.to(device))
+
     def worlds(self) -> list[Rollout]:
         """The rollouts of B worlds, one by one; `inverted` is then of all of them."""
         parts = zip(*(getattr(self, name).unbind(1) for name in ("x", "v", "F", "F_tot")))

@@ -53,8 +53,8 @@ def test_what_is_known_passes(overrides):
 @pytest.mark.parametrize(("override", "nearest"), [
     ("+foo=1", ""), ("+sed=1", "seed"), ("+world.wals=1", "world.walls"),
     ("+simulation.particels=9", "simulation.particles"),
-    ("+fit.view=1", "fit.views"), ("+rendering.magrin=1", "rendering.margin"), ("+trainer.max_epochs=3", "trainer."),
-    ("+logger._target_=nonsense", "logger."), ("+evaluation.sample=1", "evaluation.samples"),
+    ("+fit.view=1", "fit.views"), ("+rendering.magrin=1", "rendering.margin"),
+    ("+evaluation.sample=1", "evaluation.samples"),
     ("+adapter.alfa=0.1", "adapter.alpha"),
     ("+losses.colour=1", "losses."), ("+heterogeneity.amplitud=1", "heterogeneity.amplitude"),
 ])  # fmt: skip

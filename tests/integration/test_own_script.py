@@ -105,8 +105,10 @@ def test_what_cannot_be_done_is_named(cfg):
         L.Trainer(**QUIET, enable_checkpointing=False, precision="64-true").fit(LitMosa(cfg), datamodule=SceneDataModule(cfg))
 
 
-def test_a_stopper_ends_a_stage_and_not_the_fit(cfg):
+def test_a_stopper_ends_a_stage_and_not_the_fit(cache):
     """Validation that never improves: each stage ends after as many epochs as the stopper waits."""
+    cfg = compose("debug=default", f"scene.cache={cache}", "adapter=mosa", "fit.joint.iterations=30", "fit.prior.iterations=5",
+                  "fit.prior.newton_iterations=5", *HELD)  # fmt: skip
     stopper = EarlyStopping("val/loss", patience=1, min_delta=1e9)
     module, trainer = LitMosa(cfg), L.Trainer(**QUIET, max_epochs=-1, enable_checkpointing=False, callbacks=[stopper])
     begun, begin = [], module.begin
