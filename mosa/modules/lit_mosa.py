@@ -167,12 +167,6 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             raise ConfigError("LitMosa: expected a SceneDataModule, which knows the particles of the body "
                               "(trainer.fit(module, datamodule=SceneDataModule(cfg))), or a module from load_from_checkpoint, "
                               f"found {type(data).__name__ if data is not None else 'neither'}")
-        if self.trainer.world_size > 1:
-            raise ConfigError(f"trainer.devices: expected one, found {self.trainer.world_size}: a fit runs on one device, and "
-                              "the runs of a sweep on several (docs/sweeps.md)")
-        if self.trainer.precision not in PRECISIONS:
-            raise ConfigError(f"trainer.precision: expected {' or '.join(PRECISIONS)}, found {self.trainer.precision!r}: the "
-                              "simulation is single precision, or double by simulation.precision=64")
         # what is saved at the end of an epoch belongs to the stage that comes next
         callbacks = self.trainer.callbacks
         own = [each for each in callbacks if isinstance(each, Stages)]
@@ -181,6 +175,13 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         self.trainer.callbacks = [*others[:place], *own, *others[place:]]
 
     def configure_callbacks(self) -> list[L.Callback]:
+        """Asked for first of all, before the data take their time."""
+        if self.trainer.world_size > 1:
+            raise ConfigError(f"trainer.devices: expected one, found {self.trainer.world_size}: a fit runs on one device, and "
+                              "the runs of a sweep on several (docs/sweeps.md)")
+        if self.trainer.precision not in PRECISIONS:
+            raise ConfigError(f"trainer.precision: expected {' or '.join(PRECISIONS)}, found {self.trainer.precision!r}: the "
+                              "simulation is single precision, or double by simulation.precision=64")
         return [Stages()]
 
     def attach(self, data, fitting: bool = True) -> None:

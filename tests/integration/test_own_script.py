@@ -39,7 +39,7 @@ def fitted(cfg, tmp_path_factory):
 
 
 def test_the_data_stand_alone(cache):
-    data = SceneDataModule("tiny", "debug=default", f"scene.cache={cache}", *HELD)
+    data = SceneDataModule("tiny", "debug=default", f"scene.cache={cache}", *HELD, held_out=False)
     data.prepare_data()
     data.setup("fit")
     batch = next(iter(data.train_dataloader()))
@@ -81,10 +81,10 @@ def test_what_lightning_s_callbacks_left(fitted):
 def test_a_checkpoint_is_fitted_on_validated_tested_and_predicts(fitted, cfg, tmp_path):
     _, data, module, _ = fitted
     begun = L.Trainer(**QUIET, max_epochs=2, default_root_dir=tmp_path, callbacks=[ModelCheckpoint(tmp_path, save_last=True)])
-    begun.fit(LitMosa(cfg), datamodule=SceneDataModule(cfg))
+    begun.fit(LitMosa(cfg), datamodule=data)
     loaded = LitMosa.load_from_checkpoint(tmp_path / "last.ckpt")
     assert 0 < loaded.steps_done < module.steps_done and loaded.stage is not None
-    L.Trainer(**QUIET, max_epochs=-1, enable_checkpointing=False).fit(loaded, datamodule=SceneDataModule(cfg))
+    L.Trainer(**QUIET, max_epochs=-1, enable_checkpointing=False).fit(loaded, datamodule=data)
     assert loaded.stage is None and loaded.steps_done == module.steps_done
     for name, value in module.state_dict().items():
         assert torch.allclose(value, loaded.state_dict()[name], rtol=1e-4, atol=1e-6), name
@@ -113,6 +113,6 @@ def test_a_stopper_ends_a_stage_and_not_the_fit(cache):
     module, trainer = LitMosa(cfg), L.Trainer(**QUIET, max_epochs=-1, enable_checkpointing=False, callbacks=[stopper])
     begun, begin = [], module.begin
     module.begin = lambda stage: (begun.append(stage.name), begin(stage))
-    trainer.fit(module, datamodule=SceneDataModule(cfg))
+    trainer.fit(module, datamodule=SceneDataModule(cfg, held_out=False))
     assert begun == [stage.name for stage in module.stages] and module.stage is None
     assert trainer.current_epoch == 2 * len(begun)
