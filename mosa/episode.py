@@ -131,7 +131,7 @@ class Episode:
         numbers = {"frames": moment.frames, "substeps": moment.substeps}
         times = {"time": moment.frames * self.frame_dt, "lag": moment.lag}
         return TwinState(
-            *(getattr(moment.state, name) for name in State._fields), self._lifts, *self._poses, self._driven,
+            *State.of(self._stepper.axes.world.state(moment.state)), self._lifts, *self._poses, self._driven,
             **{k: torch.tensor(v) for k, v in numbers.items()},
             **{k: torch.tensor(v, dtype=torch.float64) for k, v in times.items()},
         )  # fmt: skip
@@ -147,6 +147,7 @@ class Episode:
                 what = f"{found.dtype} {tuple(found.shape)}" if isinstance(found, Tensor) else repr(found)
                 raise ConfigError(f"state.{f.name}: expected a tensor {known.dtype} {tuple(known.shape)}, found {what}")
         particles = ParticleState(*(getattr(state, name).to(now.x.device) for name in State._fields))
+        particles = self._stepper.axes.state(particles, particles.v.dtype)
         self._moment = Moment(particles, int(state.substeps), int(state.frames), float(state.lag))
         self._driven, self._poses = state.driven.cpu(), (state.position.cpu(), state.rotation.cpu())
 
@@ -186,7 +187,9 @@ class Episode:
         again = dict(zip(which, starts if starts is not None else [self._starts[b] for b in which], strict=True))
         with self._gradients():
             now = moment.state.worlds()
-            fresh = ParticleState.stack([self._begin(b, again[b]) if b in again else now[b] for b in range(self.worlds)])
+            for b in again:
+                now[b] = self._stepper.axes.state(self._begin(b, again[b]), now[b].x.dtype)
+            fresh = ParticleState.stack(now)
             if moment.substeps:  # F goes before its velocities by one advance
                 parts = self._stepper.prepared.first_advance(flat(fresh), self._stepper.clock.dt)
                 fresh = ParticleState(*(t.unflatten(0, (self.worlds, -1)) for t in parts))
@@ -378,7 +381,7 @@ def _worlds(
     def begin(b: int, start: Start) -> ParticleState:
         state = body.initial_state(start, simulator.dt, pulls[b])
         state = replace(state, x=state.x + found[b % len(found)].lift)
-        return ParticleState(*(getattr(state, name).to(simulator.dtype) for name in State._fields))
+        return state.to(simulator.dtype)
 
     ready, states = found[0] if laws is None else Ready.stack(found), [begin(b, start) for b, start in enumerate(starts)]
     return replace(ready, simulator=simulator, state=ParticleState.stack(states)), begin

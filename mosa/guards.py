@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mosa.analysis.figures import ffmpeg
 from mosa.checkpoints import check_resumed, check_same_scene, read_checkpoint
-from mosa.config import plain, rehearse
+from mosa.config import build_world, plain, rehearse, world_config
 from mosa.data.agreement import lines_of_sight, misses
 from mosa.data.splat_files import check_formats
 from mosa.errors import ConfigError, DataError
@@ -24,6 +24,8 @@ from mosa.limits import machine_memory
 from mosa.modules.body import Body, Start, World
 from mosa.physics.contact.colliders import colliders_from_config
 from mosa.physics.contact.overlap import check_clear
+from mosa.physics.contact.planes import ground_plane
+from mosa.physics.engine.axes import turn_along
 from mosa.reconstruction.starts import first_contact
 from mosa.schema import check
 from mosa.twin import Twin
@@ -110,10 +112,13 @@ def check_begin(cfg: DictConfig) -> None:
 
 
 def check_seen(cfg: DictConfig, scene: Scene) -> None:
-    """The object as frame 0 shows it, before its reconstruction: no solid contains it, and the grid's spacing suits its size.
+    """The object as frame 0 shows it, before its reconstruction: no solid contains it, and the grid's spacing suits its size; a
+    grid can be along ground and walls.
 
     Errors: ConfigError naming the key. Silent where fewer than two mattes are whole.
     """
+    world = build_world(world_config(scene) | {"walls": plain(cfg.world).get("walls")})
+    turn_along([*([] if world.ground is None else [ground_plane(world.ground, world.up)]), *world.planes])
     chosen, origins, directions, radii = lines_of_sight(scene, 0)
     if len(chosen) < 2:
         return

@@ -204,6 +204,11 @@ class ParticleState:
         """The states of equally many particles each, as those of B worlds."""
         return cls(*(torch.stack([getattr(state, f.name) for state in states]) for f in fields(cls)))
 
+    def to(self, dtype: torch.dtype) -> ParticleState:
+        """In this type, but x in float64 stays so."""
+        x = self.x if self.x.dtype == torch.float64 else self.x.to(dtype)
+        return ParticleState(x, *(t.to(dtype) for t in (self.v, self.C_affine, self.F, self.F_tot)))
+
     def worlds(self) -> list[ParticleState]:
         """The states of B worlds, one by one."""
         return [ParticleState(*parts) for parts in zip(*(getattr(self, f.name).unbind(0) for f in fields(self)))]

@@ -25,6 +25,8 @@ below 0.04."""
 DRIFT = 0.15
 """By which it may change over a film, averaged over all learning cameras, so that what turns into one's view leaves another's: a
 body in one light that is exposed the same stays below 0.075 in the built-in films, at 0.022 in the bird's."""
+FARTHEST = 1000.0
+"""[m] of a camera from the origin: positions are rounded to 0.06 mm there."""
 SQUARE, NEARLY = 2.0, 1.05
 """Ratios of the two focal lengths of a camera from which on they are refused, and warned of: sensors have square pixels."""
 
@@ -70,8 +72,13 @@ def validate(scene: Scene) -> Scene:
 
 
 def check_cameras(scene: Scene, label: str) -> None:
-    """Proper poses and positive focal lengths."""
+    """Proper poses, near the origin, and positive focal lengths."""
     cameras = scene.cameras
+    places = -(cameras.w2c[:, :3, :3].double().mT @ cameras.w2c[:, :3, 3:].double())[..., 0]
+    if bool(torch.isfinite(places).all()) and float(places.abs().max()) > FARTHEST:
+        raise DataError(f"{label}: expected cameras within {FARTHEST:g} m of the origin, beyond which float32 has no digits for an "
+                        f"image, found one at {[round(c, 1) for c in places[int(places.abs().amax(1).argmax())].tolist()]} m: "
+                        "subtract one offset from all camera positions, the box, the ground's height along up and the solids")
     for v, name in enumerate(cameras.names):
         if not bool(torch.isfinite(cameras.K[v]).all() and torch.isfinite(cameras.w2c[v]).all()):
             raise DataError(f"{label}: camera {name}: NaN or infinite numbers in its calibration")

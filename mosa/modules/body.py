@@ -23,6 +23,7 @@ from mosa.modules.simulation_settings import SimulationSettings
 from mosa.modules.start import Start, World
 from mosa.physics.contact.colliders import reach
 from mosa.physics.engine.adaptive_steps import StepControl
+from mosa.physics.engine.axes import PERIOD
 from mosa.physics.engine.clock import Adaptive, Replay
 from mosa.physics.engine.law_options import AS_USUAL, LawOptions
 from mosa.physics.engine.simulator import Simulator
@@ -132,7 +133,9 @@ class Body(nn.Module):
         v = velocity + torch.linalg.cross(start.angular_velocity.expand_as(arm), arm)
         n = len(arm)
         F = Q.expand(n, 3, 3).contiguous()
-        return ParticleState(arm + start.center, v, skew(start.angular_velocity).expand(n, 3, 3).contiguous(), F, F)
+        # where float32 has no digits for a particle's place it has some for the body's
+        center = start.center if float(start.center.detach().abs().max()) < PERIOD * self.settings.dx else start.center.double()
+        return ParticleState(arm + center, v, skew(start.angular_velocity).expand(n, 3, 3).contiguous(), F, F)
 
     def stiffening(self, adapted: bool) -> float:
         """Modulus over the prior's that the time step allows for."""
@@ -231,7 +234,7 @@ class Body(nn.Module):
         else:
             simulator = self.simulator(material.law, substeps, frame_dt, world, adapter.strain if adapter is not None else None)
         state = replace(state, x=state.x + lift)
-        state = ParticleState(*(getattr(state, name).to(dtype) for name in ("x", "v", "C_affine", "F", "F_tot")))
+        state = state.to(dtype)
         arguments = {
             "parameters": {k: p.to(dtype) for k, p in parameters.items()}, "volume": self.volume.to(dtype),
             "density": self.density, "adapter": adapter,

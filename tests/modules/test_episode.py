@@ -396,3 +396,31 @@ def test_the_page_about_the_twin_runs(monkeypatch, tmp_path):
     assert names["by_push"].abs().max() > 0 and names["by_modulus"].abs() > 0
     assert names["state"].positions.shape == (4, 120, 3) and names["reactions"].shape[1:] == (4, 1, 6)
     assert TwinState.read(torch.load("moment.pt", weights_only=True)).x.shape == (120, 3)
+
+
+@pytest.mark.parametrize("precision", [32, 64])
+def test_a_twin_that_is_turned_and_far_away_moves_as_at_home(precision):
+    """Ten kilometres away on a sloping ground: simulated, stepped, driven, saved and branched."""
+    away = torch.tensor([9e3, 0.0, -4e3]).double()
+    home = {"frames": STEPS + 1, "box": [[-9, -9, -9], [9, 9, 9]]}
+    there = home | {"position": (away + torch.tensor([0.0, 0.09, 0.0]).double()).tolist(), "box": [[-1e4] * 3, [1e4] * 3]}
+    made = twin(precision)
+    near, far = made.simulate(**home), made.simulate(**there)
+    assert (far.x.double() - away - near.x.double()).abs().max() < (1.5e-3 if precision == 32 else 1e-6)  # float32 resolves 1 mm
+    assert (far.F - near.F).abs().max() < 0.02 and near.x[-1, :, 1].amin() > 0
+    paddle = PUSHER | {"position": [-0.12, 0.08, 0]}
+    moved = paddle | {"position": (away + torch.tensor([-0.12, 0.08, 0.0]).double()).tolist()}
+    seen = []
+    for given, solid in ((home, paddle), (there, moved)):
+        state = made.reset(**given, colliders=[solid])
+        for k in range(STEPS):
+            state, reactions = made.step({"pusher": {"velocity": (0.6, 0, 0)}})
+            if k == 3:
+                saved = state
+        made.state = saved
+        for _ in range(STEPS - 4):
+            again = made.step({"pusher": {"velocity": (0.6, 0, 0)}}).state
+        assert (again.x - state.x).abs().max() < 1e-5
+        seen.append((state.x.double(), reactions))
+    assert seen[1][0].dtype == torch.float64 and (seen[1][0] - away - seen[0][0]).abs().max() < 1e-3
+    assert float(seen[0][1].abs().max()) > 0.1

@@ -17,6 +17,7 @@ from mosa.errors import ConfigError, SimulationDiverged
 from mosa.physics.contact.motion import Motion, Poses, Trajectory, sample_poses
 from mosa.physics.engine.adapter_chain import ChainOfSegments
 from mosa.physics.engine.adapter_interface import ANSWER, AdapterOperator, MaterialState
+from mosa.physics.engine.axes import Axes
 from mosa.physics.engine.budget import room, substep_bytes
 from mosa.physics.engine.chain_schedule import SEGMENT, Chains
 from mosa.physics.engine.clock import Clock, Frame, Moment
@@ -191,13 +192,15 @@ class Stepper:
     """Advances bodies by one frame at a time, with colliders where the caller puts them. Made by `Simulator.stepper`.
 
     prepared: with what is the same in all steps; worlds: None for one body without a leading dimension; clock: how many substeps
-    the steps take; motions: of the colliders, of every world.
+    the steps take; motions: of the colliders, of every world; axes: of the moments' states. `axes.world.state` has them in the
+    world, as poses and reactions are here.
     """
 
     def __init__(
-        self, prepared: Prepared, worlds: int | None, clock: Clock, motions: Sequence[Sequence[Motion | Trajectory]]
-    ) -> None:
-        self.prepared, self.worlds, self.clock, self.motions = prepared, worlds, clock, motions
+        self, prepared: Prepared, worlds: int | None, clock: Clock, motions: Sequence[Sequence[Motion | Trajectory]],
+        axes: Axes,
+    ) -> None:  # fmt: skip
+        self.prepared, self.worlds, self.clock, self.motions, self.axes = prepared, worlds, clock, motions, axes
 
     def step(
         self, moment: Moment, poses: Poses | Callable[[int, float], Poses] | None = None, speed: float | None = None
@@ -212,7 +215,8 @@ class Stepper:
         along = self._poses(moment, frame, poses)
         self.prepared.begin(state, along, frame.count, self.clock.varies)
         after, forces, count = self.through(moment, state, frame, along)
-        return Step(after._replace(state=ParticleState(*self.apart(after.state))), *self.apart([forces], 1), count)
+        forces = self.apart([self.axes.world.reactions(forces)], 1)
+        return Step(after._replace(state=ParticleState(*self.apart(after.state))), *forces, count)
 
     def enter(self, moment: Moment, begins: bool, speed: float | None = None) -> tuple[State, Frame]:
         """(all particles before the next frame, the frame). begins: whether a motion does, whose F is not advanced yet."""
@@ -225,6 +229,8 @@ class Stepper:
     def through(self, moment: Moment, state: State, frame: Frame, poses: tuple[Tensor, ...], alike: int = 0) -> Step:
         """The frame that `enter` found, of all particles one world's after the other's. poses, alike: as `Prepared.frame`."""
         state, forces = self.prepared.frame(state, frame, poses, alike)
+        if self.axes.turn is not None:
+            self.prepared.lanes.check_box(self.axes.world.points(state.x.detach()), frame.first + frame.count - 1, frame.dt)
         if forces is not None and frame.steps is not None:
             forces = mean_force(forces, frame.steps)
         return Step(Moment(state, moment.substeps + frame.count, moment.frames + 1, frame.dt), forces, frame.count)
@@ -240,14 +246,18 @@ class Stepper:
             return ()
         if poses is None:
             each = [self.sample(moment, count, frame.dt, motions) for motions in self.motions]
-            return tuple(torch.cat(parts, 1).to(numerics.dtype).to(numerics.device) for parts in zip(*each))
+            return self.taken([torch.cat(parts, 1) for parts in zip(*each)])
         poses = poses(count, frame.dt) if callable(poses) else poses
         leading = (count, colliders) if self.worlds is None else (count, self.worlds, colliders)
         for name, part, shape in zip(Poses._fields, poses, ((3,), (3, 3), (3,), (3,)), strict=True):
             if tuple(part.shape) != (*leading, *shape):
                 raise ConfigError(f"poses: {name}: expected shape {(*leading, *shape)}, found {tuple(part.shape)}")
-        poses = [self._moved(part) for part in poses]
-        return tuple(poses if self.worlds is None else (part.flatten(1, 2) for part in poses))
+        poses = self.taken(poses)
+        return poses if self.worlds is None else tuple(part.flatten(1, 2) for part in poses)
+
+    def taken(self, poses: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """Poses (S, ..., K, ...) in the simulator's axes and type."""
+        return tuple(self._moved(part) for part in self.axes.poses(Poses(*poses)))
 
     def _moved(self, part: Tensor) -> Tensor:
         """In the simulator's type and on its device: one row where it is the same in all."""
