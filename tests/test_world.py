@@ -1,5 +1,7 @@
 """A body among moving colliders: from plain configuration to reactions, through the twin's interface."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -38,6 +40,34 @@ def test_a_plate_presses_the_body_down():
         assert top < free.x[-1, :, 1].max() - 0.01
         up = rollout.reactions[..., 0, 1].mean(1)
         assert up[0] == 0 and up[-1] > 5.0
+
+
+@pytest.mark.parametrize("start", [{"height": 0.0}, {"height": 0.5}, {"height": 0.5, "velocity": (1, -2, 0)}])
+def test_a_long_motion_takes_the_time_step_that_its_drop_needs(start):
+    """What a body reaches is told by how far it can fall, not by how long it is simulated."""
+    made = twin()
+    made.body.material = Material("corotated", {"E": 2e3, "nu": 0.3})  # so soft that speeds decide
+    counts = []
+    for frames in (30, 300, 1500, 100_000):
+        made.reset(**start, frames=frames, box=[[-99, -9, -99], [99, 9, 99]])
+        counts.append(made.episode.substeps)
+    assert counts[1] == counts[2] == counts[3] <= 1.3 * counts[0]
+    begun = Start(*(getattr(made.episode._starts, name) for name in ("rotation", "center", "velocity", "angular_velocity")))
+    world, size = made.world, made.body.size
+    rollout = made.simulate(**start, frames=60, box=[[-99, -9, -99], [99, 9, 99]])
+    assert float(rollout.v.norm(dim=-1).max()) < world.fastest(begun, size, 60 * 0.02) < 1.5 * (2.3 + (2 * 9.8 * 0.8) ** 0.5)
+    # in a short motion it is the time that tells, and without a ground, or along one that slopes, it always is
+    drop = begun.velocity.norm()
+    assert world.fastest(begun, size, 0.1) == pytest.approx(float(drop) + 0.98)
+    assert replace(world, ground=None).fastest(begun, size, 20.0) == pytest.approx(float(drop) + 196)
+    sloping = replace(world, up=torch.tensor([0.6, 0.8, 0.0]))
+    assert 0.6 * 9.8 * 20 < sloping.fastest(begun, size, 20.0) < 0.6 * 9.8 * 20 + 10
+
+
+def test_a_fall_that_nothing_ends_is_refused_with_the_way_out():
+    made = twin(WORLD | {"ground": None})
+    with pytest.raises(ConfigError, match=r"speed 1.96e\+04 m/s.*fewer frames where no ground ends the fall"):
+        made.simulate(frames=100_000)
 
 
 def test_walls_and_errors():

@@ -216,9 +216,7 @@ class Body(nn.Module):
         elif substeps is not None:
             state = self.initial_state(start, frame_dt / substeps, gravity)
         else:
-            fall = float(gravity.norm()) * frames * frame_dt
-            speed = float(start.velocity.detach().norm()) + fall
-            speed += float(start.angular_velocity.detach().norm()) * self.size
+            speed = world.fastest(start, self.size, frames * frame_dt)
             speed += max((c.motion.max_speed(reach(c.shape)) for c in world.colliders), default=0.0)
             # one time step for all variants of a body: their difference is then the law's, not the integrator's
             substeps = self.substeps(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
@@ -11,6 +12,9 @@ from torch import Tensor
 from mosa.physics.contact.colliders import Collider
 from mosa.physics.contact.planes import Plane
 from mosa.types import Ground
+
+FASTER = 1.5
+"""Times the speed that its energy allows a body, which single particles reach (measured on blocks of 1 to 30 kPa: 0.7 to 1.47)."""
 
 
 @dataclass(frozen=True)
@@ -44,3 +48,16 @@ class World:
     box: Tensor
     planes: tuple[Plane, ...] = ()
     colliders: tuple[Collider, ...] = ()
+
+    def fastest(self, start: Start, size: float, time: float) -> float:
+        """Bound of the speeds [m/s] that a body of this size [m] reaches in `time` [s] from `start`: of a free fall, as far as the
+        ground lets it fall."""
+        first, spin = float(start.velocity.detach().norm()), float(start.angular_velocity.detach().norm()) * size
+        free = first + float(self.gravity.norm()) * time + spin
+        up, gravity = (v.detach().double().cpu() for v in (self.up, self.gravity))
+        up = up / up.norm()
+        if self.ground is None or (pull := -float(gravity @ up)) <= 0:
+            return free
+        height = max(0.0, float(start.center.detach().double().cpu() @ up) - self.ground.height + 0.5 * size)
+        sliding = float((gravity + pull * up).norm()) * time
+        return min(free, FASTER * math.hypot(first + spin, math.sqrt(2 * pull * height)) + sliding)

@@ -77,8 +77,8 @@ def turn_along(planes: Sequence[Plane]) -> Tensor | None:
     for i, n in met.items():
         if float(Axes(turn).vectors(n).abs().sort().values[1]) > ASKEW:
             raise ConfigError(
-                f"plane {i} (normal {[round(c, 3) for c in n.tolist()]}, mode {planes[i].mode}): expected ground and walls at right "
-                "angles to each other, so that a grid can be along them, or mode touch (scene.ground.mode=touch), at any angle"
+                f"plane {i} (normal {[round(c, 3) for c in n.tolist()]}, mode {planes[i].mode}): expected ground and walls at "
+                "right angles to each other, along which a grid can be, or mode touch (scene.ground.mode=touch), at any angle"
             )
     return turn
 
@@ -91,8 +91,8 @@ def shift_to(x: Tensor, turn: Tensor | None, dx: float) -> tuple[float, ...] | N
     if not far < float("inf"):
         return None  # the first substep names the particle
     if far * torch.finfo(x.dtype).eps > COARSE * dx:
-        raise ConfigError(f"x: particles are {far:.3g} m from the origin, where {x.dtype} has no digits for a grid of {dx:.3g} m: give "
-                          "x in float64, or place body, ground and solids nearer to the origin")
+        raise ConfigError(f"x: particles are {far:.3g} m from the origin, where {x.dtype} has no digits for a grid of {dx:.3g} m: "
+                          "give x in float64, or place body, ground and solids nearer to the origin")
     if x.ndim == 3 and wide > SPREAD * PERIOD * dx:
         raise ConfigError(f"x: expected worlds within {SPREAD * PERIOD * dx:.3g} m of each other, found {wide:.3g} m: they never "
                           "meet, and may be in one place")

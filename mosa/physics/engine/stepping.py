@@ -241,7 +241,7 @@ class Stepper:
 
     def _poses(self, moment: Moment, frame: Frame, poses: Poses | Callable | None) -> tuple[Tensor, ...]:
         """(S, W K, ...) each, in the simulator's type."""
-        colliders, numerics, count = len(self.motions[0]), self.prepared.numerics, frame.count
+        colliders, count = len(self.motions[0]), frame.count
         if not colliders:
             return ()
         if poses is None:
