@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -19,7 +20,7 @@ from mosa.errors import ConfigError, DataError
 from mosa.modules.body import Body, Ready, Start, World
 from mosa.modules.learned_numbers import each_law
 from mosa.physics.contact.colliders import SMOOTH, differentiable_thickness, reach, thickness_on
-from mosa.physics.contact.motion import Poses, exponential, rotation_matrices, rotation_vector
+from mosa.physics.contact.motion import Poses, exponential, rotation_matrices, rotation_vector, turning
 from mosa.physics.engine.clock import Moment
 from mosa.physics.engine.numerics import State, flat
 from mosa.twin_start import asks_for_gradients, check_wants_no_gradients
@@ -116,6 +117,7 @@ class Episode:
             self._moment, self._poses = moment, self._placed(moment, 0)
             self._starts, self._first = starts, self._poses
             self._warned: set[int] = set()
+            self._said: dict[int, Tensor] = {}  # rotation vectors of the last actions
             self._warn_of_jumps(k for k, collider in enumerate(self.colliders) if asks_for_gradients(collider.motion))
 
     @property
@@ -278,13 +280,11 @@ class Episode:
             v = (end["position"] - x) / self.frame_dt
         if "rotation" in command:
             end["rotation"] = command["rotation"].expand_as(R)
-            w = rotation_vector(end["rotation"] @ R.mT) / self.frame_dt
+            w = (rotation_vector(end["rotation"] @ R.mT) if "turn" not in command else command["turn"]) / self.frame_dt
         return v.expand_as(x), w.expand_as(x), end
 
     def _speed(self, commands: dict[int, dict], driven: Tensor) -> float:
-        """Bound of the colliders' speeds in this step [m/s]. Errors: ConfigError for a collider that is faster than a fixed step
-        allows."""
-        most = 0.5 * self._stepper.prepared.numerics.dx / self._stepper.clock.dt if self.substeps is not None else float("inf")
+        """Bound of the colliders' speeds in this step [m/s]."""
         fastest = 0.0
         for k, collider in enumerate(self.colliders):
             far = reach(collider.shape)
@@ -294,13 +294,7 @@ class Episode:
             if k not in commands:
                 continue
             v, w, _ = self._twist(commands[k], *(part.select(len(self._leading()), k).detach() for part in self._poses))
-            speed = float((v.detach().norm(dim=-1) + far * w.detach().norm(dim=-1)).max())
-            if speed > most:
-                raise ConfigError(
-                    f"action[{self.names[k]!r}]: expected a speed of at most {most:.3g} m/s, half a cell per substep, found "
-                    f"{speed:.3g}; use reset(substeps=...) with more than {self.substeps}"
-                )
-            fastest = max(fastest, speed)
+            fastest = max(fastest, float((v.detach().norm(dim=-1) + far * w.detach().norm(dim=-1)).max()))
         return fastest
 
     def _checked(self, action: Mapping[str, Any]) -> dict[int, dict[str, Tensor]]:
@@ -320,7 +314,17 @@ class Episode:
                     f"{where}: expected {' and '.join(TWISTS)}, or {' and '.join(TARGETS)} after the step, or one of them, found "
                     f"{', '.join(map(str, command)) or 'nothing'}"
                 )
-            commands[self.names.index(name)] = {key: self._vector(f"{where}.{key}", value) for key, value in command.items()}
+            k, given = self.names.index(name), command.get("rotation")
+            commands[k] = {key: self._vector(f"{where}.{key}", value) for key, value in command.items()}
+            said = None if given is None else torch.as_tensor(given, dtype=torch.float64).cpu()
+            if said is None or said.shape[-2:] == (3, 3):
+                continue
+            if bool((said.detach().norm(dim=-1) > math.pi - 1e-6).any()):
+                # half a turn or more, from what was said last where that is where the solid is
+                R, last = self._poses[1].select(len(self._leading()), k), self._said.get(k)
+                last = last if last is not None and torch.allclose(exponential(last).expand_as(R), R) else rotation_vector(R)
+                commands[k]["turn"] = turning(last, said)
+            self._said[k] = said
         return commands
 
     def _vector(self, where: str, value: Any) -> Tensor:

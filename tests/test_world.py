@@ -109,6 +109,53 @@ def test_a_collider_that_contains_the_body_is_named(collider):
         twin().simulate(frames=2, colliders=[collider])
 
 
+ARRIVES = {"waypoints": [{"time": -1.0, "position": [0, 5, 0]}, {"time": 0.0, "position": [0, 0.1, 0]}]}
+LEAVES = {"waypoints": [{"time": -1.0, "position": [0, 0.1, 0]}, {"time": 0.0, "position": [0, 5, 0]}]}
+
+
+@pytest.mark.parametrize("solids, named", [
+    ([{"size": [0.18, 0.045, 0.18], "position": [0, 0.0425, 0]}], r"^colliders\[0\]: .* found 1\d% of the body inside of it"),
+    ([{"size": [0.09, 0.18, 0.09], "position": [0.045, 0.11, 0.045]}], r"^colliders\[0\]: .* found 1\d% of the body"),
+    ([{"size": [0.1, 0.1, 0.1], "position": [x, 0.06, 0.09]} for x in (-0.1, 0.1)], r"\[0\] and colliders\[1\]: .* of them at t"),
+    ([{"type": "capsule", "radius": 0.02, "length": 1.0, "position": [0.015, 0.125, 0]}], r"^colliders\[0\]"),
+    ([{"size": [0.4, 0.4, 0.4], "motion": ARRIVES}], r"100% of the body inside of it at t = 0, .* \[0.0, 0.1, 0.0\]"),
+])  # fmt: skip
+def test_a_body_that_is_partly_inside_of_solids_is_refused(solids, named):
+    with pytest.raises(ConfigError, match=named):
+        twin().reset(colliders=[{"type": "box", "name": "", **solid} for solid in solids], substeps=50)
+
+
+@pytest.mark.parametrize("solids", [
+    [{"size": [0.4, 0.4, 0.4], "motion": LEAVES}], [{"size": [0.4, 0.4, 0.4], "motion": {**LEAVES, "waypoints": [
+        {"time": -3.0, "position": [0, 0.1, 0]}, {"time": -2.0, "position": [0, 5, 0]}]}}],
+    [{"size": [0.1, 0.2, 0.2], "position": [s * 0.139, 0.11, 0]} for s in (-1, 1)],  # faces of the particles' cells, 1 mm inside
+    [{"type": "plane", "normal": [0, 1, 0], "position": [0, 0.02, 0]}],
+])  # fmt: skip
+def test_a_body_beside_solids_is_not(solids):
+    state = twin().reset(colliders=[{"type": "box", "name": str(i), **solid} for i, solid in enumerate(solids)], substeps=400)
+    assert torch.isfinite(state.x).all()
+
+
+@pytest.mark.parametrize("count", [3, 6, 11])
+@pytest.mark.parametrize("mode", ["touch", "separate", "slip", "sticky"])
+@torch.no_grad()
+def test_what_is_set_down_stays(mode, count):
+    """At height 0, with any number of particles: it comes to rest within a fraction of a cell, and is not thrown up."""
+    h = 0.18 / count
+    made = twin(WORLD | {"ground": {"height": 0.03, "mode": mode, "friction": 0.3 if mode in ("touch", "separate") else 0.0}})
+    axis = (torch.arange(count) + 0.5) * h - 0.09
+    rest = torch.cartesian_prod(axis, axis, axis)
+    made.body = Body(
+        rest=rest, volume=torch.full((len(rest),), h**3), colors=rest * 0, opacities=rest[:, 0] * 0,
+        covariances=1e-4 * torch.eye(3).expand(len(rest), 3, 3), density=1000.0, heterogeneity=None, adapter=None,
+        material=Material("corotated", {"E": 5e5, "nu": 0.3}), settings=SimulationSettings(dx=2 * h),
+    )  # fmt: skip
+    height = made.simulate(height=0.0, frames=20).x[..., 1].mean(1)
+    assert float(height.max() - height[0]) < 1e-4 and float(height[0] - height.min()) < 0.4 * 2 * h
+    lowest = made.simulate(height=0.0, frames=1).x[0, :, 1].min() - 0.03
+    assert float(lowest) == pytest.approx(0.5 * h if mode == "touch" else 0.0, abs=1e-6)
+
+
 @pytest.mark.parametrize("arguments, message", [
     ({"rotation": [[1.2, 0, 0], [0, 1, 0], [0, 0, 0.8]]}, "rotation: expected R R.T = I"),
     ({"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "rotation: expected R R.T = I"),

@@ -90,6 +90,11 @@ class Body(nn.Module):
         return (self.rest * self.volume[:, None]).sum(0) / self.volume.sum()
 
     @property
+    def spacing(self) -> float:
+        """Of the particles [m]."""
+        return float(self.volume.mean()) ** (1 / 3)
+
+    @property
     def size(self) -> float:
         """Largest extent of the rest shape [m]."""
         return float((self.rest.amax(0) - self.rest.amin(0)).max())

@@ -263,7 +263,7 @@ class Simulator:
             choose = chooser.choose
         clock = Clock(self.frame_dt, self.substeps, None if frames == 1 else choose)
         lag = 0.0 if timing is None else timing.lag
-        return Stepper(prepared, worlds, clock, each, axes), Moment(self._begun(state, started), lag=lag)
+        return Stepper(prepared, worlds, clock, each, axes, self.colliders), Moment(self._begun(state, started), lag=lag)
 
     def _move(self, shift: tuple[float, ...] | None) -> None:
         """The origin of its axes. Numerics and buffers are others then: a stepper that was made before goes on with its own."""
@@ -284,9 +284,9 @@ class Simulator:
         if stepper.clock.varies:
             return lambda number, frame: stepper.taken(sample_frame(
                 each[0], number, frames - 1, frame.first, frame.count, self.frame_dt, start_time, *like, replayed
-            )), ()
+            ), frame.dt), ()
         found = [sample_poses(own, frames - 1, self.substeps, self.dt, start_time, *like) for own in each]
-        found = stepper.taken(tuple(torch.cat(parts, 1) if len(each) > 1 else parts[0] for parts in zip(*found)))
+        found = stepper.taken(tuple(torch.cat(parts, 1) if len(each) > 1 else parts[0] for parts in zip(*found)), self.dt)
         return lambda _, frame: tuple(part[frame.first : frame.first + frame.count] for part in found), found
 
     def _prepare(

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError, SimulationDiverged
+from mosa.physics.contact.colliders import Collider, reach
 from mosa.physics.contact.motion import Motion, Poses, Trajectory, sample_poses
 from mosa.physics.engine.adapter_chain import ChainOfSegments
 from mosa.physics.engine.adapter_interface import ANSWER, AdapterOperator, MaterialState
@@ -192,15 +193,16 @@ class Stepper:
     """Advances bodies by one frame at a time, with colliders where the caller puts them. Made by `Simulator.stepper`.
 
     prepared: with what is the same in all steps; worlds: None for one body without a leading dimension; clock: how many substeps
-    the steps take; motions: of the colliders, of every world; axes: of the moments' states. `axes.world.state` has them in the
+    the steps take; motions: of the `solids`, of every world; axes: of the moments' states. `axes.world.state` has them in the
     world, as poses and reactions are here.
     """
 
     def __init__(
         self, prepared: Prepared, worlds: int | None, clock: Clock, motions: Sequence[Sequence[Motion | Trajectory]],
-        axes: Axes,
+        axes: Axes, solids: Sequence[Collider],
     ) -> None:  # fmt: skip
-        self.prepared, self.worlds, self.clock, self.motions, self.axes = prepared, worlds, clock, motions, axes
+        self.prepared, self.worlds, self.clock, self.motions = prepared, worlds, clock, motions
+        self.axes, self.solids = axes, solids
 
     def step(
         self, moment: Moment, poses: Poses | Callable[[int, float], Poses] | None = None, speed: float | None = None
@@ -246,17 +248,26 @@ class Stepper:
             return ()
         if poses is None:
             each = [self.sample(moment, count, frame.dt, motions) for motions in self.motions]
-            return self.taken([torch.cat(parts, 1) for parts in zip(*each)])
+            return self.taken([torch.cat(parts, 1) for parts in zip(*each)], frame.dt)
         poses = poses(count, frame.dt) if callable(poses) else poses
         leading = (count, colliders) if self.worlds is None else (count, self.worlds, colliders)
         for name, part, shape in zip(Poses._fields, poses, ((3,), (3, 3), (3,), (3,)), strict=True):
             if tuple(part.shape) != (*leading, *shape):
                 raise ConfigError(f"poses: {name}: expected shape {(*leading, *shape)}, found {tuple(part.shape)}")
-        poses = self.taken(poses)
+        poses = self.taken(poses, frame.dt)
         return poses if self.worlds is None else tuple(part.flatten(1, 2) for part in poses)
 
-    def taken(self, poses: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """Poses (S, ..., K, ...) in the simulator's axes and type."""
+    def taken(self, poses: Sequence[Tensor], dt: float) -> tuple[Tensor, ...]:
+        """Poses (S, ..., K, ...) at substeps of dt [s] in the simulator's axes and type. Errors: ConfigError for a solid that would
+        pass the body without being felt."""
+        most, K = 0.5 * self.prepared.numerics.dx / dt, len(self.solids)
+        x, v, w = (poses[i].detach().reshape(len(poses[i]), -1, K, 3) for i in (0, 2, 3))
+        speeds = v.norm(dim=-1) + w.norm(dim=-1) * v.new_tensor([reach(solid.shape) for solid in self.solids])
+        fastest = torch.cat([speeds, x.diff(dim=0).norm(dim=-1) / dt]).amax((0, 1))
+        if bool((fastest > (1 + 1e-6) * most).any()):
+            k = int(fastest.argmax())
+            raise ConfigError(f"collider {self.solids[k].name or k}: expected a speed of at most {most:.3g} m/s, half a cell per "
+                              f"substep, found {float(fastest[k]):.3g}, which no body feels: use more substeps (reset(substeps=))")
         return tuple(self._moved(part) for part in self.axes.poses(Poses(*poses)))
 
     def _moved(self, part: Tensor) -> Tensor:
