@@ -290,11 +290,9 @@ class Episode:
             far = reach(collider.shape)
             if not driven[k]:
                 fastest = max(fastest, collider.motion.max_speed(far))
-                continue
-            if k not in commands:
-                continue
-            v, w, _ = self._twist(commands[k], *(part.select(len(self._leading()), k).detach() for part in self._poses))
-            fastest = max(fastest, float((v.detach().norm(dim=-1) + far * w.detach().norm(dim=-1)).max()))
+            elif k in commands:
+                v, w, _ = self._twist(commands[k], *(part.select(len(self._leading()), k).detach() for part in self._poses))
+                fastest = max(fastest, float((v.detach().norm(dim=-1) + far * w.detach().norm(dim=-1)).max()))
         return fastest
 
     def _checked(self, action: Mapping[str, Any]) -> dict[int, dict[str, Tensor]]:

@@ -112,8 +112,7 @@ def check_begin(cfg: DictConfig) -> None:
 
 
 def check_seen(cfg: DictConfig, scene: Scene) -> None:
-    """The object as frame 0 shows it, before its reconstruction: no solid contains it, and the grid's spacing suits its size; a
-    grid can be along ground and walls.
+    """The object as frame 0 shows it, before its reconstruction: no solid contains it, a grid suits its size, ground and walls.
 
     Errors: ConfigError naming the key. Silent where fewer than two mattes are whole.
     """
@@ -138,7 +137,7 @@ def check_starts(world: World, body: Body, found: dict[str, Start]) -> None:
     """No sequence starts inside of a solid. Errors: ConfigError naming the collider."""
     for prefix, start in found.items():
         x = (body.rest - body.center) @ start.rotation.to(body.rest).T + start.center.to(body.rest)
-        check_clear(world.colliders, x, f"the body of {prefix}", spacing=body.spacing)
+        check_clear(world.colliders, x, f"the body of {prefix}", spacing=float(body.volume.mean()) ** (1 / 3))
 
 
 def warn_of_little(world: World, body: Body, found: Mapping[str, Start], scenes: Sequence[Scene]) -> None:

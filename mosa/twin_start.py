@@ -177,8 +177,8 @@ def start_in(
         if outside > 0:
             raise ConfigError(f"box: expected one that the body starts in, found {outside:.0%} of it outside of "
                               f"{world.box.tolist()} m; its centre is at {[round(c, 4) for c in center.tolist()]} m")
-    field = "world.colliders" if colliders is None else "colliders"
-    check_clear(world.colliders, center + arms, "the body", field, body.spacing)
+    field, spacing = "world.colliders" if colliders is None else "colliders", float(body.volume.mean()) ** (1 / 3)
+    check_clear(world.colliders, center + arms, "the body", field, spacing)
     if world.ground is not None:
         below = float((((center + arms) @ up).detach() < world.ground.height).double().mean())
         if below > UNDER:

@@ -206,8 +206,7 @@ class ParticleState:
 
     def to(self, dtype: torch.dtype) -> ParticleState:
         """In this type, but x in float64 stays so."""
-        x = self.x if self.x.dtype == torch.float64 else self.x.to(dtype)
-        return ParticleState(x, *(t.to(dtype) for t in (self.v, self.C_affine, self.F, self.F_tot)))
+        return ParticleState(*(t if t is self.x and t.dtype == torch.float64 else t.to(dtype) for t in vars(self).values()))
 
     def worlds(self) -> list[ParticleState]:
         """The states of B worlds, one by one."""

@@ -132,6 +132,8 @@ def test_a_body_that_is_partly_inside_of_solids_is_refused(solids, named):
     [{"type": "plane", "normal": [0, 1, 0], "position": [0, 0.02, 0]}],
 ])  # fmt: skip
 def test_a_body_beside_solids_is_not(solids):
+    made = [{"type": "box", **solid} for solid in solids]
+    assert twin().simulate(frames=1, colliders=made).x.shape[0] == 1
     state = twin().reset(colliders=[{"type": "box", "name": str(i), **solid} for i, solid in enumerate(solids)], substeps=400)
     assert torch.isfinite(state.x).all()
 

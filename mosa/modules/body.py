@@ -21,7 +21,6 @@ from mosa.modules.model import Model
 from mosa.modules.ready import Ready
 from mosa.modules.simulation_settings import SimulationSettings
 from mosa.modules.start import Start, World
-from mosa.physics.contact.colliders import reach
 from mosa.physics.engine.adaptive_steps import StepControl
 from mosa.physics.engine.axes import PERIOD
 from mosa.physics.engine.clock import Adaptive, Replay
@@ -90,11 +89,6 @@ class Body(nn.Module):
         return (self.rest * self.volume[:, None]).sum(0) / self.volume.sum()
 
     @property
-    def spacing(self) -> float:
-        """Of the particles [m]."""
-        return float(self.volume.mean()) ** (1 / 3)
-
-    @property
     def size(self) -> float:
         """Largest extent of the rest shape [m]."""
         return float((self.rest.amax(0) - self.rest.amin(0)).max())
@@ -138,8 +132,8 @@ class Body(nn.Module):
         v = velocity + torch.linalg.cross(start.angular_velocity.expand_as(arm), arm)
         n = len(arm)
         F = Q.expand(n, 3, 3).contiguous()
-        # where float32 has no digits for a particle's place it has some for the body's
-        center = start.center if float(start.center.detach().abs().max()) < PERIOD * self.settings.dx else start.center.double()
+        far = float(start.center.detach().abs().max()) > PERIOD * self.settings.dx  # where float32 has few digits for a particle
+        center = start.center.double() if far else start.center
         return ParticleState(arm + center, v, skew(start.angular_velocity).expand(n, 3, 3).contiguous(), F, F)
 
     def stiffening(self, adapted: bool) -> float:
@@ -222,7 +216,6 @@ class Body(nn.Module):
             state = self.initial_state(start, frame_dt / substeps, gravity)
         else:
             speed = world.fastest(start, self.size, frames * frame_dt)
-            speed += max((c.motion.max_speed(reach(c.shape)) for c in world.colliders), default=0.0)
             # one time step for all variants of a body: their difference is then the law's, not the integrator's
             substeps = self.substeps(
                 float(material.max_modulus(factor.detach())), frame_dt, speed, self.adapter is not None,

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from mosa.physics.contact.colliders import Collider
+from mosa.physics.contact.colliders import Collider, reach
 from mosa.physics.contact.planes import Plane
 from mosa.types import Ground
 
@@ -50,14 +50,13 @@ class World:
     colliders: tuple[Collider, ...] = ()
 
     def fastest(self, start: Start, size: float, time: float) -> float:
-        """Bound of the speeds [m/s] that a body of this size [m] reaches in `time` [s] from `start`: of a free fall, as far as the
-        ground lets it fall."""
-        first, spin = float(start.velocity.detach().norm()), float(start.angular_velocity.detach().norm()) * size
-        free = first + float(self.gravity.norm()) * time + spin
-        up, gravity = (v.detach().double().cpu() for v in (self.up, self.gravity))
-        up = up / up.norm()
-        if self.ground is None or (pull := -float(gravity @ up)) <= 0:
-            return free
-        height = max(0.0, float(start.center.detach().double().cpu() @ up) - self.ground.height + 0.5 * size)
-        sliding = float((gravity + pull * up).norm()) * time
-        return min(free, FASTER * math.hypot(first + spin, math.sqrt(2 * pull * height)) + sliding)
+        """Bound of the speeds [m/s] that a body of this size [m] reaches in `time` [s] from `start`, as far as it can fall, and that
+        colliders add."""
+        up, gravity, center = (v.detach().double().cpu() for v in (self.up / self.up.norm(), self.gravity, start.center))
+        first, spin = (float(v.detach().norm()) for v in (start.velocity, start.angular_velocity * size))
+        fastest, pull = first + float(self.gravity.norm()) * time + spin, -float(gravity @ up)
+        if self.ground is not None and pull > 0:
+            height = max(0.0, float(center @ up) - self.ground.height + 0.5 * size)
+            sliding = float((gravity + pull * up).norm()) * time
+            fastest = min(fastest, FASTER * math.hypot(first + spin, math.sqrt(2 * pull * height)) + sliding)
+        return fastest + max((c.motion.max_speed(reach(c.shape)) for c in self.colliders), default=0.0)

@@ -65,8 +65,8 @@ def rotation_vector(R: Tensor) -> Tensor:
     longest = about.detach().diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None].expand(*R.shape[:-1], 1)
     axis = torch.nn.functional.normalize(about.gather(-1, longest)[..., 0], dim=-1)
     along = (sine * axis).sum(-1, keepdim=True)
-    axis, along = torch.where(along < 0, -axis, axis), along.abs()
-    return torch.where((cosine < -0.9)[..., None], torch.atan2(along, cosine[..., None]) * axis, factor[..., None] * sine)
+    turn = torch.atan2(along.abs(), cosine[..., None]) * torch.where(along < 0, -axis, axis)
+    return torch.where((cosine < -0.9)[..., None], turn, factor[..., None] * sine)
 
 
 def turning(start: Tensor, end: Tensor) -> Tensor:
@@ -237,7 +237,7 @@ class Trajectory:
 
 def sample_frame(
     motions: Sequence[Motion | Trajectory], frame: int, frames: int, first: int, count: int, frame_dt: float, start: float,
-    dtype: torch.dtype, device: torch.device, replayed: bool,
+    replayed: bool,
 ) -> Poses:  # fmt: skip
     """Poses at the substeps of frame interval `frame` (from 0) of `frames`, where every interval has its own count.
 
@@ -255,22 +255,20 @@ def sample_frame(
                 "trajectory: it gives poses substep by substep: expected given `counts` and start_time 0, found adaptive substeps "
                 f"or start_time {start}; use a Motion with times or waypoints, or replay with counts"
             )
-    return _poses(sampled, dtype, device)
+    return _poses(sampled)
 
 
 def sample_poses(
-    motions: Sequence[Motion | Trajectory], frames: int, substeps: int, dt: float, start: float, dtype: torch.dtype,
-    device: torch.device, first: int = 0,
-) -> Poses:  # fmt: skip
-    """Poses of all colliders at every substep of `frames` frame intervals, from the `first` substep after time `start`, in the
-    simulator's type.
+    motions: Sequence[Motion | Trajectory], frames: int, substeps: int, dt: float, start: float, first: int = 0
+) -> Poses:
+    """Poses (float64, CPU) of all colliders at every substep of `frames` frame intervals, from the `first` one after time `start`.
 
     Errors: ConfigError naming a collider whose motion is not finite (a NaN would silently touch nothing).
     """
-    return _poses([motion.sample(frames, substeps, dt, start, first) for motion in motions], dtype, device)
+    return _poses([motion.sample(frames, substeps, dt, start, first) for motion in motions])
 
 
-def _poses(sampled: Sequence[Sequence[Tensor]], dtype: torch.dtype, device: torch.device) -> Poses:
+def _poses(sampled: Sequence[Sequence[Tensor]]) -> Poses:
     for i, parts in enumerate(sampled):
         for name, part in zip(Poses._fields, parts):
             if not bool(torch.isfinite(part.detach()).all()):
@@ -278,4 +276,4 @@ def _poses(sampled: Sequence[Sequence[Tensor]], dtype: torch.dtype, device: torc
                 raise ConfigError(
                     f"motion of collider {i}: {name}: expected finite numbers, found {part[bad].tolist()} at substep {bad}"
                 )
-    return Poses(*(torch.stack(parts, 1).to(dtype=dtype, device=device) for parts in zip(*sampled)))
+    return Poses(*(torch.stack(parts, 1) for parts in zip(*sampled)))

@@ -18,22 +18,20 @@ one has its surface in it."""
 
 
 @torch.no_grad()
-def check_clear(
-    colliders: Sequence[Collider], x: Tensor, where: str, field: str = "world.colliders", spacing: float = 0.0
-) -> None:
-    """x: (N, 3) [m] where the body starts, at t = 0; where: what starts, for the message; spacing: of its particles [m]. Errors:
-    ConfigError naming the colliders."""
+def check_clear(colliders: Sequence[Collider], x: Tensor, where: str, field: str = "world.colliders", spacing: float = 0.0) -> None:
+    """x: (N, 3) [m] of particles where the body starts, at t = 0, and their spacing [m]; where: what starts, for the message.
+    Errors: ConfigError naming the colliders."""
     deep, places = [], []
     for collider in colliders:
         motion = collider.motion.timed(None, 1.0) if isinstance(collider.motion, Motion) else collider.motion
         position, rotation = (part[0] for part in motion.sample(1, 1, 1e-9)[:2])
         distance = signed_distance(collider.shape, (x.detach().cpu().double() - position) @ rotation)
         deep.append(distance < -0.5 * min(spacing, half_width(collider.shape)))
-        places.append([round(p, 4) for p in position.tolist()])
-    inside = [i for i, each in enumerate(deep) if bool(each.any())]
-    share = float(torch.stack(deep).any(0).double().mean()) if inside else 0.0
+        places.append(str([round(p, 4) for p in position.tolist()]))
+    share = float(torch.stack(deep).any(0).double().mean()) if deep else 0.0
     if share > MOST:
+        inside = [i for i, each in enumerate(deep) if bool(each.any())]
         named = " and ".join(f"{field}[{i}]" + f" ({colliders[i].name})" * bool(colliders[i].name) for i in inside)
-        raise ConfigError(f"{named}: expected a solid that the body is outside of, found {share:.0%} of {where} inside of "
-                          f"{'it' if len(inside) == 1 else 'them'} at t = 0, where its position is "
-                          f"{' and '.join(str(places[i]) for i in inside)} m")
+        raise ConfigError(f"{named}: expected a solid that the body is outside of, found {share:.0%} of {where} inside "
+                          f"of {'them' if inside[1:] else 'it'} at t = 0, where its position is "
+                          f"{' and '.join(places[i] for i in inside)} m")

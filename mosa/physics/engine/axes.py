@@ -1,8 +1,8 @@
 """The axes in which a simulator computes: along the planes that nodes meet, with their origin near the body.
 
-Nodes meet a plane askew to their grid at other heights than one along it: a body comes to rest elsewhere, by cells. And float32
-resolves a micrometre ten metres from the origin, a millimetre at ten kilometres. Hence x' = Q x - s: Q turns the normals of the
-planes onto grid axes, s is a whole number of cells. Where neither is needed nothing is computed.
+Nodes meet a plane askew to their grid elsewhere than one along it, by cells. And float32 resolves a micrometre ten metres from the
+origin, a millimetre at ten kilometres. Hence x' = Q x - s: Q turns the normals of the planes onto grid axes, s is a whole number of
+cells. Where neither is needed nothing is computed.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.physics.contact.motion import Poses
 from mosa.physics.contact.planes import NODE_MODES, Plane
 from mosa.rotations import skew
 from mosa.types import ParticleState
@@ -33,11 +32,12 @@ class Axes:
     @property
     def world(self) -> "Axes":
         """The way back."""
-        turn = None if self.turn is None else self.turn.mT.contiguous()
+        turn = None if self.turn is None else self.turn.mT
         return Axes(turn, self.shift and tuple((-Axes(turn).vectors(torch.tensor(self.shift, dtype=torch.float64))).tolist()))
 
-    def vectors(self, v: Tensor) -> Tensor:
-        return v if self.turn is None else v @ self.turn.mT.to(v)
+    def vectors(self, v: Tensor | None) -> Tensor | None:
+        """(..., 3), or forces and torques (..., 6)."""
+        return v if v is None or self.turn is None else (v.unflatten(-1, (-1, 3)) @ self.turn.mT.to(v)).flatten(-2)
 
     def points(self, x: Tensor) -> Tensor:
         """(..., 3) [m]: float64 where the origin moves."""
@@ -49,17 +49,9 @@ class Axes:
 
     def state(self, state: ParticleState, dtype: torch.dtype | None = None) -> ParticleState:
         """dtype: of positions, None for what `points` gives."""
-        x, v, C, F = self.points(state.x), self.vectors(state.v), self.gradients(state.C_affine), self.gradients(state.F)
-        C, x = C if self.turn is None else C @ self.turn.mT.to(C), x if dtype is None else x.to(dtype)
-        return ParticleState(x, v, C, F, F if state.F_tot is state.F else self.gradients(state.F_tot))
-
-    def poses(self, poses: Poses) -> Poses:
-        x, R, *twist = poses
-        return Poses(self.points(x), self.gradients(R), *map(self.vectors, twist))
-
-    def reactions(self, forces: Tensor | None) -> Tensor | None:
-        """Forces and torques (..., 6)."""
-        return forces if forces is None else self.vectors(forces.unflatten(-1, (2, 3))).flatten(-2)
+        x, F, C = self.points(state.x), self.gradients(state.F), self.vectors(self.gradients(state.C_affine))
+        F_tot = F if state.F_tot is state.F else self.gradients(state.F_tot)
+        return ParticleState(x if dtype is None else x.to(dtype), self.vectors(state.v), C, F, F_tot)
 
 
 def turn_along(planes: Sequence[Plane]) -> Tensor | None:
@@ -76,10 +68,8 @@ def turn_along(planes: Sequence[Plane]) -> Tensor | None:
             turn = Axes(eye + S + S @ S / (1 + m @ along)).gradients(eye if turn is None else turn)
     for i, n in met.items():
         if float(Axes(turn).vectors(n).abs().sort().values[1]) > ASKEW:
-            raise ConfigError(
-                f"plane {i} (normal {[round(c, 3) for c in n.tolist()]}, mode {planes[i].mode}): expected ground and walls at "
-                "right angles to each other, along which a grid can be, or mode touch (scene.ground.mode=touch), at any angle"
-            )
+            raise ConfigError(f"plane {i} (normal {[round(c, 3) for c in n.tolist()]}, mode {planes[i].mode}): expected ground and "
+                              "walls at right angles, along which a grid can be, or mode touch (scene.ground.mode=touch) at others")
     return turn
 
 

@@ -10,7 +10,6 @@ from torch import Tensor
 from mosa.physics.engine.buffers import Buffers
 from mosa.physics.engine.numerics import State
 from mosa.physics.engine.solver import SegmentSolver
-from mosa.physics.grid.transfer_kernels import OUTSIDE
 from mosa.threads import threaded
 
 
@@ -52,14 +51,6 @@ class Lanes:
             return [tuple(tensors)]
         each = [(None,) * count if t is None else t.chunk(count, dim) for t in tensors]
         return list(zip(*each)) if each else [()] * count
-
-    def check_box(self, x: Tensor, substep: int, dt: float) -> None:
-        """x: (N, 3) [m] of all particles in the world after a substep, where no kernel looks. Errors: SimulationDiverged."""
-        for solver, (part,) in zip(self.solvers, self.split([x])):
-            low, high = torch.tensor(self.numerics.box, dtype=torch.float64).to(part)
-            outside = ((part < low) | (part > high)).any(1)
-            if bool(outside.any()):
-                raise solver.error(OUTSIDE, substep * len(part) + int(outside.nonzero()[0]), 0, dt)
 
     def join(self, parts: Sequence[Sequence[Tensor | None]], dim: int = 0) -> list[Tensor | None]:
         """The tensors of all from the solvers' parts."""

@@ -53,8 +53,7 @@ class Simulator:
 
     dx: grid spacing [m]; substeps per frame of frame_dt [s]; gravity (3,) [m/s^2]; ground: plane below `up` ((3,), against
     gravity by default), then `planes` in order, then the moving `colliders`; box: (2, 3) [m] corners a particle may not leave,
-    None for no limit. The grid lies along the planes that its nodes meet, which have to be at right angles to each other, and its
-    origin is near the body: what goes in and comes out is in the axes of the world (`axes`).
+    None for no limit. It computes in axes of its own (`axes`): planes that nodes meet have to be at right angles.
     strain: hencky | biot | green: what adapters answer is a stiffness G in units of 2 mu, of the energy mu E : G : E that is added
     to 1 + h[0] times the prior's; None: an operator on the prior's stress. options: how the law is taken.
     Errors: ConfigError naming the argument. Not safe for use by two threads: buffers are shared between rollouts.
@@ -102,7 +101,7 @@ class Simulator:
         touching = any(plane.mode == "touch" for plane in all_planes)
         # a ground that particles meet yields a little, and the box may end at it
         box = corners(box, float(dx) if touching else 0.0)
-        low, high = box if axes.turn is None else corners(None)  # one askew is looked at after each frame
+        low, high = box if axes.turn is None else corners(None)  # one askew is looked at by `Stepper.through`
         self.numerics = Numerics(
             law=self.law, dtype=dtype, device=self.device, dx=float(dx), dt=self.dt,
             gravity=tuple(axes.vectors(gravity).tolist()), planes=values, modes=modes, plane_count=len(all_planes),
@@ -110,8 +109,8 @@ class Simulator:
             check_J=self.law.needs_positive_J or options.on_inversion == "error",
             colliders=packed_colliders, strain=strain,
         )  # fmt: skip
-        # at the world's origin, in float64
-        self._planes, self._limits = torch.cat([axes.vectors(values[:, :3]), values[:, 3:]], 1), torch.tensor((low, high)).double()
+        values[:, :3] = axes.vectors(values[:, :3])
+        self._planes, self._limits = values, torch.tensor((low, high), dtype=torch.float64)
         self._move(None)
         # each stretch of motion costs a look at the host, and on CUDA waits for it; a CPU gains nothing
         self.gathers = self.device.type == "cuda"
@@ -203,7 +202,7 @@ class Simulator:
         return Rollout(
             *columns[:3], columns[-1], times=self.frame_dt * torch.arange(frames, dtype=self.dtype, device=self.device),
             final=world.state(ParticleState(*stepper.apart(moment.state if frames > 1 else current))), inverted=inverted,
-            reactions=world.reactions(forces), counts=tuple(counts),
+            reactions=world.vectors(forces), counts=tuple(counts),
         )  # fmt: skip
 
     def stepper(
@@ -266,11 +265,11 @@ class Simulator:
         return Stepper(prepared, worlds, clock, each, axes, self.colliders), Moment(self._begun(state, started), lag=lag)
 
     def _move(self, shift: tuple[float, ...] | None) -> None:
-        """The origin of its axes. Numerics and buffers are others then: a stepper that was made before goes on with its own."""
+        """The origin of its axes. A stepper that was made before goes on with its own numerics and buffers."""
         offset = torch.tensor(shift or (0.0, 0.0, 0.0), dtype=torch.float64)
         planes = self._planes.clone()
         planes[:, 3] -= planes[:, :3] @ offset.to(planes.device)
-        low, high = (tuple(corner) for corner in (self._limits - offset).tolist())
+        low, high = map(tuple, (self._limits - offset).tolist())
         self.numerics = replace(self.numerics, planes=planes.to(self.dtype), low=low, high=high)
         self._axes, self.buffers = replace(self._axes, shift=shift), Buffers()
 
@@ -278,14 +277,14 @@ class Simulator:
         self, stepper: Stepper, frames: int, start_time: float, replayed: bool
     ) -> tuple[Callable[[int, Frame], tuple[Tensor, ...]], tuple[Tensor, ...]]:
         """(what tells those of the colliders in a frame interval, all of them where these are known beforehand)."""
-        each, like = stepper.motions, (torch.float64, torch.device("cpu"))
+        each = stepper.motions
         if not self.colliders:
             return lambda *_: (), ()
         if stepper.clock.varies:
             return lambda number, frame: stepper.taken(sample_frame(
-                each[0], number, frames - 1, frame.first, frame.count, self.frame_dt, start_time, *like, replayed
+                each[0], number, frames - 1, frame.first, frame.count, self.frame_dt, start_time, replayed
             ), frame.dt), ()
-        found = [sample_poses(own, frames - 1, self.substeps, self.dt, start_time, *like) for own in each]
+        found = [sample_poses(own, frames - 1, self.substeps, self.dt, start_time) for own in each]
         found = stepper.taken(tuple(torch.cat(parts, 1) if len(each) > 1 else parts[0] for parts in zip(*found)), self.dt)
         return lambda _, frame: tuple(part[frame.first : frame.first + frame.count] for part in found), found
 

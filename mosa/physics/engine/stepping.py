@@ -28,6 +28,7 @@ from mosa.physics.engine.numerics import Numerics, State, Steps, flat
 from mosa.physics.engine.operation import wants_gradient
 from mosa.physics.engine.segment import HeldSegment, advance_segment
 from mosa.physics.engine.solver import LeftWindow
+from mosa.physics.grid.transfer_kernels import OUTSIDE
 from mosa.types import ParticleState
 
 AHEAD = 256
@@ -217,8 +218,8 @@ class Stepper:
         along = self._poses(moment, frame, poses)
         self.prepared.begin(state, along, frame.count, self.clock.varies)
         after, forces, count = self.through(moment, state, frame, along)
-        forces = self.apart([self.axes.world.reactions(forces)], 1)
-        return Step(after._replace(state=ParticleState(*self.apart(after.state))), *forces, count)
+        (forces,) = self.apart([self.axes.world.vectors(forces)], 1)
+        return Step(after._replace(state=ParticleState(*self.apart(after.state))), forces, count)
 
     def enter(self, moment: Moment, begins: bool, speed: float | None = None) -> tuple[State, Frame]:
         """(all particles before the next frame, the frame). begins: whether a motion does, whose F is not advanced yet."""
@@ -232,10 +233,17 @@ class Stepper:
         """The frame that `enter` found, of all particles one world's after the other's. poses, alike: as `Prepared.frame`."""
         state, forces = self.prepared.frame(state, frame, poses, alike)
         if self.axes.turn is not None:
-            self.prepared.lanes.check_box(self.axes.world.points(state.x.detach()), frame.first + frame.count - 1, frame.dt)
+            self._check_box(self.axes.world.points(state.x.detach()), frame)
         if forces is not None and frame.steps is not None:
             forces = mean_force(forces, frame.steps)
         return Step(Moment(state, moment.substeps + frame.count, moment.frames + 1, frame.dt), forces, frame.count)
+
+    def _check_box(self, x: Tensor, frame: Frame) -> None:
+        low, high = x.new_tensor(self.prepared.numerics.box)
+        if len(outside := ((x < low) | (x > high)).any(1).nonzero()):
+            solvers = self.prepared.lanes.solvers
+            which, particle = divmod(int(outside[0]), len(solvers[0].volume))
+            raise solvers[which].error(OUTSIDE, particle, frame.first + frame.count - 1, frame.dt)
 
     def apart(self, tensors: Iterable[Tensor | None], dim: int = 0) -> list[Tensor | None]:
         """With a dimension for the worlds in place of `dim`."""
@@ -261,14 +269,17 @@ class Stepper:
         """Poses (S, ..., K, ...) at substeps of dt [s] in the simulator's axes and type. Errors: ConfigError for a solid that would
         pass the body without being felt."""
         most, K = 0.5 * self.prepared.numerics.dx / dt, len(self.solids)
-        x, v, w = (poses[i].detach().reshape(len(poses[i]), -1, K, 3) for i in (0, 2, 3))
+        worlds = poses[0].shape[1:-1].numel() // K
+        x, v, w = (poses[i].detach().reshape(len(poses[i]), worlds, K, 3) for i in (0, 2, 3))
         speeds = v.norm(dim=-1) + w.norm(dim=-1) * v.new_tensor([reach(solid.shape) for solid in self.solids])
-        fastest = torch.cat([speeds, x.diff(dim=0).norm(dim=-1) / dt]).amax((0, 1))
+        fastest = torch.cat([speeds, x.diff(dim=0).norm(dim=-1) / dt]).flatten(0, 1)
         if bool((fastest > (1 + 1e-6) * most).any()):
+            fastest = fastest.amax(0)
             k = int(fastest.argmax())
             raise ConfigError(f"collider {self.solids[k].name or k}: expected a speed of at most {most:.3g} m/s, half a cell per "
                               f"substep, found {float(fastest[k]):.3g}, which no body feels: use more substeps (reset(substeps=))")
-        return tuple(self._moved(part) for part in self.axes.poses(Poses(*poses)))
+        x, R, v, w = poses
+        return tuple(map(self._moved, (self.axes.points(x), self.axes.gradients(R), self.axes.vectors(v), self.axes.vectors(w))))
 
     def _moved(self, part: Tensor) -> Tensor:
         """In the simulator's type and on its device: one row where it is the same in all."""
@@ -282,4 +293,4 @@ class Stepper:
         frame_dt = self.clock.frame_dt
         motions = [motion.timed(None, frame_dt) if isinstance(motion, Motion) else motion for motion in motions]
         first, start = (0, moment.frames * frame_dt) if self.clock.varies else (moment.substeps, 0.0)
-        return sample_poses(motions, 1, count, dt, start, torch.float64, torch.device("cpu"), first + after)
+        return sample_poses(motions, 1, count, dt, start, first + after)
