@@ -117,7 +117,7 @@ def check_seen(cfg: DictConfig, scene: Scene) -> None:
     Errors: ConfigError naming the key. Silent where fewer than two mattes are whole.
     """
     world = build_world(world_config(scene) | {"walls": plain(cfg.world).get("walls")})
-    turn_along([*([] if world.ground is None else [ground_plane(world.ground, world.up)]), *world.planes])
+    turn_along([*([ground_plane(world.ground, world.up)] if world.ground is not None else []), *world.planes])
     chosen, origins, directions, radii = lines_of_sight(scene, 0)
     if len(chosen) < 2:
         return
