@@ -369,8 +369,8 @@ def _worlds(
                           f"{'' if options['model'] == body.model() else ' of another variant'}")
     pulls = [world.gravity.to(body.rest)] * len(starts) if gravity is None else list(gravity.to(body.rest))
     # the time step is one for all
-    hardest = replace(world, gravity=max(pulls, key=lambda g: float(g.norm())))
-    quick = _fastest(body, starts)
+    quick, time = _fastest(body, starts), options["frames"] * options["frame_dt"]
+    hardest = max((replace(world, gravity=pull) for pull in pulls), key=lambda each: each.fastest(quick, body.size, time))
     if laws is None:
         found = [body.ready(quick, hardest, **options)]
     else:

@@ -13,8 +13,8 @@ from mosa.physics.contact.motion import Motion
 from mosa.physics.contact.reference import signed_distance
 
 MOST = 0.01
-"""Share of a body's particles that may be deeper than half their spacing, or half way into a thin solid: what is pressed against
-one has its surface in it."""
+"""Share of a body's particles that may be deeper than a quarter of their spacing, or of the way into a thin solid: where both touch,
+they are half a spacing outside."""
 
 
 @torch.no_grad()
@@ -26,7 +26,7 @@ def check_clear(colliders: Sequence[Collider], x: Tensor, where: str, field: str
         motion = collider.motion.timed(None, 1.0) if isinstance(collider.motion, Motion) else collider.motion
         position, rotation = (part[0] for part in motion.sample(1, 1, 1e-9)[:2])
         distance = signed_distance(collider.shape, (x.detach().cpu().double() - position) @ rotation)
-        deep.append(distance < -0.5 * min(spacing, half_width(collider.shape)))
+        deep.append(distance < -0.25 * min(spacing, half_width(collider.shape)))
         places.append(str([round(p, 4) for p in position.tolist()]))
     share = float(torch.stack(deep).any(0).double().mean()) if deep else 0.0
     if share > MOST:
