@@ -13,8 +13,8 @@ from mosa.physics.contact.motion import Motion
 from mosa.physics.contact.reference import signed_distance
 
 MOST = 0.01
-"""Share of a body's particles that may be deeper than a quarter of their spacing, or of the way into a thin solid: where both touch,
-they are half a spacing outside."""
+"""Share of a body's particles that may be deeper than a quarter of their spacing, or of a thin solid: where both touch, they
+are half a spacing outside."""
 
 
 @torch.no_grad()
