@@ -179,9 +179,9 @@ def body_like(cfg: Mapping[str, Any], scene: Scene, count: int, radius: float) -
 
 def speed_of_rollouts(body: Body, frame_dt: float, gravity: torch.Tensor, up: torch.Tensor) -> float:
     """Seconds of a frame of frame_dt [s]: of two in free flight, corrected as the fit's are, after some that load the kernels."""
-    world = World(None, gravity, up, torch.tensor([[-1e3] * 3, [1e3] * 3]))
+    world = World(None, gravity, up, torch.tensor([[-1e5] * 3, [1e5] * 3]))
     zero = torch.zeros_like(body.rest[0])
-    start = Start(torch.eye(3).to(zero), zero, zero, zero)
+    start = Start(torch.eye(3).to(zero), body.center, zero, zero)
     seen = None if body.settings.adaptive else body.rest.expand(3, -1, 3)
     took = math.inf
     with torch.no_grad():

@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
@@ -18,7 +19,7 @@ from mosa.errors import ConfigError, DataError
 from mosa.modules.body import Body, Ready, Start, World
 from mosa.modules.learned_numbers import each_law
 from mosa.physics.contact.colliders import reach
-from mosa.physics.contact.motion import Poses, exponential, rotation_matrices, rotation_vector
+from mosa.physics.contact.motion import Poses, exponential, rotation_matrices, rotation_vector, turning
 from mosa.physics.engine.clock import Moment
 from mosa.physics.engine.numerics import State, flat
 from mosa.twin_start import check_wants_no_gradients
@@ -113,6 +114,7 @@ class Episode:
             self._driven = torch.zeros(len(self.colliders), dtype=torch.bool)
             self._moment, self._poses = moment, self._placed(moment, 0)
             self._starts, self._first = starts, self._poses
+            self._said: dict[int, Tensor] = {}  # rotation vectors of the last actions
 
     @property
     def substeps(self) -> int | None:
@@ -127,7 +129,7 @@ class Episode:
         numbers = {"frames": moment.frames, "substeps": moment.substeps}
         times = {"time": moment.frames * self.frame_dt, "lag": moment.lag}
         return TwinState(
-            *(getattr(moment.state, name) for name in State._fields), self._lifts, *self._poses, self._driven,
+            *State.of(self._stepper.axes.world.state(moment.state)), self._lifts, *self._poses, self._driven,
             **{k: torch.tensor(v) for k, v in numbers.items()},
             **{k: torch.tensor(v, dtype=torch.float64) for k, v in times.items()},
         )  # fmt: skip
@@ -146,6 +148,7 @@ class Episode:
             if not 0 <= int(found := getattr(state, name)) <= 2**53:  # as far as times have them exactly
                 raise ConfigError(f"state.{name}: expected a whole number of at least 0 and at most 2^53, found {int(found)}")
         particles = ParticleState(*(getattr(state, name).to(now.x.device) for name in State._fields))
+        particles = self._stepper.axes.state(particles, particles.v.dtype)
         self._moment = Moment(particles, int(state.substeps), int(state.frames), float(state.lag))
         self._driven, self._poses = state.driven.cpu(), (state.position.cpu(), state.rotation.cpu())
 
@@ -184,7 +187,9 @@ class Episode:
         again = dict(zip(which, starts if starts is not None else [self._starts[b] for b in which], strict=True))
         with self._gradients():
             now = moment.state.worlds()
-            fresh = ParticleState.stack([self._begin(b, again[b]) if b in again else now[b] for b in range(self.worlds)])
+            for b in again:
+                now[b] = self._stepper.axes.state(self._begin(b, again[b]), now[b].x.dtype)
+            fresh = ParticleState.stack(now)
             if moment.substeps:  # F goes before its velocities by one advance
                 parts = self._stepper.prepared.first_advance(flat(fresh), self._stepper.clock.dt)
                 fresh = ParticleState(*(t.unflatten(0, (self.worlds, -1)) for t in parts))
@@ -256,29 +261,19 @@ class Episode:
             v = (end["position"] - x) / self.frame_dt
         if "rotation" in command:
             end["rotation"] = command["rotation"].expand_as(R)
-            w = rotation_vector(end["rotation"] @ R.mT) / self.frame_dt
+            w = (rotation_vector(end["rotation"] @ R.mT) if "turn" not in command else command["turn"]) / self.frame_dt
         return v.expand_as(x), w.expand_as(x), end
 
     def _speed(self, commands: dict[int, dict], driven: Tensor) -> float:
-        """Bound of the colliders' speeds in this step [m/s]. Errors: ConfigError for a collider that is faster than a fixed step
-        allows."""
-        most = 0.5 * self._stepper.prepared.numerics.dx / self._stepper.clock.dt if self.substeps is not None else float("inf")
+        """Bound of the colliders' speeds in this step [m/s]."""
         fastest = 0.0
         for k, collider in enumerate(self.colliders):
             far = reach(collider.shape)
             if not driven[k]:
                 fastest = max(fastest, collider.motion.max_speed(far))
-                continue
-            if k not in commands:
-                continue
-            v, w, _ = self._twist(commands[k], *(part.select(len(self._leading()), k).detach() for part in self._poses))
-            speed = float((v.detach().norm(dim=-1) + far * w.detach().norm(dim=-1)).max())
-            if speed > most:
-                raise ConfigError(
-                    f"action[{self.names[k]!r}]: expected a speed of at most {most:.3g} m/s, half a cell per substep, found "
-                    f"{speed:.3g}; use reset(substeps=...) with more than {self.substeps}"
-                )
-            fastest = max(fastest, speed)
+            elif k in commands:
+                v, w, _ = self._twist(commands[k], *(part.select(len(self._leading()), k).detach() for part in self._poses))
+                fastest = max(fastest, float((v.detach().norm(dim=-1) + far * w.detach().norm(dim=-1)).max()))
         return fastest
 
     def _checked(self, action: Mapping[str, Any]) -> dict[int, dict[str, Tensor]]:
@@ -298,7 +293,17 @@ class Episode:
                     f"{where}: expected {' and '.join(TWISTS)}, or {' and '.join(TARGETS)} after the step, or one of them, found "
                     f"{', '.join(map(str, command)) or 'nothing'}"
                 )
-            commands[self.names.index(name)] = {key: self._vector(f"{where}.{key}", value) for key, value in command.items()}
+            k, given = self.names.index(name), command.get("rotation")
+            commands[k] = {key: self._vector(f"{where}.{key}", value) for key, value in command.items()}
+            said = None if given is None else torch.as_tensor(given, dtype=torch.float64).cpu()
+            if said is None or said.shape[-2:] == (3, 3):
+                continue
+            if bool((said.detach().norm(dim=-1) > math.pi - 1e-6).any()):
+                # half a turn or more, from what was said last where that is where the solid is
+                R, last = self._poses[1].select(len(self._leading()), k), self._said.get(k)
+                last = last if last is not None and torch.allclose(exponential(last).expand_as(R), R) else rotation_vector(R)
+                commands[k]["turn"] = turning(last, said)
+            self._said[k] = said
         return commands
 
     def _vector(self, where: str, value: Any) -> Tensor:
@@ -345,8 +350,8 @@ def _worlds(
                           f"{'' if options['model'] == body.model() else ' of another variant'}")
     pulls = [world.gravity.to(body.rest)] * len(starts) if gravity is None else list(gravity.to(body.rest))
     # the time step is one for all
-    hardest = replace(world, gravity=max(pulls, key=lambda g: float(g.norm())))
-    quick = _fastest(body, starts)
+    quick, time = _fastest(body, starts), options["frames"] * options["frame_dt"]
+    hardest = max((replace(world, gravity=pull) for pull in pulls), key=lambda each: each.fastest(quick, body.size, time))
     if laws is None:
         found = [body.ready(quick, hardest, **options)]
     else:
@@ -359,7 +364,7 @@ def _worlds(
     def begin(b: int, start: Start) -> ParticleState:
         state = body.initial_state(start, simulator.dt, pulls[b])
         state = replace(state, x=state.x + found[b % len(found)].lift)
-        return ParticleState(*(getattr(state, name).to(simulator.dtype) for name in State._fields))
+        return state.to(simulator.dtype)
 
     ready, states = found[0] if laws is None else Ready.stack(found), [begin(b, start) for b, start in enumerate(starts)]
     return replace(ready, simulator=simulator, state=ParticleState.stack(states)), begin

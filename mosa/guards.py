@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mosa.analysis.figures import ffmpeg
 from mosa.checkpoints import check_resumed, check_same_scene, read_checkpoint
-from mosa.config import plain, rehearse
+from mosa.config import build_world, plain, rehearse, world_config
 from mosa.data.agreement import lines_of_sight, misses
 from mosa.data.splat_files import check_formats
 from mosa.errors import ConfigError, DataError
@@ -24,6 +24,8 @@ from mosa.limits import counted
 from mosa.modules.body import Body, Start, World
 from mosa.physics.contact.colliders import colliders_from_config
 from mosa.physics.contact.overlap import check_clear
+from mosa.physics.contact.planes import ground_plane
+from mosa.physics.engine.axes import turn_along
 from mosa.reconstruction.starts import first_contact
 from mosa.schema import check
 from mosa.twin import Twin
@@ -107,10 +109,12 @@ def check_begin(cfg: DictConfig) -> None:
 
 
 def check_seen(cfg: DictConfig, scene: Scene) -> None:
-    """The object as frame 0 shows it, before its reconstruction: no solid contains it, and the grid's spacing suits its size.
+    """The object as frame 0 shows it, before its reconstruction: no solid contains it, a grid suits its size, ground and walls.
 
     Errors: ConfigError naming the key. Silent where fewer than two mattes are whole.
     """
+    world = build_world(world_config(scene) | {"walls": plain(cfg.world).get("walls")})
+    turn_along([*([ground_plane(world.ground, world.up)] if world.ground is not None else []), *world.planes])
     chosen, origins, directions, radii = lines_of_sight(scene, 0)
     if len(chosen) < 2:
         return
@@ -130,7 +134,7 @@ def check_starts(world: World, body: Body, found: dict[str, Start]) -> None:
     """No sequence starts inside of a solid. Errors: ConfigError naming the collider."""
     for prefix, start in found.items():
         x = (body.rest - body.center) @ start.rotation.to(body.rest).T + start.center.to(body.rest)
-        check_clear(world.colliders, x, f"the body of {prefix}")
+        check_clear(world.colliders, x, f"the body of {prefix}", spacing=float(body.volume.mean()) ** (1 / 3))
 
 
 def warn_of_little(world: World, body: Body, found: Mapping[str, Start], scenes: Sequence[Scene]) -> None:

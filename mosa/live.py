@@ -121,8 +121,7 @@ class Live:
                 self.target = self.home()
             solids = [*twin.world.colliders, self.ball(self.target)]
             # the time step is to allow for the speed that the whole fall gives
-            fall = math.sqrt(2 * drop.height / max(float(twin.world.gravity.norm()), 1e-3)) / self.dt
-            options = {"colliders": solids, "control_dt": self.dt, "frames": int(min(max(30, fall), 300))}
+            options = {"colliders": solids, "control_dt": self.dt, "frames": 300}
             state = twin.reset(**given, **options)
         except (MosaError, RuntimeError) as error:
             return self.fail(error)

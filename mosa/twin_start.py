@@ -160,8 +160,10 @@ def start_in(
     if height is not None:
         if not is_number(height) or (height < 0 and world.ground is not None):
             raise ConfigError(f"height: expected metres above the ground, a finite number >= 0, found {height!r}")
-        ground = world.ground.height if world.ground is not None else 0.0
-        center = center + up * (ground + height - (arms @ up).min() - center @ up)
+        ground, low = world.ground.height if world.ground is not None else 0.0, arms @ up
+        if world.ground is not None and world.ground.mode == "touch":  # it is met by balls, where it was found to be
+            low = low - 0.5 * body.volume.to(low) ** (1 / 3) + body.contact.lift(world.ground).detach()
+        center = center + up * (ground + height - low.min() - center @ up)
     start = Start(Q, center, velocity_.to(body.rest), spin.to(body.rest))
     if colliders is not None:
         world = replace(world, colliders=colliders_from_config(colliders, "colliders"))
@@ -172,7 +174,8 @@ def start_in(
         if outside > 0:
             raise ConfigError(f"box: expected one that the body starts in, found {outside:.0%} of it outside of "
                               f"{world.box.tolist()} m; its centre is at {[round(c, 4) for c in center.tolist()]} m")
-    check_clear(world.colliders, center + arms, "the body", "world.colliders" if colliders is None else "colliders")
+    field, spacing = "world.colliders" if colliders is None else "colliders", float(body.volume.mean()) ** (1 / 3)
+    check_clear(world.colliders, center + arms, "the body", field, spacing)
     if world.ground is not None:
         below = float((((center + arms) @ up).detach() < world.ground.height).double().mean())
         if below > UNDER:

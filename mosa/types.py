@@ -211,6 +211,10 @@ class ParticleState:
         """The states of equally many particles each, as those of B worlds."""
         return cls(*(torch.stack([getattr(state, f.name) for state in states]) for f in fields(cls)))
 
+    def to(self, dtype: torch.dtype) -> ParticleState:
+        """In this type, but x in float64 stays so."""
+        return ParticleState(*(t if t is self.x and t.dtype == torch.float64 else t.to(dtype) for t in vars(self).values()))
+
     def worlds(self) -> list[ParticleState]:
         """The states of B worlds, one by one."""
         return [ParticleState(*parts) for parts in zip(*(getattr(self, f.name).unbind(0) for f in fields(self)))]

@@ -7,6 +7,7 @@ import struct
 import sys
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -20,11 +21,12 @@ from mosa.data.images import check_amount, read_image
 from mosa.data.particles import read_ply
 from mosa.data.splats import load_ply
 from mosa.errors import ConfigError, DataError
-from mosa.guards import check_begin, check_configuration, check_particles
+from mosa.guards import check_begin, check_configuration, check_particles, check_seen
 from mosa.limits import machine_memory
 from mosa.physics.contact.mesh import field_of_mesh
 from mosa.reconstruction.cache import StageCache
 from mosa.run import read_figures
+from mosa.types import Ground
 
 
 def test_more_particles_than_memory_holds_are_refused_with_the_most_that_fit():
@@ -32,6 +34,14 @@ def test_more_particles_than_memory_holds_are_refused_with_the_most_that_fit():
     check_particles("simulation.particles", 0.9 * most)
     with pytest.raises(ConfigError, match=rf"simulation\.particles: expected at most {int(most)}, found"):
         check_particles("simulation.particles", 1.1 * most)
+
+
+def test_walls_beside_a_ground_that_slopes_are_refused_before_the_reconstruction():
+    up = torch.tensor([0.5, 0.75**0.5, 0.0])
+    scene = SimpleNamespace(ground=Ground(0.0, "sticky"), gravity=-9.8 * up, up=up, box=torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    cfg = OmegaConf.create(composed("debug=default", "world.walls={mode: separate}"))
+    with pytest.raises(ConfigError, match=r"plane 0 .*mode sticky.*right angles.*scene\.ground\.mode=touch"):
+        check_seen(cfg, scene)
 
 
 def test_a_fit_goes_on_from_its_own_checkpoint_alone(tmp_path):

@@ -21,8 +21,8 @@ from mosa.modules.model import Model
 from mosa.modules.ready import Ready
 from mosa.modules.simulation_settings import SimulationSettings
 from mosa.modules.start import Start, World
-from mosa.physics.contact.colliders import reach
 from mosa.physics.engine.adaptive_steps import StepControl
+from mosa.physics.engine.axes import PERIOD
 from mosa.physics.engine.clock import Adaptive, Replay
 from mosa.physics.engine.law_options import AS_USUAL, LawOptions
 from mosa.physics.engine.simulator import Simulator
@@ -132,7 +132,9 @@ class Body(nn.Module):
         v = velocity + torch.linalg.cross(start.angular_velocity.expand_as(arm), arm)
         n = len(arm)
         F = Q.expand(n, 3, 3).contiguous()
-        return ParticleState(arm + start.center, v, skew(start.angular_velocity).expand(n, 3, 3).contiguous(), F, F)
+        far = float(start.center.detach().abs().max()) > PERIOD * self.settings.dx  # where float32 has few digits for a particle
+        center = start.center.double() if far else start.center
+        return ParticleState(arm + center, v, skew(start.angular_velocity).expand(n, 3, 3).contiguous(), F, F)
 
     def stiffening(self, adapted: bool) -> float:
         """Modulus over the prior's that the time step allows for."""
@@ -213,10 +215,7 @@ class Body(nn.Module):
         elif substeps is not None:
             state = self.initial_state(start, frame_dt / substeps, gravity)
         else:
-            fall = float(gravity.norm()) * frames * frame_dt
-            speed = float(start.velocity.detach().norm()) + fall
-            speed += float(start.angular_velocity.detach().norm()) * self.size
-            speed += max((c.motion.max_speed(reach(c.shape)) for c in world.colliders), default=0.0)
+            speed = world.fastest(start, self.size, frames * frame_dt)
             # one time step for all variants of a body: their difference is then the law's, not the integrator's
             substeps = self.substeps(
                 float(material.max_modulus(factor.detach())), frame_dt, speed, self.adapter is not None,
@@ -231,7 +230,7 @@ class Body(nn.Module):
         else:
             simulator = self.simulator(material.law, substeps, frame_dt, world, adapter.strain if adapter is not None else None)
         state = replace(state, x=state.x + lift)
-        state = ParticleState(*(getattr(state, name).to(dtype) for name in ("x", "v", "C_affine", "F", "F_tot")))
+        state = state.to(dtype)
         arguments = {
             "parameters": {k: p.to(dtype) for k, p in parameters.items()}, "volume": self.volume.to(dtype),
             "density": self.density, "adapter": adapter,

@@ -54,7 +54,7 @@ def corrected_rollout(
         away = observed[frame] - part.final.x
         if unseen is not None:
             away = away + unseen(part.final.x, frame)
-        current = replace(part.final, v=part.final.v + (gain / frame_dt) * away)
+        current = replace(part.final, v=part.final.v + ((gain / frame_dt) * away).to(part.final.v))
     if not parts:
         return roll(state, frames=1)
     stacked = {

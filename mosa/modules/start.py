@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 
-from mosa.physics.contact.colliders import Collider
+from mosa.physics.contact.colliders import Collider, reach
 from mosa.physics.contact.planes import Plane
 from mosa.types import Ground
+
+FASTER = 1.5
+"""Times the speed that its energy allows a body, which single particles reach (measured on blocks of 1 to 30 kPa: 0.7 to 1.47)."""
 
 
 @dataclass(frozen=True)
@@ -44,3 +48,15 @@ class World:
     box: Tensor
     planes: tuple[Plane, ...] = ()
     colliders: tuple[Collider, ...] = ()
+
+    def fastest(self, start: Start, size: float, time: float) -> float:
+        """Bound of the speeds [m/s] of a body of this size [m] within `time` [s] from `start`: as far as it can fall, and what
+        colliders add."""
+        up, gravity, center = (v.detach().double().cpu() for v in (self.up / self.up.norm(), self.gravity, start.center))
+        first, spin = (float(v.detach().norm()) for v in (start.velocity, start.angular_velocity * size))
+        fastest, pull = first + float(self.gravity.norm()) * time + spin, -float(gravity @ up)
+        if self.ground is not None and pull > 0:
+            height = max(0.0, float(center @ up) - self.ground.height + 0.5 * size)
+            sliding = float((gravity + pull * up).norm()) * time
+            fastest = min(fastest, FASTER * math.hypot(first + spin, math.sqrt(2 * pull * height)) + sliding)
+        return fastest + max((c.motion.max_speed(reach(c.shape)) for c in self.colliders), default=0.0)

@@ -124,7 +124,14 @@ def entries(change):
     return lambda folder: edit(folder / "transforms.json", change)
 
 
+def moved(offset):
+    """All cameras moved along x [m]."""
+    return entries(lambda d: [e["transform_matrix"][0].__setitem__(3, e["transform_matrix"][0][3] + offset) for e in d["frames"]])
+
+
 TRANSFORMS = {
+    "ten kilometres away": (moved(1e4), r"camera .*: expected within 100 m of the origin.*found .* subtract one offset"),
+    "a million kilometres away": (moved(-1e9), "camera .*: expected within 100 m of the origin"),
     "no frames": (entries(lambda d: d.pop("frames")), "expected an object with a list `frames`"),
     "no pose": (entries(lambda d: d["frames"][2].pop("transform_matrix")), r"frames\[2\]: expected the key transform_matrix"),
     "no focal length": (

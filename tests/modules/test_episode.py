@@ -1,5 +1,6 @@
 """A twin that is stepped: the bits of one long simulation, state saved and branched, driven colliders, gradients, many worlds."""
 
+import math
 import re
 import warnings
 from dataclasses import replace
@@ -327,8 +328,8 @@ def _with(body, numbers):
     ({"1": {"speed": 1.0}}, r"action\['1'\]: expected velocity and angular_velocity, or position and rotation .*, found speed"),
     ({"1": {"velocity": (0, 0, 0), "position": (0, 0, 0)}}, r"action\['1'\]: .* found velocity, position"),
     ({"1": {"rotation": 2 * torch.eye(3)}}, r"action\['1'\]\.rotation: .*a defect of 3"),
-    ({"pusher": (0, 100.0, 0)}, r"action\['pusher'\]: expected a speed of at most .* found 100"),
-    ({"pusher": {"position": (5.0, 0, 0)}}, r"action\['pusher'\]: expected a speed of at most"),
+    ({"pusher": (0, 100.0, 0)}, "collider pusher: expected a speed of at most .* found 100"),
+    ({"pusher": {"position": (5.0, 0, 0)}}, "collider pusher: expected a speed of at most"),
     (5, "action: expected commands by the names of colliders, found 5"),
 ])  # fmt: skip
 def test_errors_of_actions_name_the_collider(action, message):
@@ -380,3 +381,88 @@ def test_the_page_about_the_twin_runs(monkeypatch, tmp_path):
     assert names["by_push"].abs().max() > 0 and names["by_modulus"].abs() > 0
     assert names["state"].positions.shape == (4, 120, 3) and names["reactions"].shape[1:] == (4, 1, 6)
     assert TwinState.read(torch.load("moment.pt", weights_only=True)).x.shape == (120, 3)
+
+
+@pytest.mark.parametrize("precision", [32, 64])
+def test_a_twin_that_is_turned_and_far_away_moves_as_at_home(precision):
+    """Ten kilometres away on a sloping ground: simulated, stepped, driven, saved and branched."""
+    away = torch.tensor([9e3, 0.0, -4e3]).double()
+    home = {"frames": STEPS + 1, "box": [[-9, -9, -9], [9, 9, 9]]}
+    there = home | {"position": (away + torch.tensor([0.0, 0.09, 0.0]).double()).tolist(), "box": [[-1e4] * 3, [1e4] * 3]}
+    made = twin(precision)
+    near, far = made.simulate(**home), made.simulate(**there)
+    assert (far.x.double() - away - near.x.double()).abs().max() < (1.5e-3 if precision == 32 else 1e-6)  # float32 resolves 1 mm
+    assert (far.F - near.F).abs().max() < 0.02 and near.x[-1, :, 1].amin() > 0
+    paddle = PUSHER | {"position": [-0.12, 0.08, 0]}
+    moved = paddle | {"position": (away + torch.tensor([-0.12, 0.08, 0.0]).double()).tolist()}
+    seen = []
+    for given, solid in ((home, paddle), (there, moved)):
+        state = made.reset(**given, colliders=[solid])
+        for k in range(STEPS):
+            state, reactions = made.step({"pusher": {"velocity": (0.6, 0, 0)}})
+            if k == 3:
+                saved = state
+        made.state = saved
+        for _ in range(STEPS - 4):
+            again = made.step({"pusher": {"velocity": (0.6, 0, 0)}}).state
+        assert (again.x - state.x).abs().max() < 1e-5
+        seen.append((state.x.double(), reactions))
+    assert seen[1][0].dtype == torch.float64 and (seen[1][0] - away - seen[0][0]).abs().max() < 1e-3
+    assert float(seen[0][1].abs().max()) > 0.1
+
+
+@pytest.mark.parametrize("angle", [0.9, 1.0, 1.5, 2.0, -3.0])
+def test_any_turn_is_swept(angle):
+    """A bar that is told to turn by half a turn and more hits the body on its way; so again from a saved state, and in worlds."""
+    bar = {"type": "box", "name": "bar", "size": [0.5, 0.06, 0.04], "position": [0, 0.1, 0.2], "mode": "separate"}
+    made, target = twin(), torch.tensor([0.0, angle * torch.pi, 0.0]).double()
+    options = {"colliders": [bar], "control_dt": 0.4, "substeps": 600, "velocity": (0, 0, 0), "frames": 3}
+    begun = made.reset(**options)
+    state, reactions = made.step({"bar": {"rotation": target.tolist()}})
+    assert float(reactions.abs().max()) > 0.1
+    torch.testing.assert_close(state.rotation[0], exponential(target), rtol=0, atol=1e-9)
+    made.state = begun
+    again, same = made.step({"bar": {"rotation": target.tolist()}})
+    assert torch.equal(same, reactions) and torch.equal(again.x, state.x)
+    worlds = made.worlds(2)
+    worlds.reset({"velocity": (0, 0, 0)}, **{k: v for k, v in options.items() if k != "velocity"})
+    _, both = worlds.step({"bar": {"rotation": torch.stack([target, 0 * target])}})
+    torch.testing.assert_close(both[:, 0], reactions, rtol=1e-6, atol=1e-9)
+
+
+def test_turns_go_on_beyond_half_a_turn():
+    """Targets in steps of 0.3 pi are reached by the same twist each, forwards and backwards, whatever lies between."""
+    made = twin()
+    made.reset(colliders=[PUSHER | {"position": [-2, 1, 0], "motion": {}}], frames=3, substeps=60)
+    for n in (1, 2, 3, 4, 5, 6, 7, 8, 7, 6, 5):
+        before = made.state.rotation[0]
+        state, _ = made.step({"pusher": {"rotation": (0, 0.3 * torch.pi * n, 0)}})
+        torch.testing.assert_close(state.rotation[0], exponential(torch.tensor([0, 0.3 * math.pi * n, 0], dtype=torch.float64)))
+        turned = state.rotation[0] @ before.mT
+        assert float(turned.diagonal().sum()) == pytest.approx(1 + 2 * math.cos(0.3 * math.pi), abs=1e-6)
+    held, _ = made.step({"pusher": {"rotation": (0, 1.5 * torch.pi, 0)}})
+    torch.testing.assert_close(held.rotation, state.rotation)  # at a speed of 0: a whole turn would be refused as too fast
+
+
+FAST = {"type": "box", "name": "fast", "size": [0.1, 0.1, 0.1], "mode": "separate"}
+STILL = torch.zeros(200, 3).double()
+JUMPS = Trajectory(torch.tensor([-1.0, 0.1, 0]) + torch.tensor([0.1, 0, 0]) * torch.arange(200)[:, None], STILL, STILL, STILL)
+
+
+@pytest.mark.parametrize("solid, action", [
+    ({"position": [-1, 0.1, 0], "motion": {"velocity": [1000, 0, 0]}}, None),
+    ({"motion": {"waypoints": [{"time": 0, "position": [-1, 0.1, 0]}, {"time": 0.01, "position": [1, 0.1, 0]}]}}, None),
+    ({"position": [-1, 0.1, 0], "motion": {"angular_velocity": [0, 0, 1000]}}, None),
+    ({"position": [-1, 0.1, 0], "motion": {"velocity": [[0, 0, 0], [500, 0, 0]], "times": [0, 0.02]}}, None),
+    (JUMPS, None), ({"position": [-1, 0.1, 0]}, {"velocity": (1000, 0, 0)}),
+    ({"position": [-1, 0.1, 0]}, {"position": (1, 0.1, 0)}), ({"position": [-1, 0.1, 0]}, {"angular_velocity": (0, 900, 0)}),
+    ({"position": [-1, 0.1, 0]}, {"rotation": (0, 40.0, 0)}),
+])  # fmt: skip
+def test_a_solid_that_no_body_would_feel_is_refused(solid, action):
+    made = twin()
+    solids = colliders_from_config([FAST | (solid if isinstance(solid, dict) else {"position": [-1, 0.1, 0]})])
+    solids = solids if isinstance(solid, dict) else (replace(solids[0], motion=solid),)
+    with pytest.raises(ConfigError, match=r"collider fast: expected a speed of at most .* half a cell per substep"):
+        made.reset(colliders=solids, substeps=8)
+        for _ in range(3):
+            made.step(None if action is None else {"fast": action})

@@ -52,14 +52,43 @@ def test_displacement_is_the_integral_of_the_velocity():
     torch.testing.assert_close(R[[10, 20, 40]], torch.from_numpy(turns), **exact(atol=1e-12))
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 0.5, 3.0])
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 0.5, 2.6, 2.8, 3.0, math.pi - 1e-4, math.pi - 1e-9])
 def test_rotation_vector_inverts_the_exponential(angle):
-    axis = torch.tensor([0.6, 0.0, -0.8]).double()
+    axis = torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64)
     R = exponential(angle * axis)
     torch.testing.assert_close(rotation_vector(R), angle * axis, **exact(atol=1e-14 if angle < 1 else 1e-12))
     v = (angle * axis).requires_grad_()
     (gradient,) = torch.autograd.grad(rotation_vector(exponential(v)) @ axis, v)
     torch.testing.assert_close(gradient, axis, **exact(atol=1e-9))
+
+
+@pytest.mark.parametrize("axis", [(0, 1, 0), (1, 0, 0), (0.6, 0, -0.8), (1, 1, 1), (-0.2, 0.3, 0.9)])
+def test_half_a_turn_has_a_vector(axis):
+    """Either sense is right; whatever comes out is the same rotation. Beside half a turn the sense is told again."""
+    axis = torch.tensor(axis).double()
+    axis = axis / axis.norm()
+    R = 2 * axis[:, None] * axis[None] - torch.eye(3).double()  # exactly half a turn
+    v = rotation_vector(R)
+    assert float(v.norm()) == pytest.approx(math.pi, abs=1e-12)
+    torch.testing.assert_close(exponential(v), R, **exact(atol=1e-12))
+    for angle in (math.pi - 1e-6, math.pi + 1e-6):
+        sense = 1 if angle < math.pi else -1
+        torch.testing.assert_close(rotation_vector(exponential(angle * axis)), sense * (math.pi - 1e-6) * axis, **exact(atol=1e-9))
+    batch = torch.stack([R, torch.eye(3).double(), exponential(0.3 * axis)])
+    torch.testing.assert_close(rotation_vector(batch)[1:], torch.stack([0 * axis, 0.3 * axis]), **exact())
+
+
+@pytest.mark.parametrize("start, end, turn", [
+    ((0, 0, 0), (0, math.pi, 0), (0, math.pi, 0)), ((0, 0, 0), (0, 1.5 * math.pi, 0), (0, 1.5 * math.pi, 0)),
+    ((0, 0, 0), (0, -4 * math.pi, 0), (0, -4 * math.pi, 0)), ((0, 3.0, 0), (0, 3.5, 0), (0, 0.5, 0)),
+    ((0, 6.0, 0), (0, 5.0, 0), (0, -1.0, 0)), ((0, 3.0, 0), (0, -3.0, 0), (0, 2 * math.pi - 6, 0)),
+])  # fmt: skip
+def test_waypoints_turn_as_far_as_their_vectors_say(start, end, turn):
+    """Half a turn and more about one axis; below it the shortest way."""
+    motion = Motion.waypoints([0.0, 2.0], [[0, 0, 0]] * 2, [start, end])
+    turn, end = (torch.tensor(vector, dtype=torch.float64) for vector in (turn, end))
+    torch.testing.assert_close(motion.sample(2, 4, 0.25)[3][0], turn / 2, **exact(atol=1e-12))
+    torch.testing.assert_close(motion.sample(3, 4, 0.25)[1][-1], exponential(end), **exact(atol=1e-12))
 
 
 def test_gradients():
@@ -97,13 +126,13 @@ NAN_TURN[2, 1] = math.nan
         (lambda: Motion(velocity=(1.0, 2.0)).sample(3, 4, 0.1), r"velocity: expected \(3,\)"),
         (lambda: Motion(position=(math.nan, 0, 0)).sample(3, 4, 0.1), "position"),
         (lambda: Motion(position=torch.zeros(4, 3)).sample(3, 4, 0.1), r"position: expected \(3,\), found 4"),
-        (lambda: sample_poses([Motion(), Trajectory(STILL, NAN_TURN, STILL, STILL)], 1, 4, 0.1, 0.0, torch.float64,
-                              torch.device("cpu")), "collider 1: rotation.*at substep 2"),
+        (lambda: sample_poses([Motion(), Trajectory(STILL, NAN_TURN, STILL, STILL)], 1, 4, 0.1, 0.0),
+         "collider 1: rotation.*at substep 2"),
         (lambda: Motion(rotation=torch.ones(3, 3)).sample(3, 4, 0.1), "expected rotation matrices"),
         (lambda: Motion(times=[0.1, 0.0], velocity=torch.zeros(2, 3)).sample(3, 4, 0.1), "times: expected ascending"),
         (lambda: Motion.waypoints([0.0], [[0, 0, 0]]), "at least two"),
         (lambda: Motion.waypoints([0.0, 1.0], [[0, 0, 0]] * 3), "found 3 and 2"),
-        (lambda: Motion.waypoints([0.0, 1.0], [[0, 0, 0]] * 2, [[0, 0, 0], [math.pi, 0, 0]]), "half a turn"),
+        (lambda: Motion.waypoints([0.0, 1.0], [[0, 0, 0]] * 2, exponential(torch.tensor([[0, 0, 0], [3.1, 0, 0]]))), "half a turn"),
     ],
 )  # fmt: skip
 def test_errors(make, match):

@@ -397,9 +397,12 @@ class TestErrors:
         return simulator(**options).rollout(state, parameters or self.PARAMETERS, volume_of(state), DENSITY, 3)
 
     def test_far_away(self, make_block):
-        state = make_block()
-        with pytest.raises(SimulationDiverged, match="from the origin"):
-            self.run(replace(state, x=state.x + 1e8))
+        state, far = make_block(), torch.tensor([1e8, 0.0, -2e8], dtype=torch.float64)
+        near, there = self.run(state), self.run(replace(state, x=state.x + far))
+        assert float((there.x - far - near.x).abs().max()) < 1e-6  # 3e-8 m is what float64 resolves there
+        with pytest.raises(ConfigError, match=r"x: particles are 2e\+08 m from the origin, .*float64"):
+            self.run(ParticleState(*(t.float() for t in (state.x + far, state.v, state.C_affine, state.F, state.F_tot))),
+                     dtype=torch.float32)  # fmt: skip
 
     def test_nan(self, make_block):
         state = make_block()

@@ -218,7 +218,7 @@ def test_a_stepper_goes_on_from_a_state_with_poses_from_outside(make_block):
     law = {"mu": 4e4, "lam": 5e4}
     long = sim.rollout(state, law, volume, 1000.0, FRAMES, motions=motions(1))
     stepper, moment = sim.stepper(state, law, volume, 1000.0, motions=motions(1))
-    poses = sample_poses(motions(1), FRAMES - 1, SUBSTEPS, sim.dt, 0.0, torch.float64, torch.device("cpu"))
+    poses = sample_poses(motions(1), FRAMES - 1, SUBSTEPS, sim.dt, 0.0)
     frames = [Poses(*(part[f * SUBSTEPS : (f + 1) * SUBSTEPS] for part in poses)) for f in range(FRAMES - 1)]
     for frame, given in enumerate((None, frames[1], lambda count, dt: frames[2])):
         before, (moment, reactions, count) = moment, stepper.step(moment, given)

@@ -8,7 +8,7 @@ from torch import Tensor
 from mosa.data.builtin.hidden import Hidden
 from mosa.data.builtin.objects import object_named
 from mosa.errors import ConfigError
-from mosa.physics.contact.colliders import reach
+from mosa.modules.start import Start
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.engine.time_step import required_substeps
 from mosa.types import ParticleState, Scene
@@ -36,14 +36,13 @@ def floor_rollout(body, scene: Scene, world) -> Tensor:
     rest, device = body.rest.detach().float().cpu(), body.rest.device
     Q = truth.rotation.float()
     start = (rest - truth.rest.mean(0)) @ Q.T + truth.positions[0].mean(0)
-    speed = float(truth.velocity.norm()) + float(world.gravity.norm()) * frame_dt * scene.frames
-    speed += max((c.motion.max_speed(reach(c.shape)) for c in world.colliders), default=0.0)
+    begun = Start(Q, start.mean(0), truth.velocity.float(), torch.zeros(3))
     substeps = required_substeps(
         hidden.wave_modulus(),
         hidden.density,
         frame_dt,
         settings.dx,
-        v_max=speed,
+        v_max=world.fastest(begun, body.size, frame_dt * scene.frames),
         courant=min(settings.courant, 0.3),
         limit=5000,
         viscosity=hidden.viscosity(),

@@ -18,7 +18,7 @@ from mosa.errors import ConfigError
 from mosa.physics.contact import shapes as packing
 from mosa.physics.contact.keys import check_keys
 from mosa.physics.contact.mesh import SignedDistanceField, field_of_mesh
-from mosa.physics.contact.motion import Motion, Trajectory, exponential
+from mosa.physics.contact.motion import Motion, Trajectory
 from mosa.physics.contact.planes import MODES, Plane
 from mosa.physics.contact.touch import GRIP
 from mosa.schema import is_number
@@ -235,7 +235,7 @@ def _motion(item: dict) -> Motion:
             raise ConfigError("motion: waypoints stand alone, without position, velocity or angular_velocity")
         if len(points) < 2:
             raise ConfigError(f"motion.waypoints: expected at least two poses, found {len(points)}")
-        turns = [exponential(_axis_degrees(p["rotation"]) if p.get("rotation") is not None else rotation) for p in points]
+        turns = [_axis_degrees(p["rotation"]) if p.get("rotation") is not None else rotation for p in points]
         return Motion.waypoints([p["time"] for p in points], [p["position"] for p in points], torch.stack(turns))
     if unknown := [key for key in motion if key not in ("velocity", "angular_velocity", "times")]:
         raise ConfigError(f"motion: unknown: {', '.join(unknown)}; expected velocity, angular_velocity, times, or waypoints")

@@ -52,7 +52,7 @@ def rotation_matrices(value: Tensor | Sequence, leading: int = 0) -> Tensor:
 
 
 def rotation_vector(R: Tensor) -> Tensor:
-    """Rotation vectors (..., 3) [rad] of rotation matrices (..., 3, 3) by less than pi, differentiable."""
+    """Rotation vectors (..., 3) [rad] of rotation matrices (..., 3, 3) by at most pi, differentiable."""
     sine = 0.5 * torch.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1)
     cosine = 0.5 * (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)
     square = (sine**2).sum(-1)
@@ -60,7 +60,23 @@ def rotation_vector(R: Tensor) -> Tensor:
     # angle/sin(angle), by its series where the angle (below 1e-4) leaves 1e-17 of it
     size = torch.where(small, torch.ones_like(square), square).sqrt()
     factor = torch.where(small & (cosine > 0), 1 + square / 6, torch.atan2(size, cosine) / size)
-    return factor[..., None] * sine
+    # near pi the sine has no direction, but R + R^T - 2 cos = 2 (1 - cos) n n^T has
+    about = R + R.mT - 2 * cosine[..., None, None] * torch.eye(3).to(R)
+    about = torch.where((cosine < -0.9)[..., None, None], about, torch.ones_like(about))
+    longest = about.detach().diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None].expand(*R.shape[:-1], 1)
+    axis = torch.nn.functional.normalize(about.gather(-1, longest)[..., 0], dim=-1)
+    along = (sine * axis).sum(-1, keepdim=True)
+    turn = torch.atan2(along.abs(), cosine[..., None]) * torch.where(along < 0, -axis, axis)
+    return torch.where((cosine < -0.9)[..., None], turn, factor[..., None] * sine)
+
+
+def turning(start: Tensor, end: Tensor) -> Tensor:
+    """Rotation vectors (..., 3) [rad] of the turns from rotation vectors `start` to `end`: the shortest ones, but what they say
+    where both are about one axis and one of them is half a turn or more."""
+    shortest = rotation_vector(exponential(end) @ exponential(start).mT)
+    far = torch.maximum(start.norm(dim=-1), end.norm(dim=-1)) > math.pi - 1e-6
+    told = far & (torch.linalg.cross(*torch.broadcast_tensors(start, end)).norm(dim=-1) < 1e-6)
+    return torch.where(told[..., None], end - start, shortest)
 
 
 def _vectors(name: str, value: Tensor | Sequence) -> Tensor:
@@ -90,7 +106,8 @@ class Motion:
     def waypoints(cls, times: Sequence[float] | Tensor, positions: Tensor | Sequence, rotations: Tensor | Sequence | None = None):
         """Through poses at `times` (K,) [s], K >= 2, at constant twist between; at rest before the first and after the last.
 
-        positions: (K, 3) [m]; rotations: (K, 3) or (K, 3, 3), turned by less than half a turn from one to the next.
+        positions: (K, 3) [m]; rotations: (K, 3) or (K, 3, 3), turned by less than half a turn from one to the next, or by more
+        where vectors about one axis say so (`turning`).
         Errors: ConfigError naming the field.
         """
         times = torch.as_tensor(times, dtype=torch.float64)
@@ -98,18 +115,20 @@ class Motion:
         count = len(times)
         if times.ndim != 1 or count < 2 or not bool((times.diff() > 0).all()):
             raise ConfigError(f"motion: waypoints: times: expected at least two ascending numbers, found {times.tolist()}")
-        R = rotation_matrices(torch.zeros(count, 3) if rotations is None else rotations, 1)
+        rotations = torch.as_tensor(torch.zeros(count, 3) if rotations is None else rotations, dtype=torch.float64)
+        R = rotation_matrices(rotations, 1)
         if len(positions) != count or len(R) != count:
             raise ConfigError(
                 f"motion: waypoints: expected one position and rotation for each of {count} times, found {len(positions)} and "
                 f"{len(R)}"
             )
-        steps = R[1:] @ R[:-1].mT
-        if bool((steps.detach().diagonal(dim1=-2, dim2=-1).sum(-1) < -0.99).any()):
+        told = rotations.ndim == 2
+        turns = turning(rotations[:-1], rotations[1:]) if told else rotation_vector(R[1:] @ R[:-1].mT)
+        if not told and bool((turns.detach().norm(dim=-1) > 3.04).any()):
             raise ConfigError("motion: waypoints: rotations: expected less than half a turn between two, put one in between")
         interval, rest = times.diff()[:, None], torch.zeros(1, 3, dtype=torch.float64)
         velocity = torch.cat([(positions[1:] - positions[:-1]) / interval, rest])
-        angular = torch.cat([rotation_vector(steps) / interval, rest])
+        angular = torch.cat([turns / interval, rest])
         return cls(positions[0], R[0], velocity, angular, times)
 
     def shifted(self, offset: Tensor) -> "Motion":
@@ -219,7 +238,7 @@ class Trajectory:
 
 def sample_frame(
     motions: Sequence[Motion | Trajectory], frame: int, frames: int, first: int, count: int, frame_dt: float, start: float,
-    dtype: torch.dtype, device: torch.device, replayed: bool,
+    replayed: bool,
 ) -> Poses:  # fmt: skip
     """Poses at the substeps of frame interval `frame` (from 0) of `frames`, where every interval has its own count.
 
@@ -237,23 +256,21 @@ def sample_frame(
                 "trajectory: it gives poses substep by substep: expected given `counts` and start_time 0, found adaptive substeps "
                 f"or start_time {start}; use a Motion with times or waypoints, or replay with counts"
             )
-    return _poses(sampled, dtype, device)
+    return _poses(sampled)
 
 
 def sample_poses(
-    motions: Sequence[Motion | Trajectory], frames: int, substeps: int, dt: float, start: float, dtype: torch.dtype,
-    device: torch.device, first: int = 0,
-) -> Poses:  # fmt: skip
-    """Poses of all colliders at every substep of `frames` frame intervals, from the `first` substep after time `start`, in the
-    simulator's type.
+    motions: Sequence[Motion | Trajectory], frames: int, substeps: int, dt: float, start: float, first: int = 0
+) -> Poses:
+    """Poses (float64, CPU) of all colliders at every substep of `frames` frame intervals, from the `first` one after time `start`.
 
     Errors: ConfigError naming a collider whose motion is not finite (a NaN would silently touch nothing).
     """
     counted("substeps of all frames and colliders", (frames, substeps, len(motions)), "take fewer", each=3 * 8 * (3 + 9 + 3 + 3))
-    return _poses([motion.sample(frames, substeps, dt, start, first) for motion in motions], dtype, device)
+    return _poses([motion.sample(frames, substeps, dt, start, first) for motion in motions])
 
 
-def _poses(sampled: Sequence[Sequence[Tensor]], dtype: torch.dtype, device: torch.device) -> Poses:
+def _poses(sampled: Sequence[Sequence[Tensor]]) -> Poses:
     for i, parts in enumerate(sampled):
         for name, part in zip(Poses._fields, parts):
             if not bool(torch.isfinite(part.detach()).all()):
@@ -261,4 +278,4 @@ def _poses(sampled: Sequence[Sequence[Tensor]], dtype: torch.dtype, device: torc
                 raise ConfigError(
                     f"motion of collider {i}: {name}: expected finite numbers, found {part[bad].tolist()} at substep {bad}"
                 )
-    return Poses(*(torch.stack(parts, 1).to(dtype=dtype, device=device) for parts in zip(*sampled)))
+    return Poses(*(torch.stack(parts, 1) for parts in zip(*sampled)))

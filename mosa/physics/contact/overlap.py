@@ -1,4 +1,4 @@
-"""Whether a body starts inside of a rigid solid: no contact is meant where most of it does, and every result would be wrong."""
+"""Whether a body starts inside of rigid solids: no contact is meant there, and every result would be wrong."""
 
 from __future__ import annotations
 
@@ -8,24 +8,30 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.physics.contact.colliders import Collider
-from mosa.physics.contact.motion import Trajectory, rotation_matrices
+from mosa.physics.contact.colliders import Collider, half_width
+from mosa.physics.contact.motion import Motion
 from mosa.physics.contact.reference import signed_distance
 
-MOST = 0.5
-"""Share of a body's particles: one that is pressed against a solid has fewer of them in it."""
+MOST = 0.01
+"""Share of a body's particles that may be deeper than a quarter of their spacing, or of a thin solid: where both touch, they
+are half a spacing outside."""
 
 
 @torch.no_grad()
-def check_clear(colliders: Sequence[Collider], x: Tensor, where: str, field: str = "world.colliders") -> None:
-    """x: (N, 3) [m] where the body starts, at t = 0; where: what starts, for the message. Errors: ConfigError naming the collider.
-    """
-    for i, collider in enumerate(colliders):
-        moves = isinstance(collider.motion, Trajectory)  # a pose for each substep
-        position = torch.as_tensor(collider.motion.position, dtype=torch.float64).cpu().reshape(-1, 3)[0]
-        rotation = rotation_matrices(collider.motion.rotation, int(moves)).cpu().reshape(-1, 3, 3)[0]
-        inside = float((signed_distance(collider.shape, (x.detach().cpu().double() - position) @ rotation) < 0).double().mean())
-        if inside > MOST:
-            name = f" ({collider.name})" if collider.name else ""
-            raise ConfigError(f"{field}[{i}]{name}: expected a solid that the body is outside of, found {inside:.0%} of {where} "
-                              f"inside of it at t = 0, where its position is {[round(p, 4) for p in position.tolist()]} m")
+def check_clear(colliders: Sequence[Collider], x: Tensor, where: str, field: str = "world.colliders", spacing: float = 0.0) -> None:
+    """x: (N, 3) [m] of particles where the body starts, at t = 0, and their spacing [m]; where: what starts, for the message.
+    Errors: ConfigError naming the colliders."""
+    deep, places = [], []
+    for collider in colliders:
+        motion = collider.motion.timed(None, 1.0) if isinstance(collider.motion, Motion) else collider.motion
+        position, rotation = (part[0] for part in motion.sample(1, 1, 1e-9)[:2])
+        distance = signed_distance(collider.shape, (x.detach().cpu().double() - position) @ rotation)
+        deep.append(distance < -0.25 * min(spacing, half_width(collider.shape)))
+        places.append(str([round(p, 4) for p in position.tolist()]))
+    share = float(torch.stack(deep).any(0).double().mean()) if deep else 0.0
+    if share > MOST:
+        inside = [i for i, each in enumerate(deep) if bool(each.any())]
+        named = " and ".join(f"{field}[{i}]" + f" ({colliders[i].name})" * bool(colliders[i].name) for i in inside)
+        raise ConfigError(f"{named}: expected a solid that the body is outside of, found {share:.0%} of {where} inside "
+                          f"of {'them' if inside[1:] else 'it'} at t = 0, where its position is "
+                          f"{' and '.join(places[i] for i in inside)} m")

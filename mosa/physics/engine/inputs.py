@@ -55,12 +55,13 @@ def pack_parameters(
 
 
 def check_state(numerics: Numerics, state: ParticleState, volume: Tensor) -> None:
-    """Errors: ConfigError naming what has another shape, type or device."""
+    """Errors: ConfigError naming what has another shape, type or device; x may be float64 in any case."""
     *worlds, n = state.x.shape[:-1]
     shapes = {name: (*worlds, n, 3) if name in ("x", "v") else (*worlds, n, 3, 3) for name in State._fields}
     values = {name: (getattr(state, name), shape) for name, shape in shapes.items()} | {"volume": (volume, (n,))}
     for name, (value, shape) in values.items():
-        if tuple(value.shape) != shape or value.dtype != numerics.dtype or value.device.type != numerics.device.type:
+        known = value.dtype == numerics.dtype or (name == "x" and value.dtype == torch.float64)
+        if tuple(value.shape) != shape or not known or value.device.type != numerics.device.type:
             raise ConfigError(
                 f"{name}: expected shape {shape} of {numerics.dtype} on {numerics.device}, found {tuple(value.shape)} of "
                 f"{value.dtype} on {value.device}"

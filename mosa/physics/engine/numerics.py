@@ -45,8 +45,9 @@ def flat(particles: ParticleState) -> State:
 class Numerics:
     """What is constant over a rollout and the same in all worlds, but for gravity where each has its own. dx [m], dt [s] where the
     step is fixed, gravity (3,) [m/s^2], planes (P, 6) and modes (P,) from `pack_planes`, low and high (3,) [m] corners of the
-    admissible domain, norm_eps under the root of yield norms, colliders None where there are none, strain: measure of an operator
-    that is a stiffness (`stress_kernel`), None for one that acts on the stress; touching: whether a plane is met by particles."""
+    admissible domain, all in the simulator's axes (`axes`), box: the same corners in the world, norm_eps under the root of yield
+    norms, colliders None where there are none, strain: measure of an operator that is a stiffness (`stress_kernel`), None for one
+    that acts on the stress; touching: whether a plane is met by particles."""
 
     law: Law
     dtype: torch.dtype
@@ -57,6 +58,7 @@ class Numerics:
     planes: Tensor
     modes: Tensor
     plane_count: int
+    box: tuple[tuple[float, ...], tuple[float, ...]]
     low: tuple[float, float, float]
     high: tuple[float, float, float]
     norm_eps: float

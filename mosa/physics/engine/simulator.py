@@ -25,6 +25,7 @@ from mosa.physics.contact.motion import sample_frame, sample_poses
 from mosa.physics.contact.planes import Plane, ground_plane, pack_planes
 from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState, Several, ask
 from mosa.physics.engine.adaptive_steps import StepChooser, check_counts
+from mosa.physics.engine.axes import Axes, shift_to, turn_along
 from mosa.physics.engine.buffers import Buffers
 from mosa.physics.engine.clock import Adaptive, Clock, Frame, Moment, Replay
 from mosa.physics.engine.inputs import (
@@ -53,7 +54,7 @@ class Simulator:
 
     dx: grid spacing [m]; substeps per frame of frame_dt [s]; gravity (3,) [m/s^2]; ground: plane below `up` ((3,), against
     gravity by default), then `planes` in order, then the moving `colliders`; box: (2, 3) [m] corners a particle may not leave,
-    None for no limit.
+    None for no limit. It computes in axes of its own (`axes`): planes that nodes meet have to be at right angles.
     strain: hencky | biot | green: what adapters answer is a stiffness G in units of 2 mu, of the energy mu E : G : E that is added
     to 1 + h[0] times the prior's; None: an operator on the prior's stress. options: how the law is taken.
     Errors: ConfigError naming the argument. Not safe for use by two threads: buffers are shared between rollouts.
@@ -94,20 +95,24 @@ class Simulator:
         if up is None:
             up = -gravity / gravity.norm() if gravity.norm() > 0 else torch.tensor([0.0, 1.0, 0.0])
         all_planes = ([ground_plane(ground, up)] if ground is not None else []) + list(planes)
-        values, modes = pack_planes(all_planes, dtype, self.device, float(dx))
+        axes = self._axes = Axes(turn_along(all_planes))
+        values, modes = pack_planes(all_planes, torch.float64, self.device, float(dx))
         self.colliders = tuple(colliders)
         packed_colliders = pack_colliders(self.colliders, dtype, self.device) if self.colliders else None
         touching = any(plane.mode == "touch" for plane in all_planes)
         # a ground that particles meet yields a little, and the box may end at it
-        low, high = corners(box, float(dx) if touching else 0.0)
+        box = corners(box, float(dx) if touching else 0.0)
+        low, high = box if axes.turn is None else corners(None)  # one askew is looked at by `Stepper.through`
         self.numerics = Numerics(
-            law=self.law, dtype=dtype, device=self.device, dx=float(dx), dt=self.dt, gravity=tuple(gravity.tolist()),
-            planes=values, modes=modes, plane_count=len(all_planes), touching=touching, low=low, high=high,
-            norm_eps=float(options.norm_eps), rebuild=options.rebuild,
+            law=self.law, dtype=dtype, device=self.device, dx=float(dx), dt=self.dt,
+            gravity=tuple(axes.vectors(gravity).tolist()), planes=values, modes=modes, plane_count=len(all_planes),
+            touching=touching, low=low, high=high, box=box, norm_eps=float(options.norm_eps), rebuild=options.rebuild,
             check_J=self.law.needs_positive_J or options.on_inversion == "error",
             colliders=packed_colliders, strain=strain,
         )  # fmt: skip
-        self.buffers = Buffers()
+        values[:, :3] = axes.vectors(values[:, :3])
+        self._planes, self._limits = values, torch.tensor((low, high), dtype=torch.float64)
+        self._move(None)
         # each stretch of motion costs a look at the host, and on CUDA waits for it; a CPU gains nothing
         self.gathers = self.device.type == "cuda"
         # no method: the cycle would keep a dropped simulator's buffers until the garbage collector looks
@@ -147,8 +152,9 @@ class Simulator:
         """`frames` frames, the start being frame 0 (so frames - 1 intervals are simulated), of a body, or of B worlds at once.
 
         state: particles at frame 0, x (N, 3) and so on, their F and F_tot not yet advanced by C_affine, unless `started` (the
-        `final` of an earlier rollout). parameters: physical values the law names, per particle (N,) or scalar; volume: (N,) [m^3];
-        density [kg/m^3]: number or (N,).
+        `final` of an earlier rollout). Far from the origin (1024 cells) x of the result is float64, and x of the state should be:
+        float32 has a resolution of 1 mm at 10 km. parameters: physical values the law names, per particle (N,) or scalar; volume:
+        (N,) [m^3]; density [kg/m^3]: number or (N,).
         adapter: asked every `stride` substeps from the start of each frame; None: once, at the start of the rollout (an operator
         that does not depend on the state). collect: called with `adapter.statistics()`, a named tuple of tensors, of every
         evaluation. progress: called with the number of each frame. Before an adapter that has `flow` is asked, F becomes
@@ -189,13 +195,15 @@ class Simulator:
         names = ("x", "v", "F", "F_tot") if self.law.plastic else ("x", "v", "F")
         columns = stepper.apart((torch.stack([getattr(each, name) for each in recorded]) for name in names), 1)
         inverted = int((_determinant(columns[2].detach()) <= 0).sum())
+        world = stepper.axes.world
+        columns = [world.points(columns[0]), world.vectors(columns[1]), *map(world.gradients, columns[2:])]
         if inverted and self.options.on_inversion == "warn":
             warnings.warn(f"{inverted} particle states with det F <= 0 in {frames} frames", stacklevel=2)
         (forces,) = stepper.apart([torch.stack(reactions) if reactions else None], 2)
         return Rollout(
             *columns[:3], columns[-1], times=self.frame_dt * torch.arange(frames, dtype=self.dtype, device=self.device),
-            final=ParticleState(*stepper.apart(moment.state if frames > 1 else current)), inverted=inverted, reactions=forces,
-            counts=tuple(counts),
+            final=world.state(ParticleState(*stepper.apart(moment.state if frames > 1 else current))), inverted=inverted,
+            reactions=world.vectors(forces), counts=tuple(counts),
         )  # fmt: skip
 
     def stepper(
@@ -234,7 +242,14 @@ class Simulator:
             raise ConfigError("timing: expected None with many worlds, which take the same substeps")
         if worlds is None and (gravity is not None or together is not None):
             raise ConfigError("gravity and together: expected None without worlds; gravity is the simulator's")
+        check_state(self.numerics, state, volume)
+        if (shift := shift_to(state.x, self._axes.turn, self.numerics.dx)) != self._axes.shift:
+            self._move(shift)
+        axes = self._axes
+        state = axes.state(state, self.dtype)
         gravities = None if worlds is None else gravity_of_worlds(gravity, worlds, self.numerics.gravity)
+        if gravity is not None:
+            gravities = tuple(map(tuple, axes.vectors(torch.tensor(gravities, dtype=torch.float64)).tolist()))
         prepared = self._prepare(state, parameters, volume, density, adapter, stride, collect, frames, worlds, gravities, together)
         each = motions_of_worlds(motions, self.colliders, worlds)
         choose = None
@@ -248,21 +263,30 @@ class Simulator:
             choose = chooser.choose
         clock = Clock(self.frame_dt, self.substeps, None if frames == 1 else choose)
         lag = 0.0 if timing is None else timing.lag
-        return Stepper(prepared, worlds, clock, each), Moment(self._begun(state, started), lag=lag)
+        return Stepper(prepared, worlds, clock, each, axes, self.colliders), Moment(self._begun(state, started), lag=lag)
+
+    def _move(self, shift: tuple[float, ...] | None) -> None:
+        """The origin of its axes. A stepper that was made before goes on with its own numerics and buffers."""
+        offset = torch.tensor(shift or (0.0, 0.0, 0.0), dtype=torch.float64)
+        planes = self._planes.clone()
+        planes[:, 3] -= planes[:, :3] @ offset.to(planes.device)
+        low, high = map(tuple, (self._limits - offset).tolist())
+        self.numerics = replace(self.numerics, planes=planes.to(self.dtype), low=low, high=high)
+        self._axes, self.buffers = replace(self._axes, shift=shift), Buffers()
 
     def _poses(
         self, stepper: Stepper, frames: int, start_time: float, replayed: bool
     ) -> tuple[Callable[[int, Frame], tuple[Tensor, ...]], tuple[Tensor, ...]]:
         """(what tells those of the colliders in a frame interval, all of them where these are known beforehand)."""
-        each, like = stepper.motions, (self.dtype, self.device)
+        each = stepper.motions
         if not self.colliders:
             return lambda *_: (), ()
         if stepper.clock.varies:
-            return lambda number, frame: sample_frame(
-                each[0], number, frames - 1, frame.first, frame.count, self.frame_dt, start_time, *like, replayed
-            ), ()
-        found = [sample_poses(own, frames - 1, self.substeps, self.dt, start_time, *like) for own in each]
-        found = tuple(torch.cat(parts, 1) if len(each) > 1 else parts[0] for parts in zip(*found))
+            return lambda number, frame: stepper.taken(sample_frame(
+                each[0], number, frames - 1, frame.first, frame.count, self.frame_dt, start_time, replayed
+            ), frame.dt), ()
+        found = [sample_poses(own, frames - 1, self.substeps, self.dt, start_time) for own in each]
+        found = stepper.taken(tuple(torch.cat(parts, 1) if len(each) > 1 else parts[0] for parts in zip(*found)), self.dt)
         return lambda _, frame: tuple(part[frame.first : frame.first + frame.count] for part in found), found
 
     def _prepare(
@@ -272,7 +296,6 @@ class Simulator:
         """What a rollout needs besides its state. Errors: ConfigError."""
         if (frames is not None and frames < 1) or (stride is not None and stride < 1):
             raise ConfigError(f"frames and stride: expected at least 1, found {frames} and {stride}")
-        check_state(self.numerics, state, volume)
         counted("particles of all frames", (frames or 1, *state.x.shape[:-1]), "take fewer", each=4 * (3 + 3 + 9 + 9))
         volume, n, count = volume.detach().contiguous(), len(volume), worlds or 1
         density, mean_mass = checked_density(density, volume)

@@ -98,7 +98,7 @@ class SegmentSolver:
             flags = self.look(work.flags, final)
             if not self.left_window(flags, first, dt):
                 return work, final, windows
-        raise LeftWindow if len(margins) == 1 else self._error(WINDOW, flags[WINDOW], first, dt)
+        raise LeftWindow if len(margins) == 1 else self.error(WINDOW, flags[WINDOW], first, dt)
 
     @contextmanager
     def one_look(self, state: State, time: float, margin: int) -> Iterator[None]:
@@ -188,16 +188,17 @@ class SegmentSolver:
         event = min(range(4), key=lambda i: (flags[i] // n, i != INVERTED, i == WINDOW, flags[i]))
         if event == WINDOW:
             return True
-        raise self._error(event, flags[event], first, dt)
+        raise self.error(event, flags[event], first, dt)
 
-    def _error(self, event: int, flag: int, first: int, dt: float) -> SimulationDiverged:
+    def error(self, event: int, flag: int, first: int, dt: float) -> SimulationDiverged:
+        """flag: number of the particle plus len(volume) for every substep after `first`."""
         substep, particle = first + flag // len(self.volume), flag % len(self.volume)
         world, particle = divmod(particle, len(self.volume) // self.worlds)
         law, numerics = self.numerics.law, self.numerics
         what = {
             WINDOW: "moved by more than half a cell per substep",
             NONFINITE: "position, velocity or deformation is no longer finite",
-            OUTSIDE: f"position is outside the box {list(numerics.low)} to {list(numerics.high)} m",
+            OUTSIDE: f"position is outside the box {list(numerics.box[0])} to {list(numerics.box[1])} m",
             INVERTED: "det F <= 0, which "
             + (f"law {law.name} has no value for" if law.needs_positive_J else "on_inversion=error forbids"),
         }[event]

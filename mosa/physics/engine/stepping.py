@@ -14,9 +14,11 @@ import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError, SimulationDiverged
+from mosa.physics.contact.colliders import Collider, reach
 from mosa.physics.contact.motion import Motion, Poses, Trajectory, sample_poses
 from mosa.physics.engine.adapter_chain import ChainOfSegments
 from mosa.physics.engine.adapter_interface import ANSWER, AdapterOperator, MaterialState
+from mosa.physics.engine.axes import Axes
 from mosa.physics.engine.budget import room, substep_bytes
 from mosa.physics.engine.chain_schedule import SEGMENT, Chains
 from mosa.physics.engine.clock import Clock, Frame, Moment
@@ -26,6 +28,7 @@ from mosa.physics.engine.numerics import Numerics, State, Steps, flat
 from mosa.physics.engine.operation import wants_gradient
 from mosa.physics.engine.segment import HeldSegment, advance_segment
 from mosa.physics.engine.solver import LeftWindow
+from mosa.physics.grid.transfer_kernels import OUTSIDE
 from mosa.types import ParticleState
 
 AHEAD = 256
@@ -191,13 +194,16 @@ class Stepper:
     """Advances bodies by one frame at a time, with colliders where the caller puts them. Made by `Simulator.stepper`.
 
     prepared: with what is the same in all steps; worlds: None for one body without a leading dimension; clock: how many substeps
-    the steps take; motions: of the colliders, of every world.
+    the steps take; motions: of the `solids`, of every world; axes: of the moments' states. `axes.world.state` has them in the
+    world, as poses and reactions are here.
     """
 
     def __init__(
-        self, prepared: Prepared, worlds: int | None, clock: Clock, motions: Sequence[Sequence[Motion | Trajectory]]
-    ) -> None:
+        self, prepared: Prepared, worlds: int | None, clock: Clock, motions: Sequence[Sequence[Motion | Trajectory]],
+        axes: Axes, solids: Sequence[Collider],
+    ) -> None:  # fmt: skip
         self.prepared, self.worlds, self.clock, self.motions = prepared, worlds, clock, motions
+        self.axes, self.solids = axes, solids
 
     def step(
         self, moment: Moment, poses: Poses | Callable[[int, float], Poses] | None = None, speed: float | None = None
@@ -212,7 +218,8 @@ class Stepper:
         along = self._poses(moment, frame, poses)
         self.prepared.begin(state, along, frame.count, self.clock.varies)
         after, forces, count = self.through(moment, state, frame, along)
-        return Step(after._replace(state=ParticleState(*self.apart(after.state))), *self.apart([forces], 1), count)
+        (forces,) = self.apart([self.axes.world.vectors(forces)], 1)
+        return Step(after._replace(state=ParticleState(*self.apart(after.state))), forces, count)
 
     def enter(self, moment: Moment, begins: bool, speed: float | None = None) -> tuple[State, Frame]:
         """(all particles before the next frame, the frame). begins: whether a motion does, whose F is not advanced yet."""
@@ -225,9 +232,18 @@ class Stepper:
     def through(self, moment: Moment, state: State, frame: Frame, poses: tuple[Tensor, ...], alike: int = 0) -> Step:
         """The frame that `enter` found, of all particles one world's after the other's. poses, alike: as `Prepared.frame`."""
         state, forces = self.prepared.frame(state, frame, poses, alike)
+        if self.axes.turn is not None:
+            self._check_box(self.axes.world.points(state.x.detach()), frame)
         if forces is not None and frame.steps is not None:
             forces = mean_force(forces, frame.steps)
         return Step(Moment(state, moment.substeps + frame.count, moment.frames + 1, frame.dt), forces, frame.count)
+
+    def _check_box(self, x: Tensor, frame: Frame) -> None:
+        low, high = x.new_tensor(self.prepared.numerics.box)
+        if len(outside := ((x < low) | (x > high)).any(1).nonzero()):
+            solvers = self.prepared.lanes.solvers
+            which, particle = divmod(int(outside[0]), len(solvers[0].volume))
+            raise solvers[which].error(OUTSIDE, particle, frame.first + frame.count - 1, frame.dt)
 
     def apart(self, tensors: Iterable[Tensor | None], dim: int = 0) -> list[Tensor | None]:
         """With a dimension for the worlds in place of `dim`."""
@@ -235,19 +251,35 @@ class Stepper:
 
     def _poses(self, moment: Moment, frame: Frame, poses: Poses | Callable | None) -> tuple[Tensor, ...]:
         """(S, W K, ...) each, in the simulator's type."""
-        colliders, numerics, count = len(self.motions[0]), self.prepared.numerics, frame.count
+        colliders, count = len(self.motions[0]), frame.count
         if not colliders:
             return ()
         if poses is None:
             each = [self.sample(moment, count, frame.dt, motions) for motions in self.motions]
-            return tuple(torch.cat(parts, 1).to(numerics.dtype).to(numerics.device) for parts in zip(*each))
+            return self.taken([torch.cat(parts, 1) for parts in zip(*each)], frame.dt)
         poses = poses(count, frame.dt) if callable(poses) else poses
         leading = (count, colliders) if self.worlds is None else (count, self.worlds, colliders)
         for name, part, shape in zip(Poses._fields, poses, ((3,), (3, 3), (3,), (3,)), strict=True):
             if tuple(part.shape) != (*leading, *shape):
                 raise ConfigError(f"poses: {name}: expected shape {(*leading, *shape)}, found {tuple(part.shape)}")
-        poses = [self._moved(part) for part in poses]
-        return tuple(poses if self.worlds is None else (part.flatten(1, 2) for part in poses))
+        poses = self.taken(poses, frame.dt)
+        return poses if self.worlds is None else tuple(part.flatten(1, 2) for part in poses)
+
+    def taken(self, poses: Sequence[Tensor], dt: float) -> tuple[Tensor, ...]:
+        """Poses (S, ..., K, ...) at substeps of dt [s] in the simulator's axes and type. Errors: ConfigError for a solid that would
+        pass the body without being felt."""
+        most, K = 0.5 * self.prepared.numerics.dx / dt, len(self.solids)
+        worlds = poses[0].shape[1:-1].numel() // K
+        x, v, w = (poses[i].detach().reshape(len(poses[i]), worlds, K, 3) for i in (0, 2, 3))
+        speeds = v.norm(dim=-1) + w.norm(dim=-1) * v.new_tensor([reach(solid.shape) for solid in self.solids])
+        fastest = torch.cat([speeds, x.diff(dim=0).norm(dim=-1) / dt]).flatten(0, 1)
+        if bool((fastest > (1 + 1e-6) * most).any()):
+            fastest = fastest.amax(0)
+            k = int(fastest.argmax())
+            raise ConfigError(f"collider {self.solids[k].name or k}: expected a speed of at most {most:.3g} m/s, half a cell per "
+                              f"substep, found {float(fastest[k]):.3g}, which no body feels: use more substeps (reset(substeps=))")
+        x, R, v, w = poses
+        return tuple(map(self._moved, (self.axes.points(x), self.axes.gradients(R), self.axes.vectors(v), self.axes.vectors(w))))
 
     def _moved(self, part: Tensor) -> Tensor:
         """In the simulator's type and on its device: one row where it is the same in all."""
@@ -261,4 +293,4 @@ class Stepper:
         frame_dt = self.clock.frame_dt
         motions = [motion.timed(None, frame_dt) if isinstance(motion, Motion) else motion for motion in motions]
         first, start = (0, moment.frames * frame_dt) if self.clock.varies else (moment.substeps, 0.0)
-        return sample_poses(motions, 1, count, dt, start, torch.float64, torch.device("cpu"), first + after)
+        return sample_poses(motions, 1, count, dt, start, first + after)

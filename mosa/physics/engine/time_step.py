@@ -53,6 +53,6 @@ def required_substeps(
         raise ConfigError(
             f"time step: {count} substeps per frame needed (wave speed {speed:.3g} m/s, modulus {modulus_max:.3g} Pa, density "
             f"{density:.4g} kg/m^3, dx {dx:.3g} m, frame {frame_dt:.3g} s, speed {v_max:.3g} m/s{viscous}), the limit is {limit}: "
-            "use a coarser grid (dx), a softer start, or raise simulation.max_substeps"
+            "use a coarser grid (dx), a slower start, fewer frames where no ground ends the fall, or raise simulation.max_substeps"
         )
     return count

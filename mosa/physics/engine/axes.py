@@ -1,0 +1,90 @@
+"""The axes in which a simulator computes: along the planes that nodes meet, with their origin near the body.
+
+Nodes meet a plane askew to their grid elsewhere than one along it, by cells. And float32 resolves a micrometre ten metres from the
+origin, a millimetre at ten kilometres. Hence x' = Q x - s: Q turns the normals of the planes onto grid axes, s is a whole number of
+cells. Where neither is needed nothing is computed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mosa.errors import ConfigError
+from mosa.physics.contact.planes import NODE_MODES, Plane
+from mosa.rotations import skew
+from mosa.types import ParticleState
+
+ALONG, ASKEW = 1e-6, 1e-2
+"""Sine of a plane's angle to the grid: below it the plane is along the grid, above it nodes cannot meet it."""
+PERIOD, SPREAD, COARSE = 2048, 8, 0.125
+"""Cells of which the origin moves by multiples; periods over which worlds may spread; cells by which given x may be rounded."""
+
+
+@dataclass(frozen=True)
+class Axes:
+    """turn: (3, 3) float64 rotation Q, None for none; shift: s [m], None for 0."""
+
+    turn: Tensor | None = None
+    shift: tuple[float, ...] | None = None
+
+    @property
+    def world(self) -> "Axes":
+        """The way back."""
+        turn = None if self.turn is None else self.turn.mT
+        return Axes(turn, self.shift and tuple((-Axes(turn).vectors(torch.tensor(self.shift, dtype=torch.float64))).tolist()))
+
+    def vectors(self, v: Tensor | None) -> Tensor | None:
+        """(..., 3), or forces and torques (..., 6)."""
+        return v if v is None or self.turn is None else (v.unflatten(-1, (-1, 3)) @ self.turn.mT.to(v)).flatten(-2)
+
+    def points(self, x: Tensor) -> Tensor:
+        """(..., 3) [m]: float64 where the origin moves."""
+        return self.vectors(x) if self.shift is None else self.vectors(x.double()) - x.double().new_tensor(self.shift)
+
+    def gradients(self, F: Tensor) -> Tensor:
+        """Deformation gradients (..., 3, 3), or rotations of bodies."""
+        return F if self.turn is None else self.turn.to(F) @ F
+
+    def state(self, state: ParticleState, dtype: torch.dtype | None = None) -> ParticleState:
+        """dtype: of positions, None for what `points` gives."""
+        x, F, C = self.points(state.x), self.gradients(state.F), self.vectors(self.gradients(state.C_affine))
+        F_tot = F if state.F_tot is state.F else self.gradients(state.F_tot)
+        return ParticleState(x if dtype is None else x.to(dtype), self.vectors(state.v), C, F, F_tot)
+
+
+def turn_along(planes: Sequence[Plane]) -> Tensor | None:
+    """(3, 3) float64: turns the normals of all planes that nodes meet, one after the other, onto the nearest grid axes; None where
+    they are there. Errors: ConfigError where they are not at right angles."""
+    turn, eye = None, torch.eye(3, dtype=torch.float64)
+    met = {i: torch.tensor(p.normal, dtype=torch.float64) for i, p in enumerate(planes) if p.mode in NODE_MODES and any(p.normal)}
+    met = {i: n / n.norm() for i, n in met.items()}
+    for n in met.values():
+        m = Axes(turn).vectors(n)
+        along = eye[m.abs().argmax()] * m[m.abs().argmax()].sign()
+        if float((m - along).norm()) > ALONG:
+            S = skew(torch.linalg.cross(m, along))
+            turn = Axes(eye + S + S @ S / (1 + m @ along)).gradients(eye if turn is None else turn)
+    for i, n in met.items():
+        if float(Axes(turn).vectors(n).abs().sort().values[1]) > ASKEW:
+            raise ConfigError(f"plane {i} (normal {[round(c, 3) for c in n.tolist()]}, mode {planes[i].mode}): expected ground and "
+                              "walls at right angles, along which a grid can be, or mode touch (scene.ground.mode=touch) at others")
+    return turn
+
+
+def shift_to(x: Tensor, turn: Tensor | None, dx: float) -> tuple[float, ...] | None:
+    """`Axes.shift` for particles at x (..., 3) [m] on a grid of dx [m], None where they are near the origin. Errors:
+    ConfigError where the type of x has no digits for the place, or where worlds are too far from each other."""
+    low, high = (t.double().cpu() for t in torch.aminmax(x.detach().flatten(0, -2), dim=0))
+    far, wide = float(torch.maximum(low.abs(), high.abs()).max()), float((high - low).max())
+    if not far < float("inf"):
+        return None  # the first substep names the particle
+    if far * torch.finfo(x.dtype).eps > COARSE * dx:
+        raise ConfigError(f"x: particles are {far:.3g} m from the origin, where {x.dtype} has no digits for a grid of {dx:.3g} m: "
+                          "give x in float64, or place body, ground and solids nearer to the origin")
+    if x.ndim == 3 and wide > SPREAD * PERIOD * dx:
+        raise ConfigError(f"x: expected worlds within {SPREAD * PERIOD * dx:.3g} m of each other, found {wide:.3g} m: they never "
+                          "meet, and may be in one place")
+    shift = PERIOD * dx * torch.round(Axes(turn).vectors(0.5 * (low + high)) / (PERIOD * dx))
+    return tuple(shift.tolist()) if bool(shift.any()) else None
