@@ -142,6 +142,15 @@ def _sizes(shape: Shape) -> tuple[float, ...]:
     return ()
 
 
+def half_width(shape: Shape) -> float:
+    """Distance [m] from the surface to the deepest point inside; infinite for a half space."""
+    if isinstance(shape, SignedDistanceField):
+        return max(0.0, -float(shape.values.min()))
+    if isinstance(shape, Capsule):
+        return shape.radius
+    return min(_sizes(shape), default=math.inf)
+
+
 def reach(shape: Shape) -> float:
     """Distance [m] of the farthest point of the shape from its origin; 0 for a half space, whose turning has no bound."""
     if isinstance(shape, SignedDistanceField):
