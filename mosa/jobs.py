@@ -52,13 +52,7 @@ def folder_name(overrides: str) -> str:
     return name.encode()[:LONGEST].decode(errors="ignore") + "_" + hashlib.sha256(overrides.encode()).hexdigest()[:8]
 
 
-def current_folder() -> str:
-    """Of the job that Hydra runs, for ${run_folder:}; outputs where there is none, as in a script or a notebook."""
-    return HydraConfig.get().runtime.output_dir if HydraConfig.initialized() else "outputs"
-
-
 OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
-OmegaConf.register_new_resolver("run_folder", current_folder, replace=True)
 
 
 def check_arguments(arguments: Sequence[str], conf: Path) -> None:
