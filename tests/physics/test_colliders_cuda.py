@@ -18,7 +18,8 @@ def run(state, shape, device, dtype):
     velocity = torch.tensor([0.2, 0.6, 0.0], device=device, dtype=dtype, requires_grad=True)
     rotation = torch.tensor([0.2 - torch.pi / 2, -0.1, 0.3], device=device, dtype=dtype, requires_grad=True)
     mu = torch.full((), 4e4, device=device, dtype=dtype, requires_grad=True)
-    motion = Motion((0.15, -0.05, 0.11), rotation, velocity, (1.0, 0.0, 2.0))
+    height = 0.0 if isinstance(shape, HalfSpace) else -0.05  # of a plane that reaches the block, or of a solid's middle
+    motion = Motion((0.15, height, 0.11), rotation, velocity, (1.0, 0.0, 2.0))
     colliders = [Collider(shape, "separate", 0.3, motion), Collider(Sphere(0.05), "slip", motion=Motion((0.15, 0.13, 0.1)))]
     simulator = Simulator("corotated", dx=0.04, substeps=10, frame_dt=4e-3, dtype=dtype, device=device, colliders=colliders)
     volume = torch.full((len(state.x),), 8e-6, device=device, dtype=dtype)
