@@ -4,9 +4,9 @@ import json
 import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
+import forked
 import lightning as L
 import pytest
 import torch
@@ -17,7 +17,6 @@ from mosa.callbacks import AtomicCheckpointIO, KeepLast
 from mosa.data.datamodule import MultiViewDataModule
 from mosa.errors import ConfigError
 
-ROOT = Path(__file__).parents[2]
 ADAM = tuple(f"+fit.{stage}.optimizer=adam" for stage in ("prior", "prior_eta", "joint"))
 """Gauss-Newton, the default here, does the same work on every rank."""
 SMALL = ("evaluation.video=false", "evaluation.floor=false", "evaluation.samples=256", "evaluation.assignment=64")
@@ -42,8 +41,7 @@ def fit_alone(cache: Path, folder: Path, *overrides: str, taught=()) -> Path:
 
 
 def train(folder: Path, cache: Path, *overrides: str) -> subprocess.CompletedProcess:
-    command = [sys.executable, "train.py", "debug=default", f"hydra.run.dir={folder}", f"scene.cache={cache}", *SMALL, *overrides]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=400)
+    return forked.call("train.py", "debug=default", f"hydra.run.dir={folder}", f"scene.cache={cache}", *SMALL, *overrides)
 
 
 def learned(checkpoint: Path) -> torch.Tensor:

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import forked
 import lightning as L
 import numpy as np
 import pytest
@@ -47,13 +48,14 @@ def command(script: str, folder: Path, cache: Path, *overrides: str) -> list[str
 
 
 def call(script: str, folder: Path, cache: Path, *overrides: str) -> subprocess.CompletedProcess:
-    return subprocess.run(command(script, folder, cache, *overrides), cwd=ROOT, capture_output=True, text=True, timeout=400)
+    return forked.call(*command(script, folder, cache, *overrides)[1:])
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, cache):
     folder = tmp_path_factory.mktemp("run")
-    result = call("train.py", folder, cache, "logger=[tensorboard,csv]", "logger.images_every=2")
+    given = command("train.py", folder, cache, "logger=[tensorboard,csv]", "logger.images_every=2")  # as a user begins it
+    result = subprocess.run(given, cwd=ROOT, capture_output=True, text=True, timeout=400)
     assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
     (folder / "screen").write_text(result.stderr)
     return folder
@@ -353,8 +355,7 @@ def test_another_scene_is_evaluated_in_its_own_world(run, cache, tmp_path, monke
 
 def test_a_sweep_goes_on_after_a_job_that_fails_and_says_so_at_the_end(cache, tmp_path):
     keys = ["debug=default", f"scene.cache={cache}", "trainer.accelerator=gpu", "trainer.devices=1000,2000"]
-    sweep = [sys.executable, "train.py", "-m", f"hydra.sweep.dir={tmp_path}", *keys]
-    result = subprocess.run(sweep, cwd=ROOT, capture_output=True, text=True, timeout=400)
+    result = forked.call("train.py", "-m", f"hydra.sweep.dir={tmp_path}", *keys)
     assert result.returncode == 1
     assert all(f"found {count}" in result.stderr for count in (1000, 2000))
     assert "2 jobs of the sweep failed:\n  0: ConfigError: trainer.devices" in result.stderr
