@@ -148,7 +148,7 @@ def exchanging(rank: int, folder: str) -> None:
 
 
 def test_ranks_exchange_agree_and_notice_a_loss(tmp_path):
-    context = torch.multiprocessing.get_context("spawn")
+    context = torch.multiprocessing.get_context("spawn" if torch.cuda.is_initialized() else "fork")  # which imports nothing again
     processes = [context.Process(target=exchanging, args=(rank, str(tmp_path))) for rank in range(2)]
     for process in processes:
         process.start()
