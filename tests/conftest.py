@@ -18,6 +18,10 @@ LONG = ("integration", "experiments", "physics_verification", "analysis")
 """Folders of whole runs and whole studies, whose files have few tests that take long."""
 
 
+FIRST = "test_main_job.py"
+"""Its first run makes the scene and the reconstruction that others find in the cache."""
+
+
 def pytest_configure(config):
     # xdist would begin with the files of most tests: the last ones, of one long test each, would keep one process alone
     if hasattr(config.option, "loadscopereorder"):
@@ -27,7 +31,7 @@ def pytest_configure(config):
 def pytest_collection_modifyitems(items):
     """The files in the order in which processes take them: whole runs first, then those of most tests."""
     tests = Counter(item.path for item in items)
-    items.sort(key=lambda item: (item.path.parent.name not in LONG, -tests[item.path], str(item.path)))
+    items.sort(key=lambda item: (item.path.name != FIRST, item.path.parent.name not in LONG, -tests[item.path], str(item.path)))
     if not torch.cuda.is_available():
         skip = pytest.mark.skip(reason="needs a CUDA device")
         for item in items:

@@ -37,7 +37,8 @@ def test_a_calibration_is_continued_from_the_scene_s_own_images(tmp_path):
     """Of a body without adapter and eta: what is printed follows from two fits, one of a third of the particles."""
     overrides = ["scene=tiny", "scene.material=isotropic", "scene.scale=0.25", f"scene.cache={tmp_path}",
                  "trainer=cpu", "prior=neo_hookean", "simulation.particles=200", "adapter=none", "heterogeneity.enabled=false",
-                 "reconstruction.static.iterations=10", "reconstruction.dynamic.track_iterations=2",
+                 "reconstruction.resolution=40", "reconstruction.points=500", "reconstruction.static.iterations=10",
+                 "reconstruction.dynamic.track_iterations=2",
                  "reconstruction.dynamic.iterations=5", "reconstruction.appearance.iterations=2",
                  "reconstruction.carried.iterations=2", "fit.prior.newton_iterations=1"]  # fmt: skip
     with initialize_config_dir(configuration(), version_base=None):

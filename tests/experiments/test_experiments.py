@@ -263,8 +263,12 @@ def test_a_stop_that_falls_into_the_start_of_a_job_ends_that_job_too(tmp_path, f
 
     begun = processes.begun
     monkeypatch.setattr(running, "begun", stopped)
-    with pytest.raises(KeyboardInterrupt):
-        running.run_jobs(jobs_of(experiment(), tmp_path), [None], 1)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell that put pytest into the background had it ignored
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            running.run_jobs(jobs_of(experiment(), tmp_path), [None], 1)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert [process.exitcode for process in started] == [-15]
 
 

@@ -4,10 +4,9 @@ the baseline."""
 import json
 import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
+import forked
 import numpy as np
 import pytest
 import torch
@@ -50,8 +49,8 @@ def run(tmp_path_factory, cache):
     given = [*QUICK, "extensions=[my_mosa]", f"hydra.searchpath=[file://{folder}/conf_of_mine]", "scene=recording",
              f"scene.path={recorded(folder, cache)}", f"scene.cache={folder}/cache", "prior=fibres", "adapter=softer",
              "+losses.volume=0.5"]  # fmt: skip
-    result = subprocess.run([sys.executable, "train.py", f"hydra.run.dir={folder}/run", *given], cwd=ROOT, capture_output=True,
-                            text=True, timeout=400, env=os.environ | {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"})
+    result = forked.call("train.py", f"hydra.run.dir={folder}/run", *given,
+                         environment=os.environ | {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"})  # fmt: skip
     assert result.returncode == 0, result.stderr[-3000:]
     return folder
 
@@ -96,8 +95,9 @@ print(twin.simulate(frames=3).x.isfinite().all().item(), *twin.body.material.dir
 
 
 def test_a_checkpoint_needs_the_package_and_does_not_import_it(run):
-    result = subprocess.run([sys.executable, "-c", LOAD, str(run / "run" / "checkpoints" / "last.ckpt")], cwd=run, text=True,
-                            capture_output=True, timeout=200, env=os.environ | {"PYTHONPATH": f"{run}{os.pathsep}{ROOT}"})
+    (run / "load.py").write_text(LOAD)
+    result = forked.call(str(run / "load.py"), str(run / "run" / "checkpoints" / "last.ckpt"),
+                         environment=os.environ | {"PYTHONPATH": f"{run}{os.pathsep}{ROOT}"})  # fmt: skip
     assert result.returncode == 0, result.stderr[-2000:]
     refused, found = result.stdout.strip().splitlines()[-2:]
     assert "adapter.name: expected" in refused and "found 'softer'" in refused and "extensions" in refused
@@ -140,8 +140,8 @@ print(float((one - other).abs().max()), float((one - softer).abs().max()), slope
 def test_the_baseline_stands_in_for_the_law(tmp_path):
     written(tmp_path)
     path = os.pathsep.join(map(str, (tmp_path, ROOT, ROOT / "tests" / "modules")))
-    result = subprocess.run([sys.executable, "-c", BASELINE], text=True, capture_output=True, timeout=200,
-                            env=os.environ | {"PYTHONPATH": path})  # fmt: skip
+    (tmp_path / "baseline.py").write_text(BASELINE)
+    result = forked.call(str(tmp_path / "baseline.py"), environment=os.environ | {"PYTHONPATH": path})
     assert result.returncode == 0, result.stderr[-2000:]
     other_prior, other_number, slope = map(float, result.stdout.split()[-3:])
     assert other_prior < 1e-9 < 1e-4 < other_number and abs(slope) > 1e-4

@@ -1,11 +1,10 @@
 """A body learned from one folder and tested on another: the whole program on what a user has, recordings and nothing else."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
+import forked
 import numpy as np
 import pytest
 import torch
@@ -27,8 +26,7 @@ QUICK = ["debug=default", "scene=transforms", "scene.scale=1", "scene.box=[[-0.7
 
 
 def call(script, folder, *overrides):
-    return subprocess.run([sys.executable, script, f"hydra.run.dir={folder}", *overrides], cwd=ROOT, capture_output=True, text=True,
-                          timeout=400)
+    return forked.call(script, f"hydra.run.dir={folder}", *overrides)
 
 
 def wider(scene, camera, margin):

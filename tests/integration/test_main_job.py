@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import forked
 import lightning as L
 import numpy as np
 import pytest
@@ -35,9 +36,9 @@ FEW_FIGURES = ["evaluation.video=false", "evaluation.floor=false", "evaluation.s
 
 
 @pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    """Its own: the first run reconstructs too."""
-    return tmp_path_factory.mktemp("cache")
+def cache(cache, tmp_path_factory):
+    """Where nothing is made yet: the first run reconstructs too."""
+    return tmp_path_factory.mktemp("cache") if any(cache.iterdir()) else cache
 
 
 def command(script: str, folder: Path, cache: Path, *overrides: str) -> list[str]:
@@ -47,13 +48,14 @@ def command(script: str, folder: Path, cache: Path, *overrides: str) -> list[str
 
 
 def call(script: str, folder: Path, cache: Path, *overrides: str) -> subprocess.CompletedProcess:
-    return subprocess.run(command(script, folder, cache, *overrides), cwd=ROOT, capture_output=True, text=True, timeout=400)
+    return forked.call(*command(script, folder, cache, *overrides)[1:])
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, cache):
     folder = tmp_path_factory.mktemp("run")
-    result = call("train.py", folder, cache, "logger=[tensorboard,csv]", "callbacks.pictures.every=2")
+    given = command("train.py", folder, cache, "logger=[tensorboard,csv]", "callbacks.pictures.every=2")  # as a user begins it
+    result = subprocess.run(given, cwd=ROOT, capture_output=True, text=True, timeout=400)
     assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
     (folder / "screen").write_text(result.stderr)
     return folder
@@ -199,7 +201,7 @@ def test_the_contact_offset_stays_where_a_grid_can_put_it(stepped):
     assert min(abs(figures["id/contact_offset_m"] / figures["dx_m"] - limit) for limit in ContactOffset.LIMITS) < 1e-5
 
 
-def test_a_killed_run_resumes_bit_for_bit(run, cache, tmp_path):
+def test_a_killed_run_resumes_bit_for_bit_and_is_then_skipped(run, cache, tmp_path):
     process = subprocess.Popen(command("train.py", tmp_path / "killed", cache), cwd=ROOT, stdout=subprocess.DEVNULL,
                                stderr=subprocess.DEVNULL)
     checkpoint = tmp_path / "killed" / "checkpoints" / "last.ckpt"
@@ -213,26 +215,17 @@ def test_a_killed_run_resumes_bit_for_bit(run, cache, tmp_path):
     finally:
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
-    result = call("train.py", tmp_path / "resumed", cache, f"ckpt_path={checkpoint}", *FEW_FIGURES)
-    assert result.returncode == 0, result.stderr[-3000:]
+    begun = [call("train.py", tmp_path / "killed", cache, "resume=auto", *FEW_FIGURES) for _ in range(2)]
+    first, second = (result.stdout for result in begun)
+    assert f"going on from {checkpoint}" in first and "skipped" not in first, begun[0].stderr[-3000:]
+    assert f"skipped: {tmp_path}" in second and [result.returncode for result in begun] == [0, 0], begun[1].stderr[-3000:]
     whole = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
-    resumed = torch.load(tmp_path / "resumed" / "checkpoints" / "last.ckpt", weights_only=True)
+    resumed = torch.load(checkpoint, weights_only=True)
     assert whole["mosa"]["steps_done"] == resumed["mosa"]["steps_done"]
     for key, value in whole["state_dict"].items():
         assert torch.equal(value, resumed["state_dict"][key]), key
-
-
-def test_resume_auto_goes_on_and_then_skips(run, cache, tmp_path):
-    """From a run that was killed after its fit: nothing is left to fit, the figures are."""
-    shutil.copytree(run / "checkpoints", tmp_path / "checkpoints")
-    first = call("train.py", tmp_path, cache, "resume=auto", "evaluation.video=false", "evaluation.samples=256")
-    assert first.returncode == 0 and f"going on from {tmp_path}/checkpoints/last.ckpt" in first.stdout, first.stderr[-3000:]
-    whole, found = (json.loads((folder / "metrics.json").read_text()) for folder in (run, tmp_path))
-    assert {k: v for k, v in found.items() if k.startswith("id/")} == {k: v for k, v in whole.items() if k.startswith("id/")}
-    written = (tmp_path / "metrics.json").stat().st_mtime_ns
-    second = call("train.py", tmp_path, cache, "resume=auto")
-    assert second.returncode == 0 and f"skipped: {tmp_path}" in second.stdout, second.stderr[-3000:]
-    assert (tmp_path / "metrics.json").stat().st_mtime_ns == written
+    figures, expected = (json.loads((folder / "metrics.json").read_text()) for folder in (tmp_path / "killed", run))
+    assert {k: v for k, v in figures.items() if k.startswith("id/")} == {k: v for k, v in expected.items() if k.startswith("id/")}
 
 
 @pytest.mark.parametrize(
@@ -353,8 +346,7 @@ def test_another_scene_is_evaluated_in_its_own_world(run, cache, tmp_path, monke
 
 def test_a_sweep_goes_on_after_a_job_that_fails_and_says_so_at_the_end(cache, tmp_path):
     keys = ["debug=default", f"scene.cache={cache}", "trainer.accelerator=gpu", "trainer.devices=1000,2000"]
-    sweep = [sys.executable, "train.py", "-m", f"hydra.sweep.dir={tmp_path}", *keys]
-    result = subprocess.run(sweep, cwd=ROOT, capture_output=True, text=True, timeout=400)
+    result = forked.call("train.py", "-m", f"hydra.sweep.dir={tmp_path}", *keys)
     assert result.returncode == 1
     assert all(f"found {count}" in result.stderr for count in (1000, 2000))
     assert "2 jobs of the sweep failed:\n  0: ConfigError: trainer.devices" in result.stderr

@@ -1,20 +1,16 @@
 """A GPU without memory, wherever a command meets it: one message, exit code 2, and the checkpoint kept."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
+import forked
 import pytest
-
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
 def outcomes(cache, tmp_path_factory):
     program = Path(__file__).with_name("no_memory_program.py")
-    made = subprocess.run([sys.executable, str(program), str(cache), str(tmp_path_factory.mktemp("no_memory"))], cwd=ROOT,
-                          capture_output=True, text=True, timeout=600)  # fmt: skip
+    made = forked.call(str(program), str(cache), str(tmp_path_factory.mktemp("no_memory")), timeout=600)
     found = [json.loads(line.removeprefix("TRIED ")) for line in made.stdout.splitlines() if line.startswith("TRIED ")]
     assert made.returncode == 0 and len(found) == 15, made.stdout[-2000:] + made.stderr[-2000:]
     return found

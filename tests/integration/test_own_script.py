@@ -1,10 +1,8 @@
 """docs/own_training_script.md: a plain Trainer with callbacks of Lightning's does what train.py does."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
+import forked
 import lightning as L
 import pytest
 import torch
@@ -14,7 +12,6 @@ from lightning.pytorch.loggers import CSVLogger
 from mosa import LitMosa, SceneDataModule, compose
 from mosa.errors import ConfigError
 
-ROOT = Path(__file__).parents[2]
 HELD = ["scene.holdout_cameras=[1]", "scene.holdout_frames=1", "heterogeneity.enabled=false"]
 QUIET = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "accelerator": "cpu"}
 
@@ -54,12 +51,12 @@ def test_the_data_stand_alone(cache):
 
 def test_a_plain_trainer_fits_as_the_command_does(fitted, cfg, cache, tmp_path):
     _, _, module, trainer = fitted
-    words = [f"hydra.run.dir={tmp_path}", "debug=default", f"scene.cache={cache}", "adapter=mosa", "fit.views=1",
+    words = ["train.py", f"hydra.run.dir={tmp_path}", "debug=default", f"scene.cache={cache}", "adapter=mosa", "fit.views=1",
              "fit.joint.iterations=5", *HELD, "evaluation.video=false", "evaluation.floor=false", "evaluation.samples=64",
              "evaluation.assignment=16", "logger=none", "+trainer.profiler=simple",
              "callbacks=[default,early_stopping,learning_rate]", "callbacks.early_stopping.patience=50",
              "callbacks.learning_rate=null"]  # fmt: skip
-    result = subprocess.run([sys.executable, "train.py", *words], cwd=ROOT, capture_output=True, text=True, timeout=400)
+    result = forked.call(*words)
     assert result.returncode == 0, result.stderr[-3000:]
     theirs = torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)
     for name, value in module.state_dict().items():

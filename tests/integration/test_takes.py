@@ -1,16 +1,12 @@
 """Learning from more than one sequence of a body."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
+import forked
 import pytest
 import torch
 from assembled import assembled, made
-
-ROOT = Path(__file__).parents[2]
 
 
 def test_a_step_descends_the_mean_over_the_sequences(cache):
@@ -49,8 +45,7 @@ def test_a_take_is_simulated_at_its_own_frame_rate(cache):
 
 
 def run(cache, folder, script, *overrides):
-    return subprocess.run([sys.executable, script, f"hydra.run.dir={folder}", *overrides], cwd=ROOT, capture_output=True, text=True,
-                          timeout=400)
+    return forked.call(script, f"hydra.run.dir={folder}", *overrides)
 
 
 def test_what_is_learned_from_is_not_held_out(cache, tmp_path):

@@ -24,7 +24,7 @@ from mosa.modules.newton_steps import NewtonSteps
 from mosa.modules.stages import Stage
 from mosa.types import AUTO, Ground
 
-FRAMES = 12
+FRAMES = 9
 
 
 def world(ground: Ground) -> World:

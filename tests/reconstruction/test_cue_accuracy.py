@@ -95,6 +95,7 @@ def seen(squashed):
     settings = build_settings(
         resolution=56, points=1000, static={"iterations": 80}, appearance={"iterations": 60}, cue="gaussian",
         dynamic={"modes": 40, "track_iterations": 30, "track_views": 2, "iterations": 30, "free_shape": True},
+        carried={"iterations": 1},
     )  # fmt: skip
     blind = replace(squashed, truth=None)
     result = reconstruct(blind, settings=settings, spacing=spacing_for(squashed, 600, settings), cache_dir=None, progress=False)

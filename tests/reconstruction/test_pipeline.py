@@ -21,7 +21,7 @@ from mosa.rendering.lighting import shading, surface_normals
 CONF = Path(__file__).parents[2] / "conf" / "reconstruction"
 SETTINGS = build_settings(
     resolution=56, points=1200, static={"iterations": 120}, appearance={"iterations": 100},
-    dynamic={"modes": 40, "track_iterations": 30, "track_views": 3, "iterations": 40},
+    dynamic={"modes": 40, "track_iterations": 30, "track_views": 3, "iterations": 40}, carried={"iterations": 20},
 )  # fmt: skip
 
 

@@ -29,18 +29,25 @@ def elongated(count=60):
     return Splats(means, scales, rotations, torch.full((count,), 0.7), torch.rand(count, 3, generator=generator))
 
 
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    """Of all options: most have the same geometry."""
+    return tmp_path_factory.mktemp("options")
+
+
 @pytest.mark.parametrize("static, appearance, more", [
     ({"start": "random"}, {}, {}),
     ({"densify": "mcmc", "max_points": 200, "refine_every": 2}, {}, {"geometry": {"source": "hull"}}),
     ({"shape": "anisotropic"}, {"shape": "anisotropic"}, {"cue": "gaussian"}),
     ({"start": "random", "densify": "mcmc", "max_points": 200, "refine_every": 2, "shape": "anisotropic"}, {}, {}),
 ])  # fmt: skip
-def test_a_scene_is_reconstructed_with_every_option(squashed, tmp_path, static, appearance, more):
+def test_a_scene_is_reconstructed_with_every_option(squashed, cache, static, appearance, more):
     settings = build_settings(**TINY, static={"iterations": 8} | static, appearance={"iterations": 3} | appearance, **more,
+                              carried={"iterations": 3},
                               dynamic=MOTION | {"free_shape": more.get("cue") == "gaussian"})  # fmt: skip
     scene = replace(squashed, holdout_frames=(3, 4))
-    spacing = spacing_for(scene, 200, settings)
-    found = reconstruct(scene, settings=settings, spacing=spacing, cache_dir=tmp_path, progress=False)
+    spacing = spacing_for(scene, 200, settings, cache_dir=cache)
+    found = reconstruct(scene, settings=settings, spacing=spacing, cache_dir=cache, progress=False)
     count = len(found.static.means)
     assert count == 150 if "densify" not in static else 150 < count <= 200
     free = found.static.scales.amax(1) / found.static.scales.amin(1)
@@ -48,7 +55,7 @@ def test_a_scene_is_reconstructed_with_every_option(squashed, tmp_path, static, 
     assert torch.isfinite(found.cues.positions).all() and torch.isfinite(found.cues.stretch).all()
     torch.testing.assert_close(found.cues.covariances[0], covariance_from(found.splats.scales, found.splats.rotations))
     torch.testing.assert_close(found.cues.stretch[0], torch.ones_like(found.cues.stretch[0]), atol=1e-4, rtol=0)
-    again = reconstruct(scene, settings=settings, spacing=spacing, cache_dir=tmp_path, progress=False)
+    again = reconstruct(scene, settings=settings, spacing=spacing, cache_dir=cache, progress=False)
     assert torch.equal(again.static.scales, found.static.scales)
     if more.get("cue") == "gaussian":
         assert float((found.splats.scales.amax(1) / found.splats.scales.amin(1)).max()) > 1.001
