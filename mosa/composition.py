@@ -3,17 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-
-import mosa.jobs  # noqa: F401  registers the resolvers that conf/ uses
-from mosa.commands import configuration
 
 GROUPED = "scene"
 """The group whose option a bare name chooses."""
+
+
+def current_folder() -> str:
+    """Of the job that Hydra runs, for ${run_folder:} in conf/; outputs where there is none, as in a script or a notebook."""
+    return HydraConfig.get().runtime.output_dir if HydraConfig.initialized() else "outputs"
+
+
+OmegaConf.register_new_resolver("run_folder", current_folder, replace=True)
+
+
+def configuration() -> str:
+    """Folder of the configuration: inside of an installed package, beside it in a clone."""
+    package = Path(__file__).parent
+    inside = package / "conf"
+    return str(inside if inside.is_dir() else package.parent / "conf")
 
 
 def compose(*overrides: str, name: str = "train") -> DictConfig:

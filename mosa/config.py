@@ -8,10 +8,10 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import torch
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
+import mosa.composition  # noqa: F401  registers the resolvers that conf/ uses
 from mosa.errors import ConfigError
 from mosa.evaluation_settings import EvaluationSettings
 from mosa.modules.adapters import adapter_class
@@ -37,14 +37,6 @@ SIZES = ("particles", "particles_per_cell", "dx")
 """Keys of `simulation` that say how fine the body is: the reconstruction's."""
 HETEROGENEITY = {"modes": StiffnessModes, "network": HeterogeneityField}
 """heterogeneity.kind."""
-
-
-def current_folder() -> str:
-    """Of the job that Hydra runs, for ${run_folder:} in conf/; outputs where there is none, as in a script or a notebook."""
-    return HydraConfig.get().runtime.output_dir if HydraConfig.initialized() else "outputs"
-
-
-OmegaConf.register_new_resolver("run_folder", current_folder, replace=True)
 
 
 def plain(cfg: DictConfig) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from yaml import YAMLError
 
-from mosa.commands import fail
+from mosa.console import fail
 from mosa.errors import ConfigError, MosaError
 from mosa.refused import explained, let_go
 from mosa.screen import outlived

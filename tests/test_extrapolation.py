@@ -8,7 +8,7 @@ from hydra import compose, initialize_config_dir
 
 from mosa.analysis.tables import continued_text
 from mosa.assembly import assemble
-from mosa.commands import configuration
+from mosa.composition import configuration
 from mosa.errors import ConfigError
 from mosa.extrapolation import Identified, check_can_extrapolate, continued, extrapolated
 from mosa.modules.material import FORMS

@@ -313,7 +313,7 @@ def test_a_joblib_sweep_with_failed_jobs_does_not_exit_with_0(tmp_path):
 
 OUTLIVED = """
     import logging, sys
-    from mosa.commands import begin_log
+    from mosa.console import begin_log
     from mosa.screen import outlived
     with outlived():
         logging.basicConfig(stream=sys.stdout, level=logging.INFO)

@@ -8,7 +8,8 @@ from collections.abc import Callable
 import hydra
 from omegaconf import DictConfig
 
-from mosa.commands import begin_log, configuration
+from mosa.composition import configuration
+from mosa.console import begin_log
 from mosa.jobs import attempt, held_back, run_command
 
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mosa.commands import configuration
+from mosa.composition import configuration
 from mosa.errors import ConfigError, MosaError
 from mosa.refused import explained
 from mosa.screen import outlived
