@@ -63,6 +63,8 @@ def made(where: str, entry: DictConfig, **arguments: Any) -> Any:
         cause = error.__cause__ if isinstance(error, InstantiationException) and error.__cause__ is not None else error
         lines = [line for line in str(cause).splitlines() if line.strip() and not line.startswith("full_key")]
         way = f"; pip install {cause.name}" if isinstance(cause, ModuleNotFoundError) and cause.name else ""
+        if where == "trainer" and "gpu" in str(cause):
+            way = "; trainer=cpu runs without one"
         raise ConfigError(f"{where}: expected what {entry.get('_target_')} takes, found: {' '.join(lines)[:300]}{way}") from error
 
 

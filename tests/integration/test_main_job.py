@@ -234,7 +234,7 @@ def test_a_killed_run_resumes_bit_for_bit_and_is_then_skipped(run, cache, tmp_pa
         (["prior=jelly"], "Could not find 'prior/jelly'"),
         (["ckpt_path=nowhere.ckpt"], "ckpt_path: no file nowhere.ckpt"),
         (["losses.colour=1"], "colour"),
-        (["trainer.devices=1000", "trainer.accelerator=gpu"], "trainer.devices: expected at most"),
+        (["trainer.devices=[1000]", "trainer.accelerator=gpu"], "trainer=cpu runs without one"),
         (["fit.clip=abc"], "fit.clip: expected a number above 0 and at most 1e+20, found 'abc'"),
         (["scene=pacnerf", "scene.path=/nonexistent"], "/nonexistent"),
     ],
