@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -42,6 +43,12 @@ class Body(nn.Module):
     """N particles with a law. Buffers: rest (N, 3) [m], volume (N,) [m^3], colors (N, 3), opacities (N,), covariances (N, 3, 3).
     splats: what its images show, None where that is the particles; a fit to images looks at the particles.
     """
+
+    rest: Tensor
+    volume: Tensor
+    colors: Tensor
+    opacities: Tensor
+    covariances: Tensor
 
     def __init__(
         self,
@@ -79,7 +86,7 @@ class Body(nn.Module):
                 variant["heterogeneity"] = copy.deepcopy(heterogeneity)
         self.frozen.requires_grad_(False)
 
-    def __getstate__(self) -> dict:
+    def __getstate__(self) -> dict[str, Any]:
         """Without the simulator, whose buffers are no part of a body: a copy makes its own."""
         return {k: v for k, v in self.__dict__.items() if not k.startswith("_simulator")}
 

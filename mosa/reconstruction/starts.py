@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from mosa.errors import DataError
 from mosa.modules.body import Body, Start
+from mosa.modules.rest_shape import RestShape
 from mosa.reconstruction.registration import initial_velocity, register_pose
 from mosa.rendering.lighting import LIGHT, shading, surface_normals
 from mosa.rendering.spherical_harmonics import constant_coefficients
@@ -25,7 +26,7 @@ FINER = 2
 that is simulated from it is worth."""
 
 
-def splats_of(body: Body) -> Splats:
+def splats_of(body: Body | RestShape) -> Splats:
     """The body's particles as (isotropic or not) splats with axes from their covariances."""
     values, vectors = torch.linalg.eigh(body.covariances.double())
     vectors = vectors * torch.linalg.det(vectors)[:, None, None]
@@ -33,7 +34,7 @@ def splats_of(body: Body) -> Splats:
     return Splats(body.rest, values.clamp(min=0).sqrt().to(body.rest), quaternions.to(body.rest), body.opacities, body.colors)
 
 
-def lowest(body: Body, start: Start, scene: Scene, time: float) -> float:
+def lowest(body: Body | RestShape, start: Start, scene: Scene, time: float) -> float:
     """Height [m] above the ground of the lowest rest particle after `time` [s] of free flight."""
     up, gravity = scene.up.to(body.rest), scene.gravity.to(body.rest)
     spin = Rotation.from_rotvec((start.angular_velocity * time).cpu().numpy()).as_matrix()
@@ -43,7 +44,7 @@ def lowest(body: Body, start: Start, scene: Scene, time: float) -> float:
     return float(((arm + center) @ up).min()) - (scene.ground.height if scene.ground is not None else -torch.inf)
 
 
-def first_contact(body: Body, start: Start, scene: Scene) -> int:
+def first_contact(body: Body | RestShape, start: Start, scene: Scene) -> int:
     """Index of the first frame after first contact: given by the scene, or where free flight would have touched the ground."""
     if scene.last_free_frame is not None:
         return min(scene.last_free_frame + 1, scene.frames - 1)
@@ -54,7 +55,7 @@ def first_contact(body: Body, start: Start, scene: Scene) -> int:
     return scene.frames - 1
 
 
-def appearance_of(body: Body) -> Appearance:
+def appearance_of(body: Body | RestShape) -> Appearance:
     """What a body is looked for by: the splats that it carries, which all training frames were fitted to; its particles where it
     has no such splats or is far coarser than they are. With the normals of its surface."""
     if body.splats is not None and len(body.splats) <= FINER * len(body.rest):
@@ -67,7 +68,7 @@ def appearance_of(body: Body) -> Appearance:
     return found
 
 
-def sequence_start(body: Body, appearance: Appearance, scene: Scene, *, register: bool) -> Start:
+def sequence_start(body: Body | RestShape, appearance: Appearance, scene: Scene, *, register: bool) -> Start:
     """Pose and velocity of `scene`. register: find the pose by rendering (held-out sequences), in the light that it shows; else the
     rest shape's own. appearance: at rest, of `appearance_of`.
 
