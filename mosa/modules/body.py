@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError
+from mosa.modules.adapter_base import Adapter
 from mosa.modules.carried_splats import CarriedSplats
 from mosa.modules.contact import ContactOffset
 from mosa.modules.heterogeneity import StiffnessField
@@ -61,7 +62,7 @@ class Body(nn.Module):
         density: float,
         material: Material,
         heterogeneity: StiffnessField | None,
-        adapter: nn.Module | None,
+        adapter: Adapter | None,
         settings: SimulationSettings,
         law_options: LawOptions = AS_USUAL,
     ) -> None:
@@ -100,7 +101,7 @@ class Body(nn.Module):
         """Largest extent of the rest shape [m]."""
         return float((self.rest.amax(0) - self.rest.amin(0)).max())
 
-    def factor(self, heterogeneity: nn.Module | None) -> Tensor:
+    def factor(self, heterogeneity: StiffnessField | None) -> Tensor:
         """(N,) stiffness factor 1 + amplitude tanh eta(X)."""
         if heterogeneity is None:
             return torch.ones_like(self.volume)
