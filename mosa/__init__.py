@@ -11,11 +11,11 @@ Public names, each imported when it is first asked for:
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mosa.caches import settle_caches
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 settle_caches()
 
 _PLACES = {
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from mosa.twin import Twin
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> Any:
     """`import mosa` takes no second: what needs torch and Warp is imported by its name."""
     if name in _PLACES:
         return getattr(importlib.import_module(_PLACES[name]), name)

@@ -10,7 +10,7 @@ from importlib.metadata import version
 FOLDERS = """HOME TMPDIR XDG_CONFIG_HOME XDG_DATA_HOME XDG_CACHE_HOME WARP_CACHE_PATH CUDA_CACHE_PATH TRITON_HOME TRITON_CACHE_DIR
 TORCHINDUCTOR_CACHE_DIR TORCH_EXTENSIONS_DIR TORCH_HOME NUMBA_CACHE_DIR MPLCONFIGDIR JOBLIB_TEMP_FOLDER U2NET_HOME""".split()
 """Variables that say where libraries keep such code, or what it is below."""
-_temporary: list[tempfile.TemporaryDirectory] = []
+_temporary: list[tempfile.TemporaryDirectory[str]] = []
 
 
 def cache_home() -> str:

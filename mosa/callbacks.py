@@ -8,6 +8,7 @@ import math
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 import lightning as L
 import torch
@@ -16,6 +17,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
 from mosa.loggers import PICTURED, add_picture
+from mosa.modules.stages import Stage
 from mosa.progress import tqdm
 
 log = logging.getLogger(__name__)
@@ -24,7 +26,7 @@ log = logging.getLogger(__name__)
 class AtomicCheckpointIO(TorchCheckpointIO):
     """Writes beside the target, flushes to the disk and renames: a run killed while it saves leaves the last checkpoint whole."""
 
-    def save_checkpoint(self, checkpoint, path, storage_options=None) -> None:
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         partial = path.with_name(path.name + ".partial")
@@ -47,20 +49,20 @@ class KeepLast(Checkpoint):
         """folder: of the file; None: checkpoints/ in the trainer's default_root_dir."""
         self.folder = folder
 
-    def setup(self, trainer, module, stage: str) -> None:
+    def setup(self, trainer: L.Trainer, module: Any, stage: str) -> None:
         root = Path(trainer.default_root_dir)
         self.path = (root / "checkpoints" if self.folder is None else Path(self.folder)) / "last.ckpt"
 
-    def on_fit_start(self, trainer, module) -> None:
+    def on_fit_start(self, trainer: L.Trainer, module: Any) -> None:
         """The figures of an earlier run in this folder go: they would say that this one is complete."""
         (Path(trainer.default_root_dir) / "metrics.json").unlink(missing_ok=True)
 
-    def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Within an epoch; at its end, and at that of a stage, the next hook saves what the next epoch begins with."""
         if not (trainer.fit_loop.epoch_loop.batch_progress.is_last_batch or module.stage_over):
             trainer.save_checkpoint(self.path)
 
-    def on_train_epoch_end(self, trainer, module) -> None:
+    def on_train_epoch_end(self, trainer: L.Trainer, module: Any) -> None:
         trainer.save_checkpoint(self.path)
 
 
@@ -68,24 +70,25 @@ class FitProgress(L.Callback):
     """One tqdm bar per stage with loss and parameters."""
 
     def __init__(self) -> None:
-        self.bar, self.shown = None, None
+        self.bar: tqdm | None = None
+        self.shown: int | None = None  # number of the stage
 
-    def on_train_batch_start(self, trainer, module, batch, batch_idx) -> None:
+    def on_train_batch_start(self, trainer: L.Trainer, module: Any, batch: Any, batch_idx: int) -> None:
         if module.stage is not None and self.shown != module.stage_index:
             self._close()
             self.shown = module.stage_index
             self.bar = tqdm(total=module.stage.iterations, initial=len(module.losses), desc=f"fit {module.stage.name}", unit="it",
                             dynamic_ncols=True, mininterval=2.0)
 
-    def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         if self.bar is not None:
             self.bar.set_postfix(figures_of(module.last), refresh=False)
             self.bar.update()
 
-    def on_train_end(self, trainer, module) -> None:
+    def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
         self._close()
 
-    def on_exception(self, trainer, module, exception) -> None:
+    def on_exception(self, trainer: L.Trainer, module: Any, exception: BaseException) -> None:
         self._close()
 
     def _close(self) -> None:
@@ -104,9 +107,10 @@ class StageNotes(L.Callback):
     """A line in the run's log when a stage begins, and one with its figures when it ends."""
 
     def __init__(self) -> None:
-        self.stage, self.began, self.steps = None, 0.0, 0
+        self.stage: Stage | None = None
+        self.began, self.steps = 0.0, 0
 
-    def on_train_batch_start(self, trainer, module, batch, batch_idx) -> None:
+    def on_train_batch_start(self, trainer: L.Trainer, module: Any, batch: Any, batch_idx: int) -> None:
         if self.stage is not None and module.stage is not self.stage:  # ended by a callback
             self._note(module)
         if module.stage is not None and self.stage is None:
@@ -114,16 +118,17 @@ class StageNotes(L.Callback):
             done = f", going on after {len(module.losses)}" if module.losses else ""
             log.info("stage %s: at most %d steps%s", self.stage.name, self.stage.iterations, done)
 
-    def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         self.steps += 1
         if self.stage is not None and module.stage_over:
             self._note(module)
 
-    def on_train_end(self, trainer, module) -> None:
-        if self.stage is not None:
-            self._note(module)
+    def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
+        self._note(module)
 
-    def _note(self, module) -> None:
+    def _note(self, module: Any) -> None:
+        if self.stage is None:
+            return
         figures = ", ".join(f"{name} {value}" for name, value in figures_of(module.last).items())
         log.info("stage %s: ended after %d steps, %.1f s: %s", self.stage.name, self.steps, time.perf_counter() - self.began,
                  figures)  # fmt: skip
@@ -135,14 +140,14 @@ class Pace(L.Callback):
     has no rates."""
 
     def __init__(self) -> None:
-        self.began, self.rates = 0.0, {}
+        self.began, self.rates = 0.0, dict[str, float]()
 
-    def on_train_batch_start(self, trainer, module, batch, batch_idx) -> None:
+    def on_train_batch_start(self, trainer: L.Trainer, module: Any, batch: Any, batch_idx: int) -> None:
         self.began = time.perf_counter()
         self.rates = {} if module.stage is None or module.stage.newton else {
             f"lr/{group['name']}": group["lr"] for optimizer in trainer.optimizers for group in optimizer.param_groups}
 
-    def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         values = {"time/step_s": time.perf_counter() - self.began} | self.rates
         module.log_dict({k: torch.tensor(v, dtype=torch.float32) for k, v in values.items()}, on_step=True, on_epoch=False)
 
@@ -153,7 +158,7 @@ class ImageStrips(L.Callback):
     def __init__(self, every: int) -> None:
         self.every = every
 
-    def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         shown = [each for each in module.loggers if isinstance(each, PICTURED)]
         if shown and self.every > 0 and module.steps_done % self.every == 0:
             add_picture(shown, "real_above_rendered_below", enlarged(module.strip()), module.steps_done)

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 from warnings import warn
 
 import numpy as np
@@ -22,6 +23,7 @@ from mosa.evaluation_settings import EvaluationSettings
 from mosa.modules.body import VARIANTS, Body, Start, World
 from mosa.modules.carried_splats import seen
 from mosa.modules.material import material_states
+from mosa.modules.rest_shape import RestShape
 from mosa.progress import tqdm
 from mosa.reconstruction.starts import first_contact
 from mosa.rendering.cameras import crop_boxes
@@ -43,12 +45,12 @@ class Sequence:
     contact: int
 
 
-def sequences(body: Body, training: Scene, others: list[Scene], found: Mapping[str, Start]) -> list[Sequence]:
+def sequences(body: Body | RestShape, training: Scene, others: list[Scene], found: Mapping[str, Start]) -> list[Sequence]:
     """found: start by prefix, in the order of the sequences."""
     return [Sequence(p, s, start, first_contact(body, start, s)) for (p, start), s in zip(found.items(), [training, *others])]
 
 
-def run_sequences(config: Mapping, body: Body) -> list[Sequence]:
+def run_sequences(config: Mapping[str, Any], body: Body) -> list[Sequence]:
     """The sequences that the run of a checkpoint's `config` was evaluated on, read again. Errors: ConfigError, DataError."""
     found = {prefix: Start.read(written, body.rest) for prefix, written in config["starts"].items()}
     return sequences(body, *load_sequences(config["cfg"]["scene"]), found)

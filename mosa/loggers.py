@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
@@ -23,7 +24,7 @@ OUTCOME = ("train/rms_m", "test/rms_m", "prior/test/rms_m", "prior_eta/test/rms_
 class DescribingLogger(TensorBoardLogger):
     """TensorBoard's logger whose scalars carry descriptions (`mosa.curves`), which TensorBoard shows beside their titles."""
 
-    def __init__(self, save_dir: str | Path, name: str = "tensorboard", version: str = "", **options) -> None:
+    def __init__(self, save_dir: str | Path, name: str = "tensorboard", version: str = "", **options: Any) -> None:
         super().__init__(save_dir, name=name, version=version, default_hp_metric=False, **options)
         self.law = ""  # of the prior, for the units of its parameters
         self.written: set[str] = set()
@@ -35,7 +36,7 @@ class DescribingLogger(TensorBoardLogger):
         for tag in [tag for tag in metrics if tag not in self.written]:
             self.written.add(tag)
             if (text := described(tag, self.law)) is not None:
-                point = scalar(tag, float(rest.pop(tag)))
+                point = scalar(tag, float(rest.pop(tag)))  # type: ignore[no-untyped-call]
                 about = point.value[0].metadata
                 about.summary_description, about.plugin_data.plugin_name = text, "scalars"
                 # without its class TensorBoard's fast reader takes the point for one of old programs and drops what is beside it
@@ -57,7 +58,7 @@ def add_picture(loggers: Sequence[Logger], name: str, picture: Tensor, step: int
             logger.log_image(name, [np.asarray(picture.movedim(0, -1))], step=step)
 
 
-def log_outcome(loggers: Sequence[Logger], cfg: Mapping, figures: Mapping[str, float | str]) -> None:
+def log_outcome(loggers: Sequence[Logger], cfg: Mapping[str, Any], figures: Mapping[str, float | str]) -> None:
     """The run's configuration beside its final figures, as `final/...`: TensorBoard's table of hyper-parameters, the summary of
     wandb's run, which ends here. A table of steps has no place for them; metrics.json has them all."""
     final = {f"final/{k}": v for k, v in figures.items() if k in OUTCOME or k.startswith(("id/", "id_prior/"))}

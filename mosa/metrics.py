@@ -94,15 +94,13 @@ def rms(x: Tensor, target: Tensor) -> float:
 
 def subsample(points: Tensor, count: int, seed: int) -> np.ndarray:
     """At most `count` points without replacement, float64."""
-    points = points.detach().cpu().double().numpy()
-    if len(points) <= count:
-        return points
-    return points[np.random.default_rng(seed).choice(len(points), count, replace=False)]
+    found = points.detach().cpu().double().numpy()
+    return found if len(found) <= count else found[np.random.default_rng(seed).choice(len(found), count, replace=False)]
 
 
 def _nearest(a: Tensor, b: Tensor, samples: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    a, b = subsample(a, samples, seed), subsample(b, samples, seed + 1)
-    return cKDTree(b).query(a)[0], cKDTree(a).query(b)[0]
+    first, second = subsample(a, samples, seed), subsample(b, samples, seed + 1)
+    return cKDTree(second).query(first)[0], cKDTree(first).query(second)[0]
 
 
 def chamfer_distances(a: Tensor, b: Tensor, *, samples: int = CHAMFER_SAMPLES, seed: int = 0) -> dict[str, float]:
@@ -179,7 +177,8 @@ def ssim(rendered: Tensor, real: Tensor) -> float:
         return float(np.mean([_ssim_on_cpu(a, b) for a, b in pairs]))
     # in float64: convolutions on a GPU may round to TF32, and variances are small differences
     a, b = rendered.movedim(-1, 1).double(), real.movedim(-1, 1).double()
-    return float(structural_similarity_index_measure(a, b, data_range=1.0, sigma=1.5, kernel_size=11))
+    found = structural_similarity_index_measure(a, b, data_range=1.0, sigma=1.5, kernel_size=11)
+    return float(found)  # type: ignore[arg-type]  # one tensor, as no picture of it is asked for
 
 
 def _ssim_on_cpu(a: np.ndarray, b: np.ndarray) -> float:

@@ -19,7 +19,7 @@ HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.re
 def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
     """The arrays, compressed: beside the target first, so that a full disk or a kill leaves no half file under its name."""
     with written_whole(path) as partial, open(partial, "wb") as file:
-        np.savez_compressed(file, **arrays)
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]  # numpy declares allow_pickle beside them
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,7 +22,7 @@ def save_rollout(path: str | Path, parts: Mapping[str, Rollout], colliders: Sequ
     every substep (one mean where the substeps vary), and collider_position [T, K, 3] (m), collider_rotation [T, K, 3, 3] at the
     frames, in the order of the configuration.
     """
-    arrays = {}
+    arrays: dict[str, np.ndarray] = {}
     for name, rollout in parts.items():
         tensors = {key: getattr(rollout, key) for key in ("x", "v", "F", "F_tot", "times")}
         tensors["counts"] = torch.tensor(rollout.counts, dtype=torch.int64)

@@ -101,12 +101,12 @@ def check_kinds(values: Mapping[str, Any], kinds: Mapping[str, Kind], where: str
             raise ConfigError(f"{where}.{name}: expected {kinds[name].described}, found {value!r}")
 
 
-def arguments_of(build: Callable) -> dict[str, inspect.Parameter]:
+def arguments_of(build: Callable[..., Any]) -> dict[str, inspect.Parameter]:
     """What `build` can be given by name."""
     return {name: p for name, p in inspect.signature(build).parameters.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
 
 
-def known_keys(where: str, build: Callable, keys: Mapping[str, Any], *positional: Any) -> Any:
+def known_keys(where: str, build: Callable[..., Any], keys: Mapping[str, Any], *positional: Any) -> Any:
     """build(*positional, **keys). Errors: ConfigError for a key that it does not take."""
     known = arguments_of(build)
     if unknown := [k for k in keys if k not in known]:

@@ -55,8 +55,9 @@ class Twin:
     """A learned body in its world. `frame_dt` [s]: time between the frames it was trained on."""
 
     def __init__(
-        self, body: Body, world: World, frame_dt: float, config: dict, training_start: Start, posterior: Posterior | None = None
-    ) -> None:
+        self, body: Body, world: World, frame_dt: float, config: dict[str, Any], training_start: Start,
+        posterior: Posterior | None = None,
+    ) -> None:  # fmt: skip
         self.body, self.world, self.frame_dt = body, world, frame_dt
         self.config, self.training_start, self.posterior = config, training_start, posterior
         self._episode: Episode | None = None
@@ -83,7 +84,7 @@ class Twin:
         posterior = None if known is None else Posterior.read(known)
         return cls(body.to(device).eval(), world, config["frame_dt"], config, start, posterior)
 
-    def predict(self, *, draws: int = DRAWS, seed: int = 0, **start) -> tuple[Rollout, Tensor]:
+    def predict(self, *, draws: int = DRAWS, seed: int = 0, **start: Any) -> tuple[Rollout, Tensor]:
         """(rollout of the learned law, standard deviation (T, N) [m] of every particle's position) from a new start.
 
         start: as `simulate` takes it; draws: laws drawn from the posterior. Errors: ConfigError where the run kept no posterior
@@ -110,7 +111,7 @@ class Twin:
         frames: int = 30,
         variant: str = "adapted",
         progress: bool = False,
-        colliders: Sequence[Collider | Mapping] | None = None,
+        colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
         box: Sequence[Sequence[float]] | Tensor | None = None,
     ) -> Rollout:
         """Roll the learned law out from a new start.
@@ -142,7 +143,7 @@ class Twin:
         position: Sequence[float | None] | Tensor | None = None,
         velocity: Sequence[float] | Tensor | None = None,
         angular_velocity: Sequence[float] | Tensor | None = None,
-        colliders: Sequence[Collider | Mapping] | None = None,
+        colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
         variant: str = "adapted",
         control_dt: float | None = None,
         substeps: int | None = None,
@@ -208,7 +209,7 @@ class Twin:
         return TwinWorlds(self.body, self.world, self.frame_dt, self.training_start, count, laws)
 
     @torch.no_grad()
-    def render(self, rollout: Rollout, size: int = 400, colliders: Sequence[Collider | Mapping] | None = None) -> Tensor:
+    def render(self, rollout: Rollout, size: int = 400, colliders: Sequence[Collider | Mapping[str, Any]] | None = None) -> Tensor:
         """(T, size, size, 3) images from one camera that sees the whole motion, on the ground and among `colliders`, those that the
         rollout was simulated with (None: the world's). Half spaces and meshes are not drawn."""
         body, up = self.body, self.world.up.to(self.body.rest)
@@ -232,7 +233,7 @@ class Twin:
         drawn = [on_ground(to_uint8(image), lines, 1, torch.ones(3)) for image in images] if lines else []
         return torch.from_numpy(np.stack(drawn)).float() / 255 if lines else images
 
-    def _met(self, rollout: Rollout, colliders: Sequence[Collider | Mapping] | None) -> tuple[Collider, ...]:
+    def _met(self, rollout: Rollout, colliders: Sequence[Collider | Mapping[str, Any]] | None) -> tuple[Collider, ...]:
         """The solids of a rollout, None for the world's. Errors: ConfigError where they are not as many as it has reactions of."""
         met = 0 if rollout.reactions is None else rollout.reactions.shape[-2]
         solids = self.world.colliders if met and colliders is None else colliders_from_config(colliders or (), "colliders")
@@ -243,7 +244,7 @@ class Twin:
 
     def export(
         self, rollout: Rollout, folder: str | Path, *, video: bool = True, title: str = "learned twin",
-        formats: Sequence[str] = ("ply",), colliders: Sequence[Collider | Mapping] | None = None,
+        formats: Sequence[str] = ("ply",), colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
     ) -> Path:  # fmt: skip
         """Write into `folder`: `body.npz`, which the viewer shows the motion with; `rollout.npz`, with the poses of `colliders`;
         one PLY a frame (x y z red green blue); `simulation.mp4`, with them and the ground; and the Gaussians of the body that its

@@ -43,8 +43,9 @@ class TwinWorlds:
         self._box: Sequence[Sequence[float]] | Tensor | None = None
 
     def reset(
-        self, starts: Mapping | Sequence[Mapping] | None = None, *, colliders: Sequence[Collider | Mapping] | None = None,
-        gravity: Tensor | Sequence | None = None, variant: str = "adapted", control_dt: float | None = None,
+        self, starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None, *,
+        colliders: Sequence[Collider | Mapping[str, Any]] | None = None, gravity: Tensor | Sequence[Any] | None = None,
+        variant: str = "adapted", control_dt: float | None = None,
         substeps: int | None = None, frames: int = 30, differentiable: bool = False,
         box: Sequence[Sequence[float]] | Tensor | None = None,
     ) -> TwinState:  # fmt: skip
@@ -71,7 +72,7 @@ class TwinWorlds:
         )  # fmt: skip
         return self.episode.state
 
-    def restart(self, which: Sequence[int], starts: Mapping | Sequence[Mapping] | None = None) -> TwinState:
+    def restart(self, which: Sequence[int], starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None) -> TwinState:
         """Put the worlds with these numbers back to new starts, as `reset` takes them, None for those they had; the others stay as
         they are. Time is one for all and goes on: colliders that were driven are back where they began, others follow their
         motion. Errors: ConfigError naming the world."""
@@ -82,7 +83,7 @@ class TwinWorlds:
         return episode.restart(which, given)
 
     def _found(
-        self, starts: Mapping | Sequence[Mapping] | None, which: Sequence[int], colliders, box
+        self, starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None, which: Sequence[int], colliders: Any, box: Any
     ) -> list[tuple[Start, World]]:
         """The starts of these worlds, and the world. Errors: ConfigError."""
         listed = isinstance(starts, (list, tuple)) and all(isinstance(start, Mapping) for start in starts)
@@ -91,7 +92,7 @@ class TwinWorlds:
         each = [dict(starts or {})] * len(which) if starts is None or isinstance(starts, Mapping) else list(starts)
         if len(each) != len(which):
             raise ConfigError(f"starts: expected one, or one for each of {len(which)} worlds, found {len(each)}")
-        found = []
+        found: list[tuple[Start, World]] = []
         for i, (b, given) in enumerate(zip(which, each)):
             if unknown := sorted(set(given) - set(STARTED)):
                 raise ConfigError(f"starts[{b}]: expected {', '.join(STARTED)}, found {', '.join(unknown)}")

@@ -141,8 +141,8 @@ class Appearance:
     light: Tensor | None = None
 
     def to(self, device: torch.device | str) -> Appearance:
-        moved = (None if value is None else value.to(device) for value in (self.harmonics, self.normals, self.light))
-        return Appearance(self.splats.to(device), *moved)
+        normals, light = (None if value is None else value.to(device) for value in (self.normals, self.light))
+        return Appearance(self.splats.to(device), self.harmonics.to(device), normals, light)
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,16 @@
 """What README and docs name is there: files, pages and their sections, and the ten stops from the command to the kernel."""
 
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
+
+import mosa
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def anchor(heading: str) -> str:
@@ -43,3 +47,20 @@ def test_the_ten_stops_are_in_the_code():
             else:
                 last = name.rpartition(".")[2]
                 assert re.search(rf"(def|class) {last}\b|^\s*{last} = ", whole, re.MULTILINE), name
+
+
+def test_the_citation_names_this_version_and_the_authors_of_the_paper():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    (paper,) = citation["references"]
+    authors = " and ".join(f"{each['family-names']}, {each['given-names']}" for each in paper["authors"])
+    readme = (ROOT / "README.md").read_text()
+    assert citation["version"] == mosa.__version__ and f"## {mosa.__version__} " in (ROOT / "CHANGELOG.md").read_text()
+    assert f"author = {{{authors}}}" in readme and paper["url"] in readme
+    assert paper["title"] in readme.replace("{MoSA}", "MoSA") and str(paper["year"]) in readme
+
+
+def test_a_change_has_a_fragment_of_a_known_kind():
+    with open(ROOT / "pyproject.toml", "rb") as file:
+        kinds = {kind["directory"] for kind in tomllib.load(file)["tool"]["towncrier"]["type"]}
+    fragments = [path.name for path in (ROOT / "changelog.d").iterdir() if path.name != "README.md"]
+    assert not [name for name in fragments if not re.fullmatch(rf"\+?[\w-]+\.({'|'.join(kinds)})\.md", name)]

@@ -17,6 +17,7 @@ from mosa.evaluation import Sequence, true_motion
 from mosa.modules.body import Body
 from mosa.modules.carried_splats import seen
 from mosa.modules.observer import deformed_covariances, observe
+from mosa.modules.start import World
 from mosa.rendering.cameras import crop_boxes, crop_cameras, crop_images
 from mosa.types import Cameras, Rollout, Scene
 
@@ -103,7 +104,7 @@ def round_up(value: float) -> float:
     return float(next(step * scale for step in (1, 2, 5, 10) if step * scale >= value * (1 - 1e-9)))
 
 
-def ground_lines(scene: Scene, cameras: Cameras, size: float) -> list[np.ndarray]:
+def ground_lines(scene: Scene | World, cameras: Cameras, size: float) -> list[np.ndarray]:
     """Lines of a grid on the ground, half the object's size apart, as (n, 2) [px] in the images of one camera; none without
     a ground. The grid lies under the middle of the image."""
     if scene.ground is None:

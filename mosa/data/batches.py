@@ -85,7 +85,7 @@ class ViewSchedule:
         return -(-self.views // self.per_step)
 
 
-class Epochs(IterableDataset):
+class Epochs(IterableDataset[MotionBatch]):
     """The batches of one epoch each time it is iterated over. It has no length, as stages have epochs of different lengths.
 
     An epoch is a pass over the training views, `per_step` of them a step; for Gauss-Newton, which needs all of them at once

@@ -48,6 +48,11 @@ def unchanged(batch: Any) -> Any:
     return batch
 
 
+def served(batches: Any) -> DataLoader[Any]:
+    """Batches that are made whole, one after another. batches: an iterable data set, or a sequence."""
+    return DataLoader(batches, batch_size=None, collate_fn=unchanged)
+
+
 class SceneDataModule(L.LightningDataModule):
     """One scene: the sequence that is reconstructed and learned from, further ones of the same object (`scene.also_train`), and
     those that are held out.
@@ -89,26 +94,26 @@ class SceneDataModule(L.LightningDataModule):
         if stage in ("fit", "validate"):
             _ = self.epochs
 
-    def train_dataloader(self) -> DataLoader:
+    def train_dataloader(self) -> DataLoader[Any]:
         """Batches of one epoch each time it is iterated over (`Epochs`)."""
-        return DataLoader(self.epochs, batch_size=None, collate_fn=unchanged)
+        return served(self.epochs)
 
-    def val_dataloader(self) -> DataLoader:
+    def val_dataloader(self) -> DataLoader[Any]:
         """Of the training sequence: held-out cameras in the frames that are learned from, and all cameras in the held-out frames.
         Empty where nothing is held out."""
-        return DataLoader(self.held_back, batch_size=None, collate_fn=unchanged)
+        return served(self.held_back)
 
-    def test_dataloader(self) -> DataLoader:
+    def test_dataloader(self) -> DataLoader[Any]:
         """The held-out sequences."""
-        return DataLoader([s for s in self.sequences if s.prefix.startswith("test")], batch_size=None, collate_fn=unchanged)
+        return served([s for s in self.sequences if s.prefix.startswith("test")])
 
-    def predict_dataloader(self) -> DataLoader:
+    def predict_dataloader(self) -> DataLoader[Any]:
         """Keyword arguments of `Twin.simulate`, one mapping a start."""
         given = self.predict or [
             {"rotation": s.start.rotation, "position": s.start.center, "velocity": s.start.velocity,
              "angular_velocity": s.start.angular_velocity, "frames": s.scene.frames} for s in self.sequences
         ]  # fmt: skip
-        return DataLoader(given, batch_size=None, collate_fn=unchanged)
+        return served(given)
 
     def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
         """Sequences and starts stay where they are: what of them is needed on the device is brought there where it is needed."""
@@ -147,7 +152,7 @@ class SceneDataModule(L.LightningDataModule):
         settings = self.cfg.simulation
         dx, particles, per_cell = settings.dx, settings.particles, settings.particles_per_cell
         if dx is not None:
-            return dx / grid_spacing(1.0, per_cell)
+            return float(dx / grid_spacing(1.0, per_cell))
         return spacing_for(self.scene, None if particles == "auto" else particles, self.reconstruction_settings, per_cell=per_cell,
                            most=most_particles(self.device or "cpu"), cache_dir=self.cache, device=self.device or "cpu")
 

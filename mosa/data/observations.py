@@ -47,7 +47,8 @@ def cropped(scene: Scene, views: Sequence[int], frames: Sequence[int], margin: i
 
 
 @torch.no_grad()
-def training_observations(scene: Scene, reconstruction: Reconstruction, *, margin: int = 6, device="cpu") -> Observations:
+def training_observations(scene: Scene, reconstruction: Reconstruction, *, margin: int = 6,
+                          device: torch.device | str = "cpu") -> Observations:
     """Cropped images, mattes and cue flow of the cameras and frames that learning may read, on `device`."""
     frames = scene.training_frames
     found = cropped(scene, scene.training_cameras, frames, margin).to(device)
@@ -58,4 +59,5 @@ def training_observations(scene: Scene, reconstruction: Reconstruction, *, margi
                 flow=True).flow
         for v in range(len(found.cameras))
     ]
-    return Observations(found.images, found.mattes, torch.cat(flow), found.cameras, found.image_width)
+    # each is there, as it was asked for
+    return Observations(found.images, found.mattes, torch.cat(flow), found.cameras, found.image_width)  # type: ignore[arg-type]

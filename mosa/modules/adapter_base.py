@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +15,7 @@ from mosa.modules.adapter_protocol import AdapterProtocol
 from mosa.modules.penalties import PENALTIES, OperatorStatistics, Penalty, statistics, statistics_of
 from mosa.modules.stiffening import ADAPTER_MARGIN
 from mosa.physics.constitutive.laws import Law
-from mosa.physics.engine.adapter_interface import MaterialState
+from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState
 from mosa.schema import Kind, check_kinds
 
 
@@ -31,7 +31,7 @@ class Adapter(nn.Module, AdapterProtocol):
     penalties: Mapping[str, Penalty] = PENALTIES
     flow: Callable[[Tensor, float], Tensor] | None = None
 
-    def __new__(cls, *_, **given: Any):
+    def __new__(cls, *_: Any, **given: Any) -> Self:
         """Errors: ConfigError naming a keyword argument that is not what `knobs` says."""
         check_kinds(given, cls.knobs, "adapter")
         return super().__new__(cls)
@@ -61,7 +61,7 @@ class Adapter(nn.Module, AdapterProtocol):
     def stiffening(self, poisson: Tensor | float) -> float:
         return ADAPTER_MARGIN
 
-    def simulator(self, density: float, world, frame_dt: float):
+    def simulator(self, density: float, world: Any, frame_dt: float) -> Any:
         return None
 
     def in_double(self) -> Adapter:
@@ -69,13 +69,13 @@ class Adapter(nn.Module, AdapterProtocol):
         return copy.deepcopy(self).double().cpu().requires_grad_(False)
 
     def increment(self, w: Tensor, s: Tensor) -> Tensor:
-        answer = self(MaterialState(w, self.E_ref * s))
+        answer: AdapterOperator = self(MaterialState(w, self.E_ref * s))
         return (answer.G @ s[..., None])[..., 0] + answer.h / self.E_ref
 
     def stiffness(self) -> Tensor | None:
         return None
 
-    def __getstate__(self) -> dict:
+    def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_last": None}  # it holds a graph, which can be neither copied nor pickled
 
     def switch_on(self, reference_modulus: Tensor | float, poisson: Tensor | float = 0.3) -> None:

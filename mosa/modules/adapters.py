@@ -49,7 +49,8 @@ def adapter_class(config: Mapping[str, Any]) -> type[nn.Module] | None:
                           "once that is imported (extensions)")
     module, _, found = ADAPTERS[name].partition(":")
     try:
-        return getattr(importlib.import_module(module), found)
+        adapter: type[nn.Module] = getattr(importlib.import_module(module), found)
+        return adapter
     except (ImportError, AttributeError) as error:  # of another package's registration
         raise ConfigError(f"adapter.name: {name!r} is registered as {ADAPTERS[name]}, which cannot be imported "
                           f"({error})") from error

@@ -8,11 +8,13 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError
+from mosa.modules.adapter_base import Adapter
 from mosa.modules.carried_splats import CarriedSplats
 from mosa.modules.contact import ContactOffset
 from mosa.modules.heterogeneity import StiffnessField
@@ -43,6 +45,12 @@ class Body(nn.Module):
     splats: what its images show, None where that is the particles; a fit to images looks at the particles.
     """
 
+    rest: Tensor
+    volume: Tensor
+    colors: Tensor
+    opacities: Tensor
+    covariances: Tensor
+
     def __init__(
         self,
         *,
@@ -54,7 +62,7 @@ class Body(nn.Module):
         density: float,
         material: Material,
         heterogeneity: StiffnessField | None,
-        adapter: nn.Module | None,
+        adapter: Adapter | None,
         settings: SimulationSettings,
         law_options: LawOptions = AS_USUAL,
     ) -> None:
@@ -79,7 +87,7 @@ class Body(nn.Module):
                 variant["heterogeneity"] = copy.deepcopy(heterogeneity)
         self.frozen.requires_grad_(False)
 
-    def __getstate__(self) -> dict:
+    def __getstate__(self) -> dict[str, Any]:
         """Without the simulator, whose buffers are no part of a body: a copy makes its own."""
         return {k: v for k, v in self.__dict__.items() if not k.startswith("_simulator")}
 
@@ -93,7 +101,7 @@ class Body(nn.Module):
         """Largest extent of the rest shape [m]."""
         return float((self.rest.amax(0) - self.rest.amin(0)).max())
 
-    def factor(self, heterogeneity: nn.Module | None) -> Tensor:
+    def factor(self, heterogeneity: StiffnessField | None) -> Tensor:
         """(N,) stiffness factor 1 + amplitude tanh eta(X)."""
         if heterogeneity is None:
             return torch.ones_like(self.volume)

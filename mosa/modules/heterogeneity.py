@@ -39,6 +39,8 @@ class StiffnessField(nn.Module):
     low, high: (3,) [m] corners of the object's box. Errors: ConfigError for a box without volume.
     """
 
+    low: Tensor
+    high: Tensor
     few_numbers = False
     """Whether Gauss-Newton can learn its numbers."""
 

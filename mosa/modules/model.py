@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from torch import nn
-
+from mosa.modules.adapter_base import Adapter
 from mosa.modules.contact import ContactOffset
+from mosa.modules.heterogeneity import StiffnessField
 from mosa.modules.material import Material
 
 
@@ -17,8 +17,8 @@ class Model:
 
     material: Material
     contact: ContactOffset
-    heterogeneity: nn.Module | None = None
-    adapter: nn.Module | None = None
+    heterogeneity: StiffnessField | None = None
+    adapter: Adapter | None = None
 
     def only(self, *, heterogeneity: bool = True, adapter: bool = True) -> Model:
         """Without the parts that are False."""

@@ -23,7 +23,7 @@ class GaussNewtonOptimizer(torch.optim.Optimizer):
         self.identification = identification
 
     @torch.no_grad()
-    def step(self, closure: Callable[[], Tensor] | None = None) -> Tensor | None:
+    def step(self, closure: Callable[[], Tensor] | None = None) -> Tensor | None:  # type: ignore[override]  # torch declares floats
         loss = None if closure is None else closure()
         self.identification().iterate()
         return loss

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import lightning as L
 import torch
 from lightning.pytorch.callbacks import Checkpoint, EarlyStopping
@@ -21,17 +23,17 @@ class Stages(Checkpoint):
     def __init__(self) -> None:
         self.begun = -1  # number of the stage that has begun in this process
 
-    def on_fit_start(self, trainer: L.Trainer, pl_module) -> None:
+    def on_fit_start(self, trainer: L.Trainer, pl_module: Any) -> None:
         self.announce(trainer, pl_module)  # the first batch is fetched before the training starts
 
-    def on_train_start(self, trainer: L.Trainer, pl_module) -> None:
+    def on_train_start(self, trainer: L.Trainer, pl_module: Any) -> None:
         if pl_module.stage is None:  # a run that was stopped after its fit
             trainer.should_stop = True
 
-    def on_train_epoch_start(self, trainer: L.Trainer, pl_module) -> None:
+    def on_train_epoch_start(self, trainer: L.Trainer, pl_module: Any) -> None:
         self.announce(trainer, pl_module)
 
-    def on_train_batch_start(self, trainer: L.Trainer, pl_module, batch, batch_idx: int) -> None:
+    def on_train_batch_start(self, trainer: L.Trainer, pl_module: Any, batch: Any, batch_idx: int) -> None:
         if pl_module.stage_over and batch_idx == 0:  # of a checkpoint that was written before the stage was ended
             self.advance(trainer, pl_module)
         if pl_module.stage is not None and self.begun != pl_module.stage_index and not pl_module.stage_over:
@@ -39,8 +41,9 @@ class Stages(Checkpoint):
             if not pl_module.losses:
                 pl_module.begin(pl_module.stage)
 
-    def on_train_epoch_end(self, trainer: L.Trainer, pl_module) -> None:
-        stoppers = [each for each in trainer.callbacks if isinstance(each, EarlyStopping)]
+    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: Any) -> None:
+        callbacks: list[L.Callback] = trainer.callbacks  # type: ignore[attr-defined]  # Lightning declares no type
+        stoppers = [each for each in callbacks if isinstance(each, EarlyStopping)]
         if trainer.should_stop and any(each.wait_count >= each.patience for each in stoppers):
             pl_module.stage_over = True
         if pl_module.stage_over:
@@ -52,7 +55,7 @@ class Stages(Checkpoint):
                     each.best_score = torch.tensor(torch.inf if each.monitor_op == torch.lt else -torch.inf)
             self.announce(trainer, pl_module)
 
-    def advance(self, trainer: L.Trainer, pl_module) -> None:
+    def advance(self, trainer: L.Trainer, pl_module: Any) -> None:
         """Ends the running stage; the next one gets its optimiser."""
         pl_module.finish()
         self.begun = -1
@@ -62,9 +65,9 @@ class Stages(Checkpoint):
             trainer.strategy.setup_optimizers(trainer)
 
     @staticmethod
-    def announce(trainer: L.Trainer, pl_module) -> None:
+    def announce(trainer: L.Trainer, pl_module: Any) -> None:
         """Tells the training data what the next epoch is."""
-        epochs, stage = getattr(trainer.datamodule, "epochs", None), pl_module.stage
+        epochs, stage = getattr(getattr(trainer, "datamodule", None), "epochs", None), pl_module.stage
         if isinstance(epochs, Epochs) and stage is not None:
             done = len(pl_module.losses)
             epochs.begin(whole=stage.newton, step=pl_module.steps_done, done=done, left=max(1, stage.iterations - done))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -27,12 +28,12 @@ class Start:
     velocity: Tensor
     angular_velocity: Tensor
 
-    def written(self) -> dict[str, list]:
+    def written(self) -> dict[str, list[Any]]:
         """Plain containers, fit for a checkpoint; `read` gives the same numbers."""
         return {f.name: getattr(self, f.name).tolist() for f in fields(self)}
 
     @classmethod
-    def read(cls, written: Mapping[str, list], like: Tensor | None = None) -> Start:
+    def read(cls, written: Mapping[str, list[Any]], like: Tensor | None = None) -> Start:
         """like: tensor of the device and type wanted, None for the CPU's float32."""
         found = {name: torch.tensor(value) for name, value in written.items()}
         return cls(**{name: value if like is None else value.to(like) for name, value in found.items()})

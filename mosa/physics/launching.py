@@ -27,7 +27,8 @@ class Turns:
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._launching, self._capturing = 0, None
+        self._launching = 0
+        self._capturing: int | None = None
 
     def launching(self) -> Turns:
         """Beside other launches; within this thread's own capture too."""

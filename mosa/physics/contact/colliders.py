@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -184,7 +184,9 @@ _FIELDS = {"plane": (HalfSpace, ()), "sphere": (Sphere, ("radius",)), "capsule":
 _COMMON = ("type", "name", "mode", "friction", "position", "rotation", "motion")
 
 
-def colliders_from_config(items: Sequence[dict | Collider], field_name: str = "world.colliders") -> tuple[Collider, ...]:
+def colliders_from_config(
+    items: Sequence[Mapping[str, Any] | Collider], field_name: str = "world.colliders"
+) -> tuple[Collider, ...]:
     """Colliders of plain containers, as a YAML file has them; a `Collider` is passed on.
 
     Each: type: plane | sphere | capsule | cylinder | box | mesh, with radius, length [m], size (3 edges) [m], or path (OBJ or PLY,
