@@ -9,10 +9,12 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
+from kornia.filters import get_gaussian_kernel1d
+from kornia.metrics import ssim as kornia_ssim
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from torch import Tensor
-from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+from torchmetrics.functional.image import peak_signal_noise_ratio
 
 from mosa.assignment import assigned
 from mosa.errors import ConfigError
@@ -166,7 +168,7 @@ def psnr(rendered: Tensor, real: Tensor) -> float:
 def ssim(rendered: Tensor, real: Tensor) -> float:
     """Mean over images (T, H, W, 3) in [0, 1] of the SSIM (Wang et al. 2004): 11x11 Gaussian window, sigma 1.5.
 
-    Over all pixels, with borders reflected (torchmetrics; others leave 5 px at the border out). At least 6 x 6 px.
+    Over all pixels, with borders reflected (torchmetrics, kornia; others leave 5 px at the border out). At least 6 x 6 px.
     """
     if rendered.shape != real.shape:
         raise ValueError(f"ssim: expected images of one shape, found {tuple(rendered.shape)} and {tuple(real.shape)}")
@@ -176,15 +178,12 @@ def ssim(rendered: Tensor, real: Tensor) -> float:
         pairs = zip(rendered.detach().numpy(), real.detach().numpy())
         return float(np.mean([_ssim_on_cpu(a, b) for a, b in pairs]))
     # in float64: convolutions on a GPU may round to TF32, and variances are small differences
-    a, b = rendered.movedim(-1, 1).double(), real.movedim(-1, 1).double()
-    found = structural_similarity_index_measure(a, b, data_range=1.0, sigma=1.5, kernel_size=11)
-    return float(found)  # type: ignore[arg-type]  # one tensor, as no picture of it is asked for
+    return float(kornia_ssim(rendered.movedim(-1, 1).double(), real.movedim(-1, 1).double(), 11, eps=0.0).mean())
 
 
 def _ssim_on_cpu(a: np.ndarray, b: np.ndarray) -> float:
-    """Of one pair of images (H, W, 3): what torchmetrics computes, row by row and column by column, in a tenth of its time."""
-    window = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
-    window /= window.sum()
+    """Of one pair of images (H, W, 3): what kornia computes, in at most 0.4 of its time and closer to its float64."""
+    window = get_gaussian_kernel1d(11, 1.5, dtype=torch.float64)[0].numpy()
 
     def mean(image: np.ndarray) -> np.ndarray:
         return cv2.sepFilter2D(image, -1, window, window, borderType=cv2.BORDER_REFLECT_101)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
+from mosa.data.images import enclosed_holes
 from mosa.errors import DataError
 from mosa.types import Scene
 
@@ -96,13 +96,10 @@ def check_agreement(scene: Scene, label: str, frame: int = 0) -> None:
         )
 
 
-def enclosed_holes(matte: np.ndarray) -> list[int]:
+def small_holes(matte: np.ndarray) -> list[int]:
     """Areas [px] of suspiciously small holes in a matte (H, W): enclosed, below half coverage, at most HOLE of its area."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats((matte < 0.5).astype(np.uint8), connectivity=4)
-    rim = set(np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])))
     limit = HOLE * float((matte >= 0.5).sum())
-    areas = stats[:, cv2.CC_STAT_AREA]
-    return [int(areas[k]) for k in range(1, count) if k not in rim and areas[k] <= limit]
+    return [area for area in enclosed_holes(matte)[1].tolist() if 0 < area <= limit]
 
 
 def holes_report(scene: Scene) -> str | None:
@@ -110,7 +107,7 @@ def holes_report(scene: Scene) -> str | None:
     found = {}
     for v, name in enumerate(scene.cameras.names):
         for t in range(scene.frames):
-            areas = enclosed_holes(scene.mattes[v, t].numpy())
+            areas = small_holes(scene.mattes[v, t].numpy())
             if areas:
                 found[name, t] = areas
     if not found:

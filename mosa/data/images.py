@@ -126,11 +126,18 @@ def fill_holes(matte: np.ndarray, largest: int) -> np.ndarray:
         raise ConfigError(f"scene.fill_holes: expected a number of pixels, 0 or more, found {largest!r}")
     if largest == 0:
         return matte
+    labels, areas = enclosed_holes(matte)
+    return np.where(((areas > 0) & (areas <= largest))[labels], np.float32(1), matte)
+
+
+def enclosed_holes(matte: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Labels (H, W) of the pieces of a matte (H, W) below half coverage, and the area (n,) [px] of each label: 0 of what is covered
+    and of pieces that reach the border."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats((matte < 0.5).astype(np.uint8), connectivity=4)
-    small = stats[:, cv2.CC_STAT_AREA] <= largest
-    small[0] = False  # what is covered
-    small[np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))] = False
-    return np.where(small[labels], np.float32(1), matte)
+    areas = stats[:, cv2.CC_STAT_AREA].copy()
+    areas[0] = 0
+    areas[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = 0
+    return labels, areas
 
 
 def expect_size(path: Path, pixels: np.ndarray, width: int, height: int, reason: str) -> None:

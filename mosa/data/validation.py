@@ -31,6 +31,8 @@ CORNER = 0.1
 """Share of an image's size from its corner within which a principal point was measured from the image's centre."""
 FARTHEST = 100.0
 """[m] of a camera from the origin: float32 rounds positions to 0.008 mm there, a thousandth of a pixel."""
+APART = 3.0
+"""Of the cameras' distances from their middle: farther off the whole capture is away from the origin, and not in another unit."""
 SQUARE, NEARLY = 2.0, 1.05
 """Ratios of the two focal lengths of a camera from which on they are refused, and warned of: sensors have square pixels."""
 
@@ -95,10 +97,12 @@ def check_film(scene: Scene, label: str) -> None:
 def check_cameras(scene: Scene, label: str) -> None:
     """Proper poses, near the origin, and positive focal lengths."""
     cameras = scene.cameras
+    places = -torch.einsum("vji,vj->vi", cameras.w2c[:, :3, :3], cameras.w2c[:, :3, 3]).double()
+    spread = float((places - places.mean(0)).norm(dim=1).max())
     for v, name in enumerate(cameras.names):
         if not bool(torch.isfinite(cameras.K[v]).all() and torch.isfinite(cameras.w2c[v]).all()):
             raise DataError(f"{label}: camera {name}: NaN or infinite numbers in its calibration")
-        if (far := float(cameras.w2c[v, :3, 3].norm())) > FARTHEST:
+        if (far := float(places[v].norm())) > FARTHEST and far > APART * spread:  # else the unit is wrong, which is said below
             raise DataError(f"{label}: camera {name}: expected within {FARTHEST:g} m of the origin, where float32 has digits for "
                             f"an image, found {far:.5g} m: subtract one offset from all cameras, the box, ground and solids")
         if not bool((cameras.K[v].diagonal()[:2] > 0).all()):

@@ -14,11 +14,13 @@ from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
+from kornia.morphology import dilation
 from torch import Tensor
 
 from mosa.reconstruction.field import at, camera_rays, first_crossing, smooth
 from mosa.reconstruction.hull import Volume
 from mosa.reconstruction.observed import Windows
+from mosa.rendering.cameras import sample_images
 
 UNSEEN = 9.0
 
@@ -44,9 +46,7 @@ class CarvingSettings:
 
 def _at_pixels(image: Tensor, pixel: Tensor) -> Tensor:
     """Bilinear values (C, ...) of an image (C, H, W) at pixels (..., 2); 0 outside."""
-    size = pixel.new_tensor([image.shape[2], image.shape[1]])
-    found = F.grid_sample(image[None], (2 * pixel / size - 1).reshape(1, 1, -1, 2), align_corners=False)
-    return found.reshape(len(image), *pixel.shape[:-1])
+    return sample_images(image[None], pixel.reshape(1, -1, 2)).reshape(len(image), *pixel.shape[:-1])
 
 
 def _window_mean(values: Tensor) -> Tensor:
@@ -141,7 +141,7 @@ def keep_silhouettes(kept: Tensor, body: Volume, views: Windows) -> Tensor:
         ray = row.clamp(0, rows - 1) * columns + column.clamp(0, columns - 1)
         covered = torch.zeros(rows * columns, device=kept.device)
         covered[ray[held]] = 1.0
-        covered = F.max_pool2d(covered.reshape(1, 1, rows, columns), 3, 1, 1).reshape(-1) > 0.5
+        covered = dilation(covered.reshape(1, 1, rows, columns), covered.new_ones(3, 3)).reshape(-1) > 0.5
         missing |= seen & ~covered[ray]
     result = kept.clone()
     result[inside] = held | missing

@@ -14,6 +14,7 @@ from mosa.reconstruction.observed import Windows
 from mosa.reconstruction.refinement import blurred, pixel_width
 from mosa.reconstruction.registration import matte_centres
 from mosa.reconstruction.rigid import rotation_exp
+from mosa.rendering.cameras import sample_images
 from mosa.types import Scene
 
 BLURS = (3.0, 3.0, 1.5, 1.5, 0.7, 0.4, 0.4)
@@ -48,9 +49,8 @@ def _sampled(image: Tensor, points: Tensor, K: Tensor, w2c: Tensor) -> tuple[Ten
     """Values (N, C) of an image at projected points, the points in the camera's frame (N, 3), and x/z, y/z (N, 2)."""
     seen = points @ w2c[:3, :3].T + w2c[:3, 3]
     flat = seen[:, :2] / seen[:, 2:]
-    size = flat.new_tensor([image.shape[2], image.shape[1]])
-    grid = (2 * (flat * K.diagonal()[:2] + K[:2, 2]) / size - 1).reshape(1, 1, -1, 2)
-    return F.grid_sample(image[None], grid, align_corners=False)[0, :, 0].T, seen, flat
+    pixel = flat * K.diagonal()[:2] + K[:2, 2]
+    return sample_images(image[None], pixel[None])[0].T, seen, flat
 
 
 def visible_points(distance: Volume, views: Windows) -> list[Tensor]:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from mosa.errors import DataError
 from mosa.limits import counted
+from mosa.rendering.cameras import sample_images
 from mosa.types import Cameras
 
 voxel_counts = partial(counted, "voxels of the object", remedy="take fewer and larger ones", each=40, error=DataError)
@@ -49,9 +50,7 @@ def matte_values(points: Tensor, mattes: Tensor, cameras: Cameras) -> Tensor:
     pixel = seen @ cameras.K.transpose(1, 2)
     pixel = pixel[..., :2] / depth.clamp(min=1e-6)[..., None]
     size = pixel.new_tensor([cameras.width, cameras.height])
-    values = F.grid_sample(
-        mattes[:, None], (2 * pixel / size - 1)[:, None], mode="bilinear", padding_mode="border", align_corners=False
-    )[:, 0, 0]
+    values = sample_images(mattes[:, None], pixel, beyond="border")[:, 0]
     border = torch.cat([mattes[:, 0], mattes[:, -1], mattes[:, :, 0], mattes[:, :, -1]], 1).amax(1) > 0.5
     inside = ((pixel >= 0) & (pixel <= size)).all(-1)
     values = torch.where(inside, values, border[:, None].to(values))

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from mosa.reconstruction.hull import Volume
 from mosa.reconstruction.observed import Windows
+from mosa.rendering.cameras import sample_images
 from mosa.types import Splats
 
 
@@ -38,9 +39,8 @@ def sampled_windows(points: Tensor, windows: Windows) -> Tensor:
     seen = points @ cameras.w2c[:, :3, :3].transpose(1, 2) + cameras.w2c[:, None, :3, 3]
     pixel = seen @ cameras.K.transpose(1, 2)
     pixel = pixel[..., :2] / pixel[..., 2:].clamp(min=1e-6)
-    grid = (2 * pixel / pixel.new_tensor([cameras.width, cameras.height]) - 1)[:, None]
     stacked = torch.cat([windows.images * windows.mattes[..., None], windows.mattes[..., None]], -1).permute(0, 3, 1, 2)
-    return F.grid_sample(stacked, grid, align_corners=False)[:, :, 0].transpose(1, 2)
+    return sample_images(stacked, pixel).transpose(1, 2)
 
 
 def projected_colors(points: Tensor, normals: Tensor, windows: Windows) -> Tensor:

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
+from kornia.morphology import dilation, erosion
 from scipy import ndimage
 from torch import Tensor
 
@@ -36,6 +37,7 @@ from mosa.reconstruction.field import (
 )
 from mosa.reconstruction.hull import Volume
 from mosa.reconstruction.observed import Windows
+from mosa.rendering.cameras import sample_images
 
 LOCAL = 0.3
 """Length on which a ray may touch a surface that it is to place, in radii of the grid: a ball's outline touches on 0.25 of them."""
@@ -95,8 +97,8 @@ class _Group:
 
 
 def _group(views: Windows) -> _Group:
-    around = views.mattes[:, None]
-    edge = (F.max_pool2d(around, 3, 1, 1) > 0.02) & (-F.max_pool2d(-around, 3, 1, 1) < 0.98)
+    around, box = views.mattes[:, None], views.mattes.new_ones(3, 3)
+    edge = (dilation(around, box) > 0.02) & (erosion(around, box) < 0.98)
     return _Group(views, *camera_rays(views.cameras), edge[:, 0], torch.full_like(views.mattes, float("nan")))
 
 
@@ -133,8 +135,7 @@ def color_information(
         pixel = flat * focal + cameras.K[u, :2, 2]
         turned = normal @ R.T
         moved = focal * (turned[:, :2] - flat * turned[:, 2:]) / seen[:, 2:]
-        grid = (2 * pixel / pixel.new_tensor([width, height]) - 1).reshape(1, 1, -1, 2)
-        found = F.grid_sample(images[u][None], grid, align_corners=False)[0, :, 0].T
+        found = sample_images(images[u][None], pixel[None])[0].T
         column, row = pixel[:, 0].long().clamp(0, width - 1), pixel[:, 1].long().clamp(0, height - 1)
         arm = points - group.centres[u]
         facing = -(normal * F.normalize(arm, dim=-1)).sum(-1)

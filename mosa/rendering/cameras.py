@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from mosa.errors import ConfigError, DataError
@@ -34,6 +35,12 @@ def rays(cameras: Cameras) -> tuple[Tensor, Tensor]:
     directions = directions / directions.norm(dim=-1, keepdim=True)
     origins = -(R.transpose(1, 2) @ cameras.w2c[:, :3, 3:])[..., 0]
     return origins, directions.view(-1, cameras.height, cameras.width, 3)
+
+
+def sample_images(images: Tensor, pixels: Tensor, *, beyond: str = "zeros") -> Tensor:
+    """Bilinear values (V, C, N) of images (V, C, H, W) at pixels (V, N, 2). beyond: an image: zeros | border (its values)."""
+    size = pixels.new_tensor([images.shape[3], images.shape[2]])
+    return F.grid_sample(images, (2 * pixels / size - 1)[:, None], padding_mode=beyond, align_corners=False)[:, :, 0]
 
 
 def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:

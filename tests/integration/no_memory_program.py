@@ -12,7 +12,8 @@ from unittest.mock import patch
 
 import torch
 
-from mosa import assembly, refused
+from mosa import refused
+from mosa.data import datamodule
 from mosa.modules.body import Body
 from mosa.modules.start import Start
 from mosa.reconstruction.starts import sequence_start
@@ -105,6 +106,6 @@ def start_once(body: Body, seen: Appearance, scene: Scene, **named: bool) -> Sta
 
 
 if __name__ == "__main__":
-    with patch.object(refused, "gpu_memory", lambda: (0.1e9, 150e9)), patch.object(assembly, "sequence_start", start_once):
+    with patch.object(refused, "gpu_memory", lambda: (0.1e9, 150e9)), patch.object(datamodule, "sequence_start", start_once):
         for one in PLACES:
             tried(*one)

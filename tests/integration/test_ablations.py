@@ -18,7 +18,7 @@ def first_step(cache):
             joint = module.stages[-1]
             module.begin(joint)
             with torch.no_grad():
-                terms, _ = module.terms(joint, [0, 1], scene.frames)
+                terms, _ = module.terms(joint, module.takes[0].observations, scene.frames, module.takes[0])
             compute.modules[name] = module
             known[name] = ({k: float(v) for k, v in terms.items()},
                                {n for n, p in body.named_parameters() if p.requires_grad})
@@ -96,7 +96,8 @@ def test_the_penalty_of_the_operator_weighs_less_the_more_the_prior_leaves_unexp
     module = first_step.modules["full", LINEAR]
     assert module.misfit == pytest.approx(terms["position"], rel=1e-6)  # the adapter has not moved: the prior's own
     with torch.no_grad():
-        penalty = [module.terms(module.stages[-1], [0, 1], 3)[0]["operator"] for module.misfit in (0.01, 0.04)]
+        take = module.takes[0]
+        penalty = [module.terms(module.stages[-1], take.observations, 3, take)[0]["operator"] for module.misfit in (0.01, 0.04)]
     assert float(penalty[0] / penalty[1]) == pytest.approx(16.0, rel=1e-6)
     assert float(penalty[0]) == pytest.approx(1e-4, rel=1e-3)  # of an operator that is nothing yet
 

@@ -345,8 +345,8 @@ def test_another_scene_is_evaluated_in_its_own_world(run, cache, tmp_path, monke
 
 
 def test_a_sweep_goes_on_after_a_job_that_fails_and_says_so_at_the_end(cache, tmp_path):
-    keys = ["debug=default", f"scene.cache={cache}", "trainer.accelerator=gpu", "trainer.devices=1000,2000"]
+    keys = ["debug=default", f"scene.cache={cache}", "trainer.accelerator=tpu,hpu"]
     result = forked.call("train.py", "-m", f"hydra.sweep.dir={tmp_path}", *keys)
     assert result.returncode == 1
-    assert all(f"found {count}" in result.stderr for count in (1000, 2000))
-    assert "2 jobs of the sweep failed:\n  0: ConfigError: trainer.devices" in result.stderr
+    assert result.stderr.count("ConfigError: trainer: expected what lightning.pytorch.Trainer takes") >= 2
+    assert "2 jobs of the sweep failed:\n  0: ConfigError: trainer: expected" in result.stderr

@@ -13,7 +13,7 @@ def test_the_loss_reaches_every_parameter(prior, cache):
     module.begin(stage)
     named = {name: float(value) for name, value in cfg.prior.parameters.items()}
     assert {n: pytest.approx(float(v.detach()), rel=1e-5) for n, v in body.material.physical().items()} == named
-    terms, _ = module.terms(stage, [0, 1], scene.frames)
+    terms, _ = module.terms(stage, module.takes[0].observations, scene.frames, module.takes[0])
     sum(terms.values()).backward()
     for name, raw in body.material.raw.items():
         assert bool(torch.isfinite(raw.grad)) and float(raw.grad.abs()) > 0, name

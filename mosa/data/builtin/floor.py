@@ -42,7 +42,7 @@ def floor_rollout(body, scene: Scene, world) -> Tensor:
         hidden.density,
         frame_dt,
         settings.dx,
-        v_max=world.fastest(begun, body.size, frame_dt * scene.frames),
+        v_max=world.fastest(begun, float((rest.amax(0) - rest.amin(0)).max()), frame_dt * scene.frames),
         courant=min(settings.courant, 0.3),
         limit=5000,
         viscosity=hidden.viscosity(),
