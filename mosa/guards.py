@@ -145,7 +145,7 @@ def warn_of_little(world: World, body: Body, found: Mapping[str, Start], scenes:
     for (prefix, start), scene in zip(found.items(), scenes):
         if not prefix.startswith("train") or scene.ground is None:
             continue
-        after = sum(frame >= first_contact(body, start, scene) for frame in scene.training_frames)
+        after = sum(frame >= first_contact(body, start, scene) for frame in scene.training_frames)  # type: ignore[arg-type]  # a body has the parts of its rest shape
         if after < DEFORMED:
             warnings.warn(f"{prefix}: {after} of the {len(scene.training_frames)} frames that are learned from come after first "
                           f"contact: expected {DEFORMED} at least, in which the object deforms; what the film does not tell stays "
