@@ -13,7 +13,7 @@ import pytest
 from omegaconf import OmegaConf
 
 import mosa
-from mosa import commands, viewer
+from mosa import composition, console, viewer
 
 ROOT = Path(__file__).parents[1]
 
@@ -79,7 +79,7 @@ def test_the_experiments_are_installed_with_the_paper_s_figures(built, tmp_path)
 
 
 def test_in_a_clone_the_configuration_is_where_it_is_edited():
-    assert Path(commands.configuration()) == ROOT / "conf"
+    assert Path(composition.configuration()) == ROOT / "conf"
 
 
 def test_there_is_one_version_and_every_command_has_its_function():
@@ -111,13 +111,13 @@ def test_a_warning_and_what_ended_a_run_are_in_the_log(tmp_path, capsys, monkeyp
     monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
     with warnings.catch_warnings():
         warnings.simplefilter("always")
-        commands.begin_log()
+        console.begin_log()
         try:
             warnings.warn("three holes in a matte", stacklevel=1)
             warnings.warn("of a library", DeprecationWarning, stacklevel=1)
         finally:
             logging.captureWarnings(False)
-    commands.fail("DataError: no image")
+    console.fail("DataError: no image")
     file.close()
     first, second, last = (tmp_path / "train.log").read_text().splitlines()
     assert first == "warning: three holes in a matte" and last == "DataError: no image"
