@@ -446,15 +446,18 @@ def test_turns_go_on_beyond_half_a_turn():
 
 FAST = {"type": "box", "name": "fast", "size": [0.1, 0.1, 0.1], "mode": "separate"}
 STILL = torch.zeros(200, 3).double()
+TURNS = Trajectory(torch.tensor([0, 0.0, 0.5]).expand(200, 3), 0.4 * torch.arange(200)[:, None] * torch.eye(3)[:1], STILL, STILL)
 JUMPS = Trajectory(torch.tensor([-1.0, 0.1, 0]) + torch.tensor([0.1, 0, 0]) * torch.arange(200)[:, None], STILL, STILL, STILL)
 
 
 @pytest.mark.parametrize("solid, action", [
     ({"position": [-1, 0.1, 0], "motion": {"velocity": [1000, 0, 0]}}, None),
     ({"motion": {"waypoints": [{"time": 0, "position": [-1, 0.1, 0]}, {"time": 0.01, "position": [1, 0.1, 0]}]}}, None),
+    ({"motion": {"waypoints": [{"time": FRAME_DT - 5e-7, "position": [-1, 0.1, 0]},  # within half a substep, between two steps
+                               {"time": FRAME_DT - 4e-7, "position": [1, 0.1, 0]}]}}, None),
     ({"position": [-1, 0.1, 0], "motion": {"angular_velocity": [0, 0, 1000]}}, None),
     ({"position": [-1, 0.1, 0], "motion": {"velocity": [[0, 0, 0], [500, 0, 0]], "times": [0, 0.02]}}, None),
-    (JUMPS, None), ({"position": [-1, 0.1, 0]}, {"velocity": (1000, 0, 0)}),
+    (JUMPS, None), (TURNS, None), ({"position": [-1, 0.1, 0]}, {"velocity": (1000, 0, 0)}),
     ({"position": [-1, 0.1, 0]}, {"position": (1, 0.1, 0)}), ({"position": [-1, 0.1, 0]}, {"angular_velocity": (0, 900, 0)}),
     ({"position": [-1, 0.1, 0]}, {"rotation": (0, 40.0, 0)}),
 ])  # fmt: skip
