@@ -20,6 +20,7 @@ from mosa.modules.body import Body, Ready, Start, World
 from mosa.modules.learned_numbers import each_law
 from mosa.physics.contact.colliders import reach
 from mosa.physics.contact.motion import Poses, exponential, rotation_matrices, rotation_vector, turning
+from mosa.physics.engine.axes import entered
 from mosa.physics.engine.clock import Moment
 from mosa.physics.engine.numerics import State, flat
 from mosa.twin_start import check_wants_no_gradients
@@ -148,7 +149,7 @@ class Episode:
             if not 0 <= int(found := getattr(state, name)) <= 2**53:  # as far as times have them exactly
                 raise ConfigError(f"state.{name}: expected a whole number of at least 0 and at most 2^53, found {int(found)}")
         particles = ParticleState(*(getattr(state, name).to(now.x.device) for name in State._fields))
-        particles = self._stepper.axes.state(particles, particles.v.dtype)
+        particles = entered(particles, self._stepper.axes, particles.v.dtype, self._stepper.prepared.numerics.dx)
         self._moment = Moment(particles, int(state.substeps), int(state.frames), float(state.lag))
         self._driven, self._poses = state.driven.cpu(), (state.position.cpu(), state.rotation.cpu())
 
@@ -188,7 +189,7 @@ class Episode:
         with self._gradients():
             now = moment.state.worlds()
             for b in again:
-                now[b] = self._stepper.axes.state(self._begin(b, again[b]), now[b].x.dtype)
+                now[b] = entered(self._begin(b, again[b]), self._stepper.axes, now[b].x.dtype, self._stepper.prepared.numerics.dx)
             fresh = ParticleState.stack(now)
             if moment.substeps:  # F goes before its velocities by one advance
                 parts = self._stepper.prepared.first_advance(flat(fresh), self._stepper.clock.dt)

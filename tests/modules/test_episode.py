@@ -383,6 +383,24 @@ def test_the_page_about_the_twin_runs(monkeypatch, tmp_path):
     assert TwinState.read(torch.load("moment.pt", weights_only=True)).x.shape == (120, 3)
 
 
+def test_nothing_is_put_where_the_axes_of_a_motion_have_no_digits():
+    """By a state or a new start of one world; a motion that is reset there has axes of its own."""
+    made, box = twin(32), [[-1e4] * 3, [1e4] * 3]
+    state = made.reset(box=box)
+    made.state = replace(state, x=state.x + torch.tensor([300.0, 0, 0]))
+    message = r"x: expected particles within 369 m of where the motion was reset, found some at .* reset there"
+    with pytest.raises(ConfigError, match=message):
+        made.state = replace(state, x=state.x + torch.tensor([400.0, 0, 0]))
+    worlds = made.worlds(2)
+    worlds.reset(box=box)
+    before = worlds.restart([1], [{"position": (300, None, 0)}])
+    with pytest.raises(ConfigError, match=message):
+        worlds.restart([0], [{"position": (400, None, 0)}])
+    assert torch.equal(worlds.state.x, before.x) and float(before.x[1].mean(0)[0]) == pytest.approx(300, abs=1e-3)
+    made.reset(box=box, position=(400, None, 0))
+    made.state = made.reset(box=box, position=(700, None, 0))
+
+
 @pytest.mark.parametrize("precision", [32, 64])
 def test_a_twin_that_is_turned_and_far_away_moves_as_at_home(precision):
     """Ten kilometres away on a sloping ground: simulated, stepped, driven, saved and branched."""
