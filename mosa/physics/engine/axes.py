@@ -55,7 +55,7 @@ class Axes:
 
 
 def entered(state: ParticleState, axes: Axes, dtype: torch.dtype, dx: float) -> ParticleState:
-    """A state of the world in axes that are chosen already, on a grid of dx [m]. Errors: ConfigError where it is too far from them."""
+    """A state of the world in axes that are chosen already, on a grid of dx [m]. Errors: ConfigError where it is too far away."""
     found, most = axes.state(state), 0.5 * (SPREAD + 1) * PERIOD * dx
     if (far := float(found.x.detach().abs().max())) > most:
         raise ConfigError(f"x: expected particles within {most:.3g} m of where the motion was reset, found some at {far:.3g} m, "
