@@ -145,6 +145,10 @@ class Episode:
             if not isinstance(found, Tensor) or found.shape != known.shape or found.dtype != known.dtype:
                 what = f"{found.dtype} {tuple(found.shape)}" if isinstance(found, Tensor) else repr(found)
                 raise ConfigError(f"state.{f.name}: expected a tensor {known.dtype} {tuple(known.shape)}, found {what}")
+            if not bool(torch.isfinite(found.detach()).all()):
+                raise ConfigError(f"state.{f.name}: expected finite numbers, found {found[~torch.isfinite(found)][0]}")
+        if self.colliders:
+            rotation_matrices(state.rotation, state.rotation.ndim - 2)
         for name in ("frames", "substeps"):
             if not 0 <= int(found := getattr(state, name)) <= 2**53:  # as far as times have them exactly
                 raise ConfigError(f"state.{name}: expected a whole number of at least 0 and at most 2^53, found {int(found)}")
@@ -179,7 +183,7 @@ class Episode:
         """Put some worlds back to a start, each to its own of `starts`, None for those it had; the others stay as they are. Time
         is one for all and goes on: driven colliders are back where they began, others follow their motion. Errors: ConfigError.
         """
-        if self.worlds is None or not all(isinstance(b, int) and 0 <= b < self.worlds for b in which):
+        if self.worlds is None or not all(type(b) is int and 0 <= b < self.worlds for b in which):
             raise ConfigError(f"restart: expected numbers of worlds below {self.worlds or 0}, found {list(which)}")
         if starts is not None and len(starts) != len(which):
             raise ConfigError(f"restart: expected a start for each of {len(which)} worlds, found {len(starts)}")

@@ -354,6 +354,15 @@ def test_errors_of_starts_and_states():
         made.worlds(2).reset([{}, {"height": -1}])
     with pytest.raises(ConfigError, match=r"laws: expected one for each of 2 worlds, a tensor .*found \(3, 5\)"):
         made.worlds(2, torch.zeros(3, 5))
+    for laws in (torch.zeros(2, 5), torch.full((2, 22), math.nan), torch.zeros(2, 22).bool()):
+        with pytest.raises(ConfigError, match=r"laws: expected one for each of 2 worlds, a tensor \(2, 22\) of finite numbers"):
+            made.worlds(2, laws)
+    with pytest.raises(ConfigError, match="gravity: expected numbers without gradients"):  # found a small part of them
+        made.worlds(2).reset(gravity=torch.zeros(2, 3, requires_grad=True), differentiable=True)
+    worlds = made.worlds(2)
+    worlds.reset()
+    with pytest.raises(ConfigError, match=r"restart: expected numbers of worlds below 2, found \[True\]"):
+        worlds.restart([True])
     with pytest.raises(ConfigError, match=r"worlds: expected at most .*, found 1e\+09 x 120"):
         made.worlds(10**9)
     made.reset()
@@ -361,6 +370,11 @@ def test_errors_of_starts_and_states():
         made.state = replace(made.state, substeps=torch.tensor(2**62))
     with pytest.raises(ConfigError, match=r"state\.x: expected a tensor torch.float64 \(120, 3\), found torch.float64 \(7, 3\)"):
         made.state = replace(made.state, x=torch.zeros(7, 3).double())
+    made.reset(colliders=[PUSHER])
+    for name, value, message in (("position", math.nan, "finite numbers, found nan"), ("F", math.inf, "finite"),
+                                 ("lag", math.nan, "finite"), ("rotation", 0.0, "rotation"), ("rotation", 1e38, "rotation")):
+        with pytest.raises(ConfigError, match=f"expected {message}"):
+            made.state = replace(made.state, **{name: torch.full_like(getattr(made.state, name), value)})
     with pytest.raises(DataError, match=r"state: expected .* found x"):
         TwinState.read({"x": torch.zeros(3)})
 
