@@ -178,9 +178,8 @@ def polar_value(F: wp.mat33d):
             else:
                 x = wp.sqrt(wp.ddot(X, X))
                 y = wp.sqrt(wp.dot(bc, bc) + wp.dot(ca, ca) + wp.dot(ab, ab))
-                q = y / x  # about the second singular value: all are positive after the step
-                if q > wp.float64(1.0e-5) * x and d > -wp.float64(0.1) * q * q * q:
-                    e = _ONE / x
+                if y > wp.float64(1.0e-5) * x * x and d * x * x * x > -wp.float64(0.1) * y * y * y:
+                    e = _ONE / x  # all singular values are positive after the step: y/x is about the second one
                     f = _ONE / y
                 else:
                     step = 20
