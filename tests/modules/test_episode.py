@@ -397,6 +397,18 @@ def test_the_page_about_the_twin_runs(monkeypatch, tmp_path):
     assert TwinState.read(torch.load("moment.pt", weights_only=True)).x.shape == (120, 3)
 
 
+@pytest.mark.parametrize("ground", ["sticky", "separate", "slip", "touch"])
+@pytest.mark.parametrize("counts", [(1, 1, 1), (2, 2, 2), (3, 3, 3), (8, 2, 8)])
+def test_what_is_set_down_at_height_0_stays(ground, counts):
+    """Its lowest layer, half of a body of two, is a rounding above or below the ground."""
+    world = replace(WORLD, ground=replace(WORLD.ground, mode=ground, friction=0.0))
+    made = twin(32, world, counts=counts, adapter=False, E=1e5)
+    first = made.reset(height=0.0, velocity=(0, 0, 0), position=(0.013, None, 0.007))
+    for _ in range(10):
+        state = made.step().state
+    assert (state.positions.mean(0) - first.positions.mean(0)).abs().max() < 1e-3
+
+
 def test_nothing_is_put_where_the_axes_of_a_motion_have_no_digits():
     """By a state or a new start of one world; a motion that is reset there has axes of its own."""
     made, box = twin(32), [[-1e4] * 3, [1e4] * 3]
