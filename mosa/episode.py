@@ -20,6 +20,7 @@ from mosa.modules.body import Body, Ready, Start, World
 from mosa.modules.learned_numbers import each_law
 from mosa.physics.contact.colliders import reach
 from mosa.physics.contact.motion import Poses, exponential, rotation_matrices, rotation_vector, turning
+from mosa.physics.contact.overlap import check_clear
 from mosa.physics.engine.axes import entered
 from mosa.physics.engine.clock import Moment
 from mosa.physics.engine.numerics import State, flat
@@ -191,19 +192,21 @@ class Episode:
         chosen[list(which)] = True
         again = dict(zip(which, starts if starts is not None else [self._starts[b] for b in which], strict=True))
         with self._gradients():
-            now = moment.state.worlds()
+            moved = chosen[:, None] & self._driven  # solids that are back
+            poses = tuple(torch.where(moved.view(*moved.shape, *(1,) * (first.ndim - 2)), first, now)
+                          for first, now in zip(self._first, self._poses))  # fmt: skip
+            now, spacing = moment.state.worlds(), float(self._stepper.prepared.lanes.solvers[0].volume.mean()) ** (1 / 3)
             for b in again:
-                now[b] = entered(self._begin(b, again[b]), self._stepper.axes, now[b].x.dtype, self._stepper.prepared.numerics.dx)
+                begun, lift = self._begin(b, again[b]), self._raised.expand(self.worlds, 3)[b]
+                check_clear(self.colliders, begun.x.detach().cpu() - lift, f"the body of world {b}", "colliders", spacing,
+                            tuple(part[b] for part in poses))  # fmt: skip
+                now[b] = entered(begun, self._stepper.axes, now[b].x.dtype, self._stepper.prepared.numerics.dx)
             fresh = ParticleState.stack(now)
             if moment.substeps:  # F goes before its velocities by one advance
                 parts = self._stepper.prepared.first_advance(flat(fresh), self._stepper.clock.dt)
                 fresh = ParticleState(*(t.unflatten(0, (self.worlds, -1)) for t in parts))
             state = ParticleState(*(_where(chosen, getattr(fresh, n), getattr(moment.state, n)) for n in State._fields))
-            back = [_where(chosen, first, now) for first, now in zip(self._first, self._poses)]
-            at = self._driven.view(1, -1)
-            self._poses = tuple(
-                torch.where(at.view(1, -1, *(1,) * (new.ndim - 2)), new, old) for new, old in zip(back, self._poses)
-            )
+            self._poses = poses
             self._moment = moment._replace(state=state)
             return self.state
 

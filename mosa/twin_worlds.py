@@ -81,7 +81,7 @@ class TwinWorlds:
         if not isinstance(which, (list, tuple, range)):
             raise ConfigError(f"restart: expected a list of numbers of worlds, found {str(which)[:80]}")
         which, episode = list(which), self._going()
-        given = None if starts is None else [start for start, _ in self._found(starts, which, episode.colliders, self._box)]
+        given = None if starts is None else [start for start, _ in self._found(starts, which, (), self._box)]
         return episode.restart(which, given)
 
     def _found(

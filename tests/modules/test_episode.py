@@ -397,6 +397,23 @@ def test_the_page_about_the_twin_runs(monkeypatch, tmp_path):
     assert TwinState.read(torch.load("moment.pt", weights_only=True)).x.shape == (120, 3)
 
 
+def test_worlds_begin_again_outside_of_where_solids_are_by_then():
+    """A solid on a motion of its own, and a driven one, which is back where it began."""
+    made, place = twin(32).worlds(2), {"position": (0, None, 0), "height": 0.01}
+    box = {"type": "box", "size": [0.1, 0.1, 0.1], "mode": "separate"}
+    own = box | {"name": "own", "position": [-0.2, 0.1, 0], "motion": {"velocity": [0.6, 0, 0]}}
+    driven = box | {"name": "driven", "position": [0, 0.1, 0.3]}
+    made.reset({"position": (1, None, 0)}, colliders=[own, driven])
+    for _ in range(20):
+        before = made.step({"driven": (0, 0, -0.9)}).state
+    for starts in ([place], place):
+        with pytest.raises(ConfigError, match=r"colliders\[0\] \(own\): .* of world 1 inside of it now, where its .* \[-0.0, 0"):
+            made.restart([1], starts)
+    assert torch.equal(made.state.x, before.x) and torch.equal(made.state.position, before.position)
+    free = made.restart([1], [{"position": (-0.2, None, 0), "height": 0.01}])  # where it was at t = 0
+    assert free.position[1, :, 2].tolist() == [0, 0.3] and free.position[0, 1, 2] == pytest.approx(0, abs=1e-9)
+
+
 @pytest.mark.parametrize("ground", ["sticky", "separate", "slip", "touch"])
 @pytest.mark.parametrize("counts", [(1, 1, 1), (2, 2, 2), (3, 3, 3), (8, 2, 8)])
 def test_what_is_set_down_at_height_0_stays(ground, counts):
@@ -414,7 +431,7 @@ def test_nothing_is_put_where_the_axes_of_a_motion_have_no_digits():
     made, box = twin(32), [[-1e4] * 3, [1e4] * 3]
     state = made.reset(box=box)
     made.state = replace(state, x=state.x + torch.tensor([300.0, 0, 0]))
-    message = r"x: expected particles within 369 m of where the motion was reset, found some at .* reset there"
+    message = r"x: expected particles within 369 m of the place of the reset, found .* m: reset there"
     with pytest.raises(ConfigError, match=message):
         made.state = replace(state, x=state.x + torch.tensor([400.0, 0, 0]))
     worlds = made.worlds(2)

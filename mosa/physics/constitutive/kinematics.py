@@ -157,8 +157,8 @@ def adj_svd(F: wp.mat33d, adj_U: wp.mat33d, adj_S: wp.vec3d, adj_V: wp.mat33d):
 def polar_value(F: wp.mat33d):
     """Rotation of F: Newton's iteration X <- (X + X^-T)/2; the SVD where two stretches vanish, or det F is far below zero.
 
-    The cofactors of X have its singular vectors, and the largest value where X has the smallest: where det X is small a step that
-    takes both at one size leaves a body that lies flat as far from its rotation as one that does not, on either side of 0."""
+    Cofactors of X have its singular vectors, the largest value where X has the smallest: at a small det X a step takes both at one
+    size, on either side of 0, and a body that lies flat costs no more than one that does not."""
     X = F
     converged = int(0)
     if wp.ddot(F, F) < wp.float64(100.0):

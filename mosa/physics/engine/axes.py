@@ -58,8 +58,7 @@ def entered(state: ParticleState, axes: Axes, dtype: torch.dtype, dx: float) -> 
     """A state of the world in axes that are chosen already, on a grid of dx [m]. Errors: ConfigError where it is too far away."""
     found, most = axes.state(state), 0.5 * (SPREAD + 1) * PERIOD * dx
     if (far := float(found.x.detach().abs().max())) > most:
-        raise ConfigError(f"x: expected particles within {most:.3g} m of where the motion was reset, found some at {far:.3g} m, "
-                          "where a moving body has no digits: reset there")
+        raise ConfigError(f"x: expected particles within {most:.3g} m of the place of the reset, found {far:.3g} m: reset there")
     return replace(found, x=found.x.to(dtype))
 
 
