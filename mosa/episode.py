@@ -20,6 +20,8 @@ from mosa.modules.body import Body, Ready, Start, World
 from mosa.modules.learned_numbers import each_law
 from mosa.physics.contact.colliders import reach
 from mosa.physics.contact.motion import Poses, exponential, rotation_matrices, rotation_vector, turning
+from mosa.physics.contact.overlap import check_clear
+from mosa.physics.engine.axes import entered
 from mosa.physics.engine.clock import Moment
 from mosa.physics.engine.numerics import State, flat
 from mosa.twin_start import check_wants_no_gradients
@@ -144,11 +146,15 @@ class Episode:
             if not isinstance(found, Tensor) or found.shape != known.shape or found.dtype != known.dtype:
                 what = f"{found.dtype} {tuple(found.shape)}" if isinstance(found, Tensor) else repr(found)
                 raise ConfigError(f"state.{f.name}: expected a tensor {known.dtype} {tuple(known.shape)}, found {what}")
+            if not bool(torch.isfinite(found.detach()).all()):
+                raise ConfigError(f"state.{f.name}: expected finite numbers, found {found[~torch.isfinite(found)][0]}")
+        if self.colliders:
+            rotation_matrices(state.rotation, state.rotation.ndim - 2)
         for name in ("frames", "substeps"):
             if not 0 <= int(found := getattr(state, name)) <= 2**53:  # as far as times have them exactly
                 raise ConfigError(f"state.{name}: expected a whole number of at least 0 and at most 2^53, found {int(found)}")
         particles = ParticleState(*(getattr(state, name).to(now.x.device) for name in State._fields))
-        particles = self._stepper.axes.state(particles, particles.v.dtype)
+        particles = entered(particles, self._stepper.axes, particles.v.dtype, self._stepper.prepared.numerics.dx)
         self._moment = Moment(particles, int(state.substeps), int(state.frames), float(state.lag))
         self._driven, self._poses = state.driven.cpu(), (state.position.cpu(), state.rotation.cpu())
 
@@ -178,7 +184,7 @@ class Episode:
         """Put some worlds back to a start, each to its own of `starts`, None for those it had; the others stay as they are. Time
         is one for all and goes on: driven colliders are back where they began, others follow their motion. Errors: ConfigError.
         """
-        if self.worlds is None or not all(isinstance(b, int) and 0 <= b < self.worlds for b in which):
+        if self.worlds is None or not all(type(b) is int and 0 <= b < self.worlds for b in which):
             raise ConfigError(f"restart: expected numbers of worlds below {self.worlds or 0}, found {list(which)}")
         if starts is not None and len(starts) != len(which):
             raise ConfigError(f"restart: expected a start for each of {len(which)} worlds, found {len(starts)}")
@@ -186,19 +192,21 @@ class Episode:
         chosen[list(which)] = True
         again = dict(zip(which, starts if starts is not None else [self._starts[b] for b in which], strict=True))
         with self._gradients():
-            now = moment.state.worlds()
+            moved = chosen[:, None] & self._driven  # solids that are back
+            poses = tuple(torch.where(moved.view(*moved.shape, *(1,) * (first.ndim - 2)), first, now)
+                          for first, now in zip(self._first, self._poses))  # fmt: skip
+            now, spacing = moment.state.worlds(), float(self._stepper.prepared.lanes.solvers[0].volume.mean()) ** (1 / 3)
             for b in again:
-                now[b] = self._stepper.axes.state(self._begin(b, again[b]), now[b].x.dtype)
+                begun, lift = self._begin(b, again[b]), self._raised.expand(self.worlds, 3)[b]
+                check_clear(self.colliders, begun.x.detach().cpu() - lift, f"the body of world {b}", "colliders", spacing,
+                            tuple(part[b] for part in poses))  # fmt: skip
+                now[b] = entered(begun, self._stepper.axes, now[b].x.dtype, self._stepper.prepared.numerics.dx)
             fresh = ParticleState.stack(now)
             if moment.substeps:  # F goes before its velocities by one advance
                 parts = self._stepper.prepared.first_advance(flat(fresh), self._stepper.clock.dt)
                 fresh = ParticleState(*(t.unflatten(0, (self.worlds, -1)) for t in parts))
             state = ParticleState(*(_where(chosen, getattr(fresh, n), getattr(moment.state, n)) for n in State._fields))
-            back = [_where(chosen, first, now) for first, now in zip(self._first, self._poses)]
-            at = self._driven.view(1, -1)
-            self._poses = tuple(
-                torch.where(at.view(1, -1, *(1,) * (new.ndim - 2)), new, old) for new, old in zip(back, self._poses)
-            )
+            self._poses = poses
             self._moment = moment._replace(state=state)
             return self.state
 

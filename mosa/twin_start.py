@@ -24,7 +24,7 @@ STARTED = ("rotation", "height", "position", "velocity", "angular_velocity")
 FASTEST = 1e6
 """[m/s], [rad/s] of a start: the time step would be refused far below."""
 UNDER = 0.25
-"""Share of the body below the ground from which on it cannot start there: pressed against it, it has less."""
+"""Share of a body that may start below the ground, by a quarter of its spacing: pressed against it, it has less."""
 STORED_BYTES = 4 * (3 + 3 + 9 + 9)
 """Of a particle in a frame of a rollout: x, v, F, F_tot."""
 
@@ -177,7 +177,7 @@ def start_in(
     field, spacing = "world.colliders" if colliders is None else "colliders", float(body.volume.mean()) ** (1 / 3)
     check_clear(world.colliders, center + arms, "the body", field, spacing)
     if world.ground is not None:
-        below = float((((center + arms) @ up).detach() < world.ground.height).double().mean())
+        below = float((((center + arms) @ up).detach() < world.ground.height - 0.25 * spacing).double().mean())
         if below > UNDER:
             raise ConfigError(f"position: expected a body that starts above the ground of {world.ground.height:g} m, "
                               f"found {below:.0%} of it below (height is that of its lowest point above the ground)")

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from mosa.episode import Episode, Stepped, TwinState
 from mosa.errors import ConfigError
 from mosa.limits import counted
 from mosa.modules.body import Body, Start, World
+from mosa.modules.learned_numbers import read_numbers
 from mosa.physics.contact.colliders import Collider
 from mosa.twin_start import (
     STARTED,
@@ -34,9 +36,10 @@ class TwinWorlds:
         if isinstance(count, bool) or not isinstance(count, int) or count < 1:
             raise ConfigError(f"worlds: expected a whole number of at least 1, found {count!r}")
         counted("worlds", (count, len(body.rest)), "take fewer", each=500)  # bytes of a particle
-        if laws is not None and (not isinstance(laws, Tensor) or laws.ndim != 2 or len(laws) != count):
-            found = tuple(laws.shape) if isinstance(laws, Tensor) else repr(laws)[:80]
-            raise ConfigError(f"laws: expected one for each of {count} worlds, a tensor ({count}, numbers), found {found}")
+        shape, fits = (count, len(read_numbers(body))), isinstance(laws, Tensor) and laws.is_floating_point()
+        if laws is not None and not (fits and laws.shape == shape and bool(torch.isfinite(laws.detach()).all())):
+            found = tuple(laws.shape) if fits and laws.shape != shape else repr(laws)[:80]
+            raise ConfigError(f"laws: expected one for each of {count} worlds, a tensor {shape} of finite numbers, found {found}")
         self.body, self.world, self.frame_dt, self.training_start = body, world, frame_dt, training_start
         self.count, self.laws = count, laws
         self.episode: Episode | None = None
@@ -79,7 +82,7 @@ class TwinWorlds:
         if not isinstance(which, (list, tuple, range)):
             raise ConfigError(f"restart: expected a list of numbers of worlds, found {str(which)[:80]}")
         which, episode = list(which), self._going()
-        given = None if starts is None else [start for start, _ in self._found(starts, which, episode.colliders, self._box)]
+        given = None if starts is None else [start for start, _ in self._found(starts, which, (), self._box)]
         return episode.restart(which, given)
 
     def _found(

@@ -85,7 +85,7 @@ def check_agreement(scene: Scene, label: str, frame: int = 0) -> None:
         listed = ", ".join(f"{n} by {o:.2g}" for n, o in zip(names, off.tolist()) if o > AGREEMENT)
         raise DataError(
             f"{label}: the cameras do not see one object in frame {frame}: expected the lines of sight through the mattes' "
-            f"centroids to meet, found that they miss it, in radii of the object: {listed}; check poses, axes and names"
+            f"centroids to meet, found that they miss it, in radii of the object: {listed}; check poses, intrinsics, axes and names"
         )
     low, high = scene.box.double()
     if not bool(((point > low) & (point < high)).all()):

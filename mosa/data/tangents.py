@@ -26,6 +26,8 @@ EXPLAINED = 3.0
 """Factor by which outlines fit better elsewhere from which on that is where they belong."""
 COPY = 0.1
 """Difference of colours of 0 to 1 below which a picture is another's copy, written anew."""
+FOCAL = [percent for percent in range(-12, 13) if percent]
+"""By which a focal length may be too large [%]: it moves outlines as another moment does where an object falls through the view."""
 NEAR, WIDE = 2.0, 2.0
 """Radii from the line through two cameras below which, and angle [rad] of the object about it above which, they do not compare."""
 
@@ -89,6 +91,17 @@ class Tangents:
         return min((float(np.median(off)), said) for off, said in tried)
 
 
+    def focal(self, camera: int, frames: list[int]) -> tuple[float, str]:
+        """As `explanation`, of a focal length that is off in all frames."""
+        middle, tried = self.K[camera, :2, 2], []
+        for percent in FOCAL:
+            off = [torch.inf if outline is None else self.misfit(middle + (1 + percent / 100) * (outline - middle), camera, t)
+                   for t, outline in enumerate(self.outlines[camera])]  # fmt: skip
+            tried.append((max(np.median(np.array(off)[frames]), np.median([miss for miss in off if miss < torch.inf])), percent))
+        best, percent = min(tried)
+        return float(best), f"a focal length that is {abs(percent)} % {('larger', 'smaller')[percent > 0]} they fit to {best:.2g}"
+
+
 def outline_of(matte: Tensor) -> Tensor | None:
     """Corners (n, 2) [px] of the convex hull of a matte (H, W); None where it is empty."""
     row, column = np.nonzero((matte > 0.5).numpy())
@@ -115,11 +128,14 @@ def check_pictures(scene: Scene, label: str) -> None:
         others = [w for w in range(len(names)) if w != v and (bool((off[w, frames] > limit).any())
                   or float((scene.images[v, frames] - scene.images[w, frames]).abs().max()) < COPY)]  # fmt: skip
         better, place = tangents.explanation(v, frames, others, names)
-        sure = better < min(limit, float(row[frames].median()) / EXPLAINED)
+        most = min(limit, float(row[frames].median()) / EXPLAINED)
+        focal, length = tangents.focal(v, frames)
+        sure = better < most < focal
         said = (f"{label}: camera {names[v]}, {listed(frames)}: expected outlines that end where most other cameras' say, found "
                 f"them up to {float(row.max()):.2g} of the object's radius beside"
                 + (f"; {place} they fit to {better:.2g}: put the right pictures there" if sure else ": another moment or camera, "
-                   "mirrored or shifted pictures, a matte with a part too many or too few, or a pose that is off?")
+                   "mirrored or shifted pictures, a matte with a part too many or too few, or a pose or focal length that is "
+                   "off?" + f" At {length}" * (focal <= most))
                 + f"; or leave out the camera (scene.holdout_cameras=[{names[v]}]) or the frames (scene.frames)")  # fmt: skip
         if sure and float(row.max()) > SUSPECT:
             raise DataError(said)

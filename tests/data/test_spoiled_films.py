@@ -1,6 +1,7 @@
 """Films of which a frame, a matte or a number was spoiled on the way: said, and silent where nothing was."""
 
 import json
+import math
 import re
 import shutil
 import warnings
@@ -14,8 +15,11 @@ from PIL import Image
 from mosa.data.export import export_transforms
 from mosa.data.falling import check_still, track_of
 from mosa.data.scene import load_scene
+from mosa.data.tangents import check_pictures
 from mosa.data.validation import validate
 from mosa.errors import DataError
+from mosa.rendering.cameras import look_at
+from mosa.types import Cameras
 
 WORLD = {"gravity": [0, -9.8, 0], "box": [[-0.7, -0.1, -0.7], [0.7, 1.0, 0.7]], "ground": {"height": 0.0}}
 
@@ -56,6 +60,34 @@ def speck(pixels):
 
 def empty(pixels):
     pixels[..., 3] = 0
+
+
+def test_a_focal_length_that_is_off_is_no_other_moment():
+    """Where a ball falls through the view another frame fits nearly as well: to 0.033 radii."""
+    scene, size, count = load_scene(format="builtin", name="tiny", scale=0.5), 128, 20
+    K = torch.tensor([[1.6 * size, 0, size / 2], [0, 1.6 * size, size / 2], [0, 0, 1.0]])
+    angles = 2 * math.pi * torch.arange(6) / 6 + 0.3
+    eyes = torch.stack([2 * angles.cos(), 0.45 + 0.25 * (torch.arange(6) % 3), 2 * angles.sin()], 1)
+    w2c = torch.stack([look_at(eye, torch.tensor([0, 0.45, 0.0]), torch.tensor([0, 1.0, 0])) for eye in eyes])
+    pixel = torch.arange(size) + 0.5
+    rays = torch.stack([*torch.meshgrid(pixel, pixel, indexing="xy"), torch.ones(size, size)], -1) @ torch.linalg.inv(K).T
+    times = torch.arange(count) / 60
+    centres = torch.tensor([0, 0.85, 0.0]) - (4.9 * times**2 + 0.3 * times)[:, None] * torch.tensor([0, 1.0, 0])
+    away = centres @ w2c[:, :3, :3].mT + w2c[:, None, :3, 3]  # (cameras, frames, 3)
+    cosine = torch.einsum("hwi,vti->vthw", rays / rays.norm(dim=-1, keepdim=True), away / away.norm(dim=-1, keepdim=True))
+    mattes = (cosine > (1 - (0.1 / away.norm(dim=-1)) ** 2).sqrt()[..., None, None]).float()
+    shades = torch.linspace(0, 0.9, 6)[:, None] + 0.1 * torch.linspace(0, 1, count)
+    known = Cameras(K.repeat(6, 1, 1), w2c, size, size, tuple("012345"))
+    scene = replace(scene, images=shades[:, :, None, None, None].expand(6, count, size, size, 3), mattes=mattes, cameras=known)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_pictures(scene, "film")
+    known.K[0, :2, :2] *= 0.98
+    with pytest.warns(UserWarning, match=r"camera 0, .* focal length that is off\? At a .* [123] % larger they fit"):
+        check_pictures(scene, "film")
+    late = replace(scene, mattes=torch.cat([mattes[:3], mattes[3:4].roll(2, 1), mattes[4:]]))
+    with pytest.raises(DataError, match=r"camera 3, .*; as pictures of frames .* put the right pictures there"):
+        check_pictures(late, "film")
 
 
 @pytest.mark.parametrize(("change", "where", "message"), [

@@ -354,6 +354,15 @@ def test_errors_of_starts_and_states():
         made.worlds(2).reset([{}, {"height": -1}])
     with pytest.raises(ConfigError, match=r"laws: expected one for each of 2 worlds, a tensor .*found \(3, 5\)"):
         made.worlds(2, torch.zeros(3, 5))
+    for laws in (torch.zeros(2, 5), torch.full((2, 22), math.nan), torch.zeros(2, 22).bool()):
+        with pytest.raises(ConfigError, match=r"laws: expected one for each of 2 worlds, a tensor \(2, 22\) of finite numbers"):
+            made.worlds(2, laws)
+    with pytest.raises(ConfigError, match="gravity: expected numbers without gradients"):  # found a small part of them
+        made.worlds(2).reset(gravity=torch.zeros(2, 3, requires_grad=True), differentiable=True)
+    worlds = made.worlds(2)
+    worlds.reset()
+    with pytest.raises(ConfigError, match=r"restart: expected numbers of worlds below 2, found \[True\]"):
+        worlds.restart([True])
     with pytest.raises(ConfigError, match=r"worlds: expected at most .*, found 1e\+09 x 120"):
         made.worlds(10**9)
     made.reset()
@@ -361,6 +370,11 @@ def test_errors_of_starts_and_states():
         made.state = replace(made.state, substeps=torch.tensor(2**62))
     with pytest.raises(ConfigError, match=r"state\.x: expected a tensor torch.float64 \(120, 3\), found torch.float64 \(7, 3\)"):
         made.state = replace(made.state, x=torch.zeros(7, 3).double())
+    made.reset(colliders=[PUSHER])
+    for name, value, message in (("position", math.nan, "finite numbers, found nan"), ("F", math.inf, "finite"),
+                                 ("lag", math.nan, "finite"), ("rotation", 0.0, "rotation"), ("rotation", 1e38, "rotation")):
+        with pytest.raises(ConfigError, match=f"expected {message}"):
+            made.state = replace(made.state, **{name: torch.full_like(getattr(made.state, name), value)})
     with pytest.raises(DataError, match=r"state: expected .* found x"):
         TwinState.read({"x": torch.zeros(3)})
 
@@ -381,6 +395,53 @@ def test_the_page_about_the_twin_runs(monkeypatch, tmp_path):
     assert names["by_push"].abs().max() > 0 and names["by_modulus"].abs() > 0
     assert names["state"].positions.shape == (4, 120, 3) and names["reactions"].shape[1:] == (4, 1, 6)
     assert TwinState.read(torch.load("moment.pt", weights_only=True)).x.shape == (120, 3)
+
+
+def test_worlds_begin_again_outside_of_where_solids_are_by_then():
+    """A solid on a motion of its own, and a driven one, which is back where it began."""
+    made, place = twin(32).worlds(2), {"position": (0, None, 0), "height": 0.01}
+    box = {"type": "box", "size": [0.1, 0.1, 0.1], "mode": "separate"}
+    own = box | {"name": "own", "position": [-0.2, 0.1, 0], "motion": {"velocity": [0.6, 0, 0]}}
+    driven = box | {"name": "driven", "position": [0, 0.1, 0.3]}
+    made.reset({"position": (1, None, 0)}, colliders=[own, driven])
+    for _ in range(20):
+        before = made.step({"driven": (0, 0, -0.9)}).state
+    for starts in ([place], place):
+        with pytest.raises(ConfigError, match=r"colliders\[0\] \(own\): .* of world 1 inside of it now, where its .* \[-0.0, 0"):
+            made.restart([1], starts)
+    assert torch.equal(made.state.x, before.x) and torch.equal(made.state.position, before.position)
+    free = made.restart([1], [{"position": (-0.2, None, 0), "height": 0.01}])  # where it was at t = 0
+    assert free.position[1, :, 2].tolist() == [0, 0.3] and free.position[0, 1, 2] == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("ground", ["sticky", "separate", "slip", "touch"])
+@pytest.mark.parametrize("counts", [(1, 1, 1), (2, 2, 2), (3, 3, 3), (8, 2, 8)])
+def test_what_is_set_down_at_height_0_stays(ground, counts):
+    """Its lowest layer, half of a body of two, is a rounding above or below the ground."""
+    world = replace(WORLD, ground=replace(WORLD.ground, mode=ground, friction=0.0))
+    made = twin(32, world, counts=counts, adapter=False, E=1e5)
+    first = made.reset(height=0.0, velocity=(0, 0, 0), position=(0.013, None, 0.007))
+    for _ in range(10):
+        state = made.step().state
+    assert (state.positions.mean(0) - first.positions.mean(0)).abs().max() < 1e-3
+
+
+def test_nothing_is_put_where_the_axes_of_a_motion_have_no_digits():
+    """By a state or a new start of one world; a motion that is reset there has axes of its own."""
+    made, box = twin(32), [[-1e4] * 3, [1e4] * 3]
+    state = made.reset(box=box)
+    made.state = replace(state, x=state.x + torch.tensor([300.0, 0, 0]))
+    message = r"x: expected particles within 369 m of the place of the reset, found .* m: reset there"
+    with pytest.raises(ConfigError, match=message):
+        made.state = replace(state, x=state.x + torch.tensor([400.0, 0, 0]))
+    worlds = made.worlds(2)
+    worlds.reset(box=box)
+    before = worlds.restart([1], [{"position": (300, None, 0)}])
+    with pytest.raises(ConfigError, match=message):
+        worlds.restart([0], [{"position": (400, None, 0)}])
+    assert torch.equal(worlds.state.x, before.x) and float(before.x[1].mean(0)[0]) == pytest.approx(300, abs=1e-3)
+    made.reset(box=box, position=(400, None, 0))
+    made.state = made.reset(box=box, position=(700, None, 0))
 
 
 @pytest.mark.parametrize("precision", [32, 64])
@@ -446,15 +507,18 @@ def test_turns_go_on_beyond_half_a_turn():
 
 FAST = {"type": "box", "name": "fast", "size": [0.1, 0.1, 0.1], "mode": "separate"}
 STILL = torch.zeros(200, 3).double()
+TURNS = Trajectory(torch.tensor([0, 0.0, 0.5]).expand(200, 3), 0.4 * torch.arange(200)[:, None] * torch.eye(3)[:1], STILL, STILL)
 JUMPS = Trajectory(torch.tensor([-1.0, 0.1, 0]) + torch.tensor([0.1, 0, 0]) * torch.arange(200)[:, None], STILL, STILL, STILL)
 
 
 @pytest.mark.parametrize("solid, action", [
     ({"position": [-1, 0.1, 0], "motion": {"velocity": [1000, 0, 0]}}, None),
     ({"motion": {"waypoints": [{"time": 0, "position": [-1, 0.1, 0]}, {"time": 0.01, "position": [1, 0.1, 0]}]}}, None),
+    ({"motion": {"waypoints": [{"time": FRAME_DT - 5e-7, "position": [-1, 0.1, 0]},  # within half a substep, between two steps
+                               {"time": FRAME_DT - 4e-7, "position": [1, 0.1, 0]}]}}, None),
     ({"position": [-1, 0.1, 0], "motion": {"angular_velocity": [0, 0, 1000]}}, None),
     ({"position": [-1, 0.1, 0], "motion": {"velocity": [[0, 0, 0], [500, 0, 0]], "times": [0, 0.02]}}, None),
-    (JUMPS, None), ({"position": [-1, 0.1, 0]}, {"velocity": (1000, 0, 0)}),
+    (JUMPS, None), (TURNS, None), ({"position": [-1, 0.1, 0]}, {"velocity": (1000, 0, 0)}),
     ({"position": [-1, 0.1, 0]}, {"position": (1, 0.1, 0)}), ({"position": [-1, 0.1, 0]}, {"angular_velocity": (0, 900, 0)}),
     ({"position": [-1, 0.1, 0]}, {"rotation": (0, 40.0, 0)}),
 ])  # fmt: skip

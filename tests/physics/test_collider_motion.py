@@ -52,6 +52,20 @@ def test_displacement_is_the_integral_of_the_velocity():
     torch.testing.assert_close(R[[10, 20, 40]], torch.from_numpy(turns), **exact(atol=1e-12))
 
 
+@pytest.mark.parametrize("length", [1e-9, 1e-5, 3e-3, 0.01, 0.013, 0.05])
+@pytest.mark.parametrize("begin", [0.0301, 0.0395, 0.0444])
+def test_what_a_motion_does_between_substeps_is_felt(begin, length):
+    """However short a piece is, the mean velocities of the substeps sum up to all of it, in whatever steps they are asked for."""
+    motion = Motion.waypoints([begin, begin + length], [[0, 0, 0], [1, 0, 2]], [[0, 0, 0], [0, 0.5, 0]])
+    _, _, linear, angular = motion.sample(4, 5, 0.01)
+    torch.testing.assert_close(0.01 * linear.sum(0), torch.tensor([1.0, 0, 2]).double(), **exact())
+    torch.testing.assert_close(0.01 * angular.sum(0), torch.tensor([0, 0.5, 0]).double(), **exact())
+    apart = [motion.sample(1, 5, 0.01, 0.0, 5 * k)[2] for k in range(4)]
+    assert torch.equal(torch.cat(apart), linear)
+    felt = linear.norm(dim=1).nonzero()[:, 0]
+    assert len(felt) <= length / 0.01 + 2 and 3 <= int(felt[0]) <= 4
+
+
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 0.5, 2.6, 2.8, 3.0, math.pi - 1e-4, math.pi - 1e-9])
 def test_rotation_vector_inverts_the_exponential(angle):
     axis = torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64)

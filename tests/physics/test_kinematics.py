@@ -98,6 +98,21 @@ def test_rotation_is_the_polar_one(drawn):
     assert names.count("inverted") == 6 and bool((~upright).any())
 
 
+@pytest.mark.parametrize("stretches, within", [
+    ([1, 1, 1e-2], 5e-15), ([1.2, 0.9, 1e-5], 5e-15), ([1.1, 0.9, 1e-17], 5e-15), ([1.2, 0.8, 0], 5e-15), ([1.1, 1, -1e-3], 5e-15),
+    ([1.2, 0.8, -0.05], 5e-15), ([0.05, 0.05, 0.05], 5e-15), ([3, 0.3, 1e-3], 5e-15), ([9.7, 1, 1e-9], 5e-15),
+    ([1, 0.5, -0.4], 5e-15), ([1, 1e-2, -1e-6], 1e-12), ([1, 1e-3, 1e-6], 1e-12), ([1, 1e-4, 1e-5], 1e-11), ([1, 1e-6, 1e-7], 1e-9),
+    ([30, 1, -1e-3], 5e-14),
+])  # fmt: skip
+def test_rotation_of_a_body_that_lies_flat(stretches, within):
+    """Newton's iteration goes through a det F of zero; the SVD does what it cannot."""
+    generator = torch.Generator().manual_seed(2)
+    U, V = (torch.linalg.qr(torch.randn(40, 3, 3, generator=generator).double())[0] for _ in range(2))
+    U, V = (Q * torch.linalg.det(Q)[:, None, None] for Q in (U, V))
+    F = U @ torch.diag(torch.tensor(stretches).double()) @ V.mT
+    torch.testing.assert_close(run("rotation", F, torch.ones(40).double()), U @ V.mT, rtol=0, atol=within)
+
+
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_gradient_against_differences(name, drawn):
     _, F = drawn

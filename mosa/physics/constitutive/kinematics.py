@@ -155,12 +155,13 @@ def adj_svd(F: wp.mat33d, adj_U: wp.mat33d, adj_S: wp.vec3d, adj_V: wp.mat33d):
 
 @wp.func
 def polar_value(F: wp.mat33d):
-    """Rotation of F: Newton's iteration X <- (X + X^-T)/2 where det F is safely positive, the SVD elsewhere."""
+    """Rotation of F: Newton's iteration X <- (X + X^-T)/2; the SVD where two stretches vanish, or det F is far below zero.
+
+    Cofactors of X have its singular vectors, the largest value where X has the smallest: at a small det X a step takes both at one
+    size, on either side of 0, and a body that lies flat costs no more than one that does not."""
     X = F
-    d = wp.determinant(F)
-    size = wp.ddot(F, F)
     converged = int(0)
-    if d > wp.float64(0.02) and size < wp.float64(100.0):
+    if wp.ddot(F, F) < wp.float64(100.0):
         step = int(0)
         while step < 20 and converged == 0:
             a = wp.vec3d(X[0, 0], X[0, 1], X[0, 2])
@@ -169,16 +170,28 @@ def polar_value(F: wp.mat33d):
             bc = wp.cross(b, c)
             ca = wp.cross(c, a)
             ab = wp.cross(a, b)
-            f = _HALF / wp.dot(a, bc)
-            a1 = _HALF * a + f * bc
-            b1 = _HALF * b + f * ca
-            c1 = _HALF * c + f * ab
+            d = wp.dot(a, bc)
+            e = _HALF
+            f = _ZERO
+            if d > wp.float64(0.02):
+                f = _HALF / d
+            else:
+                x = wp.sqrt(wp.ddot(X, X))
+                y = wp.sqrt(wp.dot(bc, bc) + wp.dot(ca, ca) + wp.dot(ab, ab))
+                if y > wp.float64(1.0e-5) * x * x and d * x * x * x > -wp.float64(0.1) * y * y * y:
+                    e = _ONE / x  # all singular values are positive after the step: y/x is about the second one
+                    f = _ONE / y
+                else:
+                    step = 20
+            a1 = e * a + f * bc
+            b1 = e * b + f * ca
+            c1 = e * c + f * ab
             da = a1 - a
             db = b1 - b
             dc = c1 - c
             X = wp.mat33d(a1[0], a1[1], a1[2], b1[0], b1[1], b1[2], c1[0], c1[1], c1[2])
             # quadratic convergence: a change of 1e-9 leaves an error of 1e-18
-            if wp.dot(da, da) + wp.dot(db, db) + wp.dot(dc, dc) < wp.float64(1.0e-18):
+            if e == _HALF and f > _ZERO and wp.dot(da, da) + wp.dot(db, db) + wp.dot(dc, dc) < wp.float64(1.0e-18):
                 converged = int(1)
             step = step + 1
     if converged == 0:

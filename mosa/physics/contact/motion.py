@@ -1,6 +1,6 @@
 """Prescribed rigid motions of colliders: pose and twist at every substep, differentiable in what describes them.
 
-The pose of substep s is the one at its start, t = s dt; the twist is the one in its middle. A motion is described by pieces of
+The pose of substep s is the one at its start, t = s dt; the twist is the mean in it. A motion is described by pieces of
 constant twist (`Motion`, `Motion.waypoints`), or given substep by substep (`Trajectory`). Everything is torch: gradients reach
 positions, rotations and velocities through autograd.
 """
@@ -86,6 +86,15 @@ def _vectors(name: str, value: Tensor | Sequence) -> Tensor:
     return value.reshape(-1, 3)
 
 
+def _mean(times: Tensor, pieces: Tensor, ends: Tensor, middle: Tensor) -> Tensor:
+    """(S, 3) means of velocities `pieces` (K, 3) from `times` (K,) on between `ends` (S + 1,): those in the `middle`, but where a
+    piece begins or ends between them, however short it is."""
+    passed = torch.cat([torch.zeros(1, 3).to(pieces), (pieces[:-1] * times.diff()[:, None]).cumsum(0)])
+    at = (torch.searchsorted(times, ends, right=True) - 1).clamp_min(0)
+    mean = (passed[at] + (ends - times[at]).clamp_min(0)[:, None] * pieces[at]).diff(dim=0) / ends.diff()[:, None]
+    return torch.where(torch.isclose(mean, middle, rtol=1e-6, atol=1e-9), middle, mean)
+
+
 @dataclass(frozen=True)
 class Motion:
     """Pieces of constant twist from a pose at t = 0.
@@ -157,7 +166,8 @@ class Motion:
         for turn in turns:
             attitudes.append(turn @ attitudes[-1])
         attitudes = torch.stack(attitudes)
-        t = start + dt * torch.arange(first, first + frames * substeps, dtype=torch.float64)
+        ends = start + dt * torch.arange(first, first + frames * substeps + 1, dtype=torch.float64)
+        t = ends[:-1]
         # a substep belongs to the piece that its middle is in
         piece = torch.searchsorted(times, t + 0.5 * dt, right=True) - 1
         resting = (piece < 0)[:, None]
@@ -165,7 +175,7 @@ class Motion:
         since = torch.where(resting, torch.zeros(()), (t - times[piece])[:, None])
         x = knots[piece] + since * linear[piece]
         R = exponential(since * angular[piece]) @ attitudes[piece]
-        return x, R, linear[piece] * ~resting, angular[piece] * ~resting
+        return x, R, *(_mean(times, value, ends, value[piece] * ~resting) for value in (linear, angular))
 
     def _pieces(self, frames: int, substeps: int, dt: float, count: int) -> tuple[Tensor, int]:
         """(start times (K,), K)."""

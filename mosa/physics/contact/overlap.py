@@ -18,13 +18,15 @@ are half a spacing outside."""
 
 
 @torch.no_grad()
-def check_clear(colliders: Sequence[Collider], x: Tensor, where: str, field: str = "world.colliders", spacing: float = 0.0) -> None:
-    """x: (N, 3) [m] of particles where the body starts, at t = 0, and their spacing [m]; where: what starts, for the message.
-    Errors: ConfigError naming the colliders."""
+def check_clear(
+    colliders: Sequence[Collider], x: Tensor, where: str, field: str = "world.colliders", spacing: float = 0.0, poses: tuple = (),
+) -> None:  # fmt: skip
+    """x: (N, 3) [m] of particles where the body starts, and their spacing [m]; where: what starts, for the message; poses: position
+    (K, 3) [m] and rotation (K, 3, 3) of the colliders now, () for theirs at t = 0. Errors: ConfigError naming the colliders."""
     deep, places = [], []
-    for collider in colliders:
+    for k, collider in enumerate(colliders):
         motion = collider.motion.timed(None, 1.0) if isinstance(collider.motion, Motion) else collider.motion
-        position, rotation = (part[0] for part in motion.sample(1, 1, 1e-9)[:2])
+        position, rotation = [part[k].detach() for part in poses] or [part[0] for part in motion.sample(1, 1, 1e-9)[:2]]
         distance = signed_distance(collider.shape, (x.detach().cpu().double() - position) @ rotation)
         deep.append(distance < -0.25 * min(spacing, half_width(collider.shape)))
         places.append(str([round(p, 4) for p in position.tolist()]))
@@ -33,5 +35,5 @@ def check_clear(colliders: Sequence[Collider], x: Tensor, where: str, field: str
         inside = [i for i, each in enumerate(deep) if bool(each.any())]
         named = " and ".join(f"{field}[{i}]" + f" ({colliders[i].name})" * bool(colliders[i].name) for i in inside)
         raise ConfigError(f"{named}: expected a solid that the body is outside of, found {share:.0%} of {where} inside "
-                          f"of {'them' if inside[1:] else 'it'} at t = 0, where its position is "
+                          f"of {'them' if inside[1:] else 'it'} {'now' if poses else 'at t = 0'}, where its position is "
                           f"{' and '.join(places[i] for i in inside)} m")

@@ -6,7 +6,7 @@ cells. Where neither is needed nothing is computed.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -52,6 +52,14 @@ class Axes:
         x, F, C = self.points(state.x), self.gradients(state.F), self.vectors(self.gradients(state.C_affine))
         F_tot = F if state.F_tot is state.F else self.gradients(state.F_tot)
         return ParticleState(x if dtype is None else x.to(dtype), self.vectors(state.v), C, F, F_tot)
+
+
+def entered(state: ParticleState, axes: Axes, dtype: torch.dtype, dx: float) -> ParticleState:
+    """A state of the world in axes that are chosen already, on a grid of dx [m]. Errors: ConfigError where it is too far away."""
+    found, most = axes.state(state), 0.5 * (SPREAD + 1) * PERIOD * dx
+    if (far := float(found.x.detach().abs().max())) > most:
+        raise ConfigError(f"x: expected particles within {most:.3g} m of the place of the reset, found {far:.3g} m: reset there")
+    return replace(found, x=found.x.to(dtype))
 
 
 def turn_along(planes: Sequence[Plane]) -> Tensor | None:

@@ -110,6 +110,8 @@ def gravity_of_worlds(
     gravity = torch.as_tensor(gravity, dtype=torch.float64)
     if tuple(gravity.shape) != (worlds, 3) or not bool(torch.isfinite(gravity).all()):
         raise ConfigError(f"gravity: expected finite numbers of shape ({worlds}, 3), found shape {tuple(gravity.shape)}")
+    if gravity.requires_grad and torch.is_grad_enabled():
+        raise ConfigError("gravity: expected numbers without gradients, found a tensor that requires them: pass its detach()")
     return tuple(map(tuple, gravity.tolist()))
 
 

@@ -6,6 +6,7 @@ Both go through `Prepared.frame`, so that steps give the bits that a rollout giv
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -270,10 +271,11 @@ class Stepper:
         pass the body without being felt."""
         most, K = 0.5 * self.prepared.numerics.dx / dt, len(self.solids)
         worlds = poses[0].shape[1:-1].numel() // K
-        x, v, w = (poses[i].detach().reshape(len(poses[i]), worlds, K, 3) for i in (0, 2, 3))
-        speeds = v.norm(dim=-1) + w.norm(dim=-1) * v.new_tensor([reach(solid.shape) for solid in self.solids])
-        fastest = torch.cat([speeds, x.diff(dim=0).norm(dim=-1) / dt]).flatten(0, 1)
-        if bool((fastest > (1 + 1e-6) * most).any()):
+        x, R, v, w = (part.detach().reshape(len(part), worlds, K, size) for part, size in zip(poses, (3, 9, 3, 3)))
+        far = v.new_tensor([reach(solid.shape) for solid in self.solids])
+        moved = (x.diff(dim=0).norm(dim=-1), far * R.diff(dim=0).norm(dim=-1) / math.sqrt(2))
+        fastest = torch.cat([v.norm(dim=-1) + w.norm(dim=-1) * far, *(part / dt for part in moved)]).flatten(0, 1)
+        if not bool((fastest <= (1 + 1e-6) * most).all()):
             fastest = fastest.amax(0)
             k = int(fastest.argmax())
             raise ConfigError(f"collider {self.solids[k].name or k}: expected a speed of at most {most:.3g} m/s, half a cell per "
