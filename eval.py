@@ -4,7 +4,7 @@ With any of simulate.velocity, simulate.rotation, simulate.position, simulate.he
 learned law out from a new start instead. Where the package is installed, `mosa-eval` is the same command.
 """
 
-from mosa.commands.eval import main
+from mosa.cli.eval import main
 
 if __name__ == "__main__":
     main()

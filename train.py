@@ -3,7 +3,7 @@
 Where the package is installed, `mosa-train` is the same command.
 """
 
-from mosa.commands.train import main
+from mosa.cli.train import main
 
 if __name__ == "__main__":
     main()

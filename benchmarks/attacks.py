@@ -12,10 +12,10 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from mosa.config import build_body
+from mosa.config.build import build_body
 from mosa.errors import MosaError
-from mosa.modules.body import Start
-from mosa.twin import Twin
+from mosa.modules.body.body import Start
+from mosa.twin.twin import Twin
 
 ROOT = Path(__file__).parents[1]
 Attack = tuple[str, Callable[[], object]]

@@ -20,7 +20,7 @@ from attacks_on_data import capture
 from attacks_on_meaning import said
 from PIL import Image
 
-from mosa.data.export import export_transforms
+from mosa.data.formats.export import export_transforms
 from mosa.data.scene import load_scene
 
 

@@ -20,7 +20,7 @@ from attacks_on_data import capture, cube_obj
 from attacks_on_running import SMALL, contents, equal, program
 from PIL import Image
 
-from mosa.data.export import export_transforms
+from mosa.data.formats.export import export_transforms
 from mosa.data.scene import load_scene
 from mosa.physics.contact.mesh import field_of_mesh
 

@@ -15,7 +15,7 @@ import torch
 from attacks import ROOT, Attack, cube, refuse, stored
 
 from mosa.environments.arena import simulator_named
-from mosa.twin import Twin
+from mosa.twin.twin import Twin
 
 LEFT = (0.6e9, 0.7e9, 1.0e9)
 """Bytes of the GPU that are left for a run which needs more: CUDA's own context takes half of a gigabyte, so that it fails with the

@@ -17,9 +17,9 @@ from attacks import WORLD, Attack, cube
 
 from mosa.capture.poses import read_phones, scene_points
 from mosa.capture.world import read_world
-from mosa.data.export import export_transforms
+from mosa.data.formats.export import export_transforms
+from mosa.data.io.gaussian_ply import load_ply
 from mosa.data.scene import load_scene
-from mosa.data.splats import load_ply
 from mosa.physics.contact.mesh import field_of_mesh
 
 

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from attacks import Attack, put, refuse, stored
 
-from mosa.checkpoints import RESUMED, check_resumed, read_checkpoint
-from mosa.npz import read_npz, write_npz
+from mosa.config.checkpoints import RESUMED, check_resumed, read_checkpoint
 from mosa.reconstruction.cache import StageCache
-from mosa.twin import Twin
+from mosa.system.npz import read_npz, write_npz
+from mosa.twin.twin import Twin
 
 
 class Touch:
@@ -47,7 +47,8 @@ def checkpoints(folder: Path) -> Iterator[Attack]:
         torch.save(content, folder / "a.ckpt")
         Twin.load(folder / "a.ckpt").simulate(frames=2)
 
-    bad = {"subprocess.Popen", "os.system", "builtins.eval", "mosa.rollout_file.save_parts", "mosa.modules.body.Body", 5, ("a",)}
+    bad = {"subprocess.Popen", "os.system", "builtins.eval", "mosa.twin.rollout_file.save_parts", "mosa.modules.body.body.Body",
+           5, ("a",)}  # fmt: skip
     changes = [(f"{config}.cfg.adapter", {"_target_": name, "args": ["touch", str(target)]}) for name in bad]
     changes += [(f"{config}.cfg.{key}", "${oc.env:HOME}/x") for key in ("scene.cache", "scene.path", "prior.law", "seed")]
     changes += [(f"{config}.{key}", ...) for key in ("cfg", "world", "density", "dx", "frame_dt", "cfg.prior", "cfg.adapter",

@@ -17,7 +17,7 @@ import torch
 from attacks import Attack, refuse
 from attacks_on_running import SMALL, program
 
-from mosa.data.export import export_particles, export_transforms
+from mosa.data.formats.export import export_particles, export_transforms
 from mosa.data.scene import load_scene
 from mosa.errors import MosaError
 from mosa.types import Scene

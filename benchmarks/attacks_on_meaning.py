@@ -26,21 +26,21 @@ from attacks_on_data import capture
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from mosa.clips import read_run
-from mosa.commands.experiment import arguments, run
-from mosa.config import rehearse
-from mosa.data.export import export_pacnerf, export_particles
+from mosa.cli.experiment import arguments, run
+from mosa.config.build import rehearse
+from mosa.config.idle import idle
+from mosa.config.known import check_known
+from mosa.data.formats.export import export_pacnerf, export_particles
 from mosa.data.scene import load_scene
 from mosa.data.sequences import load_sequences
 from mosa.environments.arena import simulator_named
 from mosa.environments.tasks import TASKS, task_named
-from mosa.guards import check_capture, check_environments, check_evaluation, check_splats
-from mosa.idle import idle
-from mosa.known import check_known
-from mosa.twin import Twin
-from mosa.twin_worlds import TwinWorlds
-from mosa.viewer import options
-from mosa.viewing import open_server
+from mosa.training.preflight import check_capture, check_environments, check_evaluation, check_splats
+from mosa.twin.batch import TwinWorlds
+from mosa.twin.twin import Twin
+from mosa.viewer.clips import read_run
+from mosa.viewer.pages import open_server
+from mosa.viewer.recorded import options
 
 NAN, INF = math.nan, math.inf
 

@@ -20,8 +20,8 @@ from attacks import ROOT, Attack, refuse
 from drawn_runs import RESUMED, leftovers
 from drawn_runs import SMALL as SHORT
 
-from mosa.analysis.figures import ffmpeg
 from mosa.errors import ConfigError
+from mosa.evaluation.analysis.figures import ffmpeg
 
 try:
     ffmpeg("")

@@ -29,24 +29,24 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 import mosa
-from mosa.config import build_body, build_criterion, build_identification, build_stages, build_world
-from mosa.data.builtin import BOX
-from mosa.data.builtin.drop import GRAVITY, simulate
-from mosa.data.builtin.hidden import Hidden
-from mosa.data.builtin.objects import BuiltinObject, object_named
-from mosa.data.builtin.published import PublishedMaterial
-from mosa.data.builtin.shapes import SHAPES
-from mosa.data.builtin.surface import bind, extract_surface, fill
+from mosa.config.build import build_body, build_criterion, build_identification, build_stages, build_world
+from mosa.data.synthetic import BOX
+from mosa.data.synthetic.bodies.objects import BuiltinObject, object_named
+from mosa.data.synthetic.bodies.shapes import SHAPES
+from mosa.data.synthetic.drop import GRAVITY, simulate
+from mosa.data.synthetic.materials.hidden import Hidden
+from mosa.data.synthetic.materials.published import PublishedMaterial
+from mosa.data.synthetic.surface import bind, extract_surface, fill
+from mosa.evaluation.metrics import identification_errors
+from mosa.evaluation.uncertainty import determined
 from mosa.experiments.commits import commit
 from mosa.experiments.specification import SHARED, options_of, read_yaml
-from mosa.metrics import identification_errors
-from mosa.modules.body import Start
-from mosa.modules.identification import Identification
-from mosa.modules.takes import Take
-from mosa.prediction import determined
-from mosa.reconstruction.cues import neighbourhood, neighbourhood_cues
+from mosa.modules.body.body import Start
+from mosa.modules.fitting.identification import Identification
+from mosa.modules.fitting.training_sequences import Take
+from mosa.reconstruction.motion.cues import neighbourhood, neighbourhood_cues
 from mosa.reconstruction.resolution import grid_spacing
-from mosa.run import device_label
+from mosa.training.run_folder import device_label
 
 CONF = Path(__file__).parents[1] / "conf"
 NOISE = 0.004

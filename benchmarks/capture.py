@@ -22,7 +22,7 @@ from omegaconf import OmegaConf
 from mosa.capture.making import capture
 from mosa.capture.resampling import KINDS
 from mosa.capture.world import World
-from mosa.composition import configuration
+from mosa.config.composition import configuration
 
 STEP = 0.02
 """[s] between frames of held-out drops: as the built-in scenes'."""

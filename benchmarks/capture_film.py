@@ -21,14 +21,14 @@ import torch
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from mosa.data.builtin.drop import GRAVITY, simulate
-from mosa.data.builtin.objects import drop_named, object_named
-from mosa.data.builtin.raycast_kernels import cast
-from mosa.data.builtin.renderer import AMBIENT, LIGHT, SAMPLES, window
-from mosa.data.builtin.surface import vertex_normals
-from mosa.data.builtin.takes import built
-from mosa.data.export import export_particles
-from mosa.data.footage import OPENGL_TO_OPENCV
+from mosa.data.formats.export import export_particles
+from mosa.data.formats.footage import OPENGL_TO_OPENCV
+from mosa.data.synthetic.bodies.objects import drop_named, object_named
+from mosa.data.synthetic.drop import GRAVITY, simulate
+from mosa.data.synthetic.films import built
+from mosa.data.synthetic.raycast_kernels import cast
+from mosa.data.synthetic.renderer import AMBIENT, LIGHT, SAMPLES, window
+from mosa.data.synthetic.surface import vertex_normals
 
 FINE = 400.0
 """Frames per second in which the truth is kept: between two of them a body moves on a straight line to 0.4 mm."""

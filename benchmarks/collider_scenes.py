@@ -20,7 +20,7 @@ from mosa.physics.constitutive.elasticity import lame
 from mosa.physics.contact.colliders import Box, Collider, HalfSpace
 from mosa.physics.contact.motion import Motion, exponential
 from mosa.physics.engine.simulator import Simulator
-from mosa.physics.engine.time_step import required_substeps
+from mosa.physics.time.time_step import required_substeps
 from mosa.types import ParticleState, Rollout
 
 DENSITY, G = 1000.0, 9.8

@@ -26,14 +26,21 @@ from pathlib import Path
 import torch
 import yaml
 
-from mosa.analysis.cue_error import USUAL_STRETCH, TrueMotion, cue_errors, motionless, strain_direction_error, true_motion
-from mosa.data.builtin import load_builtin
-from mosa.data.builtin.objects import drop_named
-from mosa.modules.observer import observe
-from mosa.reconstruction.cues import neighbourhood, neighbourhood_cues
+from mosa.data.synthetic import load_builtin
+from mosa.data.synthetic.bodies.objects import drop_named
+from mosa.evaluation.analysis.cue_error import (
+    USUAL_STRETCH,
+    TrueMotion,
+    cue_errors,
+    motionless,
+    strain_direction_error,
+    true_motion,
+)
+from mosa.reconstruction.motion.cues import neighbourhood, neighbourhood_cues
 from mosa.reconstruction.pipeline import reconstruct, spacing_for
 from mosa.reconstruction.settings import ReconstructionSettings, build_settings
 from mosa.rendering.covariance import covariance_from
+from mosa.rendering.observer import observe
 from mosa.types import MotionCues, Reconstruction, Scene
 
 PRESET = Path(__file__).parents[1] / "conf" / "reconstruction" / "fast.yaml"

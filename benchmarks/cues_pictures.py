@@ -18,8 +18,8 @@ from cues import CONDITIONS, reconstructed
 from PIL import Image
 from torch import Tensor
 
-from mosa.analysis.cue_error import rotation_error, true_motion
-from mosa.reconstruction.cues import neighbourhood, polar
+from mosa.evaluation.analysis.cue_error import rotation_error, true_motion
+from mosa.reconstruction.motion.cues import neighbourhood, polar
 from mosa.types import MotionCues, Splats
 
 matplotlib.use("Agg")

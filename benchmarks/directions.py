@@ -8,7 +8,7 @@
 `make` simulates the training drop of a built-in body on its own fine grid. `fit` fills the shape with other and fewer particles,
 carries them along the true motion, adds an error to every frame (`calibration.noisy`), calibrates the isotropic prior on that and
 identifies the directions by the joint stage of a run (`adapter=operator`). With `--plates` a specimen of the true law, of the
-isotropic one and of the learned one is then pressed between two plates, over half a turn (`mosa.analysis.compression`).
+isotropic one and of the learned one is then pressed between two plates, over half a turn (`mosa.evaluation.analysis.compression`).
 `--black-box` learns `adapter=direct` by as many steps of Adam as a run takes, on the same motion. What is left out is the
 reconstruction. With `--own-grid` the motion to learn from is that of the true law on the learner's own particles and grid: what is
 then wrong, the grid has not done. `make` and `fit` with `--drops train test_60` learn from several drops of the body. `draw` makes
@@ -31,23 +31,23 @@ from matplotlib.figure import Figure as Canvas
 from torch import Tensor
 
 import mosa
-from mosa.analysis.anisotropy import directions_in_plane
-from mosa.analysis.compression import Pressed, press
-from mosa.analysis.stiffness import angle_between, stiffest
-from mosa.analysis.tables import markdown
-from mosa.data.builtin.floor import floor_rollout
-from mosa.data.builtin.hidden_material import HiddenMaterial
-from mosa.data.builtin.objects import BuiltinObject, object_named
+from mosa.data.synthetic.bodies.objects import BuiltinObject, object_named
+from mosa.data.synthetic.materials.hidden_material import HiddenMaterial
+from mosa.evaluation.analysis.anisotropy import directions_in_plane
+from mosa.evaluation.analysis.compression import Pressed, press
+from mosa.evaluation.analysis.stiffness import angle_between, stiffest
+from mosa.evaluation.analysis.tables import markdown
+from mosa.evaluation.floor import floor_rollout
+from mosa.evaluation.uncertainty import determined
 from mosa.experiments.analyses import learned_modulus, redistribution, true_modulus
 from mosa.experiments.commits import commit
-from mosa.experiments.drawing import save
+from mosa.experiments.report.drawing import save
 from mosa.experiments.specimens import force_at, pressed_modulus
-from mosa.modules.body import Body, Start
-from mosa.modules.lit_mosa import LitMosa
-from mosa.modules.takes import Take
-from mosa.prediction import determined
-from mosa.reconstruction.cues import neighbourhood, neighbourhood_cues
-from mosa.run import device_label
+from mosa.modules.body.body import Body, Start
+from mosa.modules.fitting.training_sequences import Take
+from mosa.reconstruction.motion.cues import neighbourhood, neighbourhood_cues
+from mosa.training.lit_mosa import LitMosa
+from mosa.training.run_folder import device_label
 
 TWIN = "_twin"
 """At the end of a name: the same body without fibres and with one stiffness everywhere."""

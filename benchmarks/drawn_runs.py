@@ -19,7 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
-from mosa.run import device_label
+from mosa.training.run_folder import device_label
 
 ROOT = Path(__file__).parents[1]
 SMALL = ["debug=default", "evaluation.video=false", "logger=none", "reconstruction.static.iterations=60",

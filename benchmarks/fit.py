@@ -45,7 +45,7 @@ def assembled(overrides: list[str], device: str):
         cfg = compose("train", overrides=overrides)
     lightning.seed_everything(cfg.seed, verbose=False)
     try:
-        from mosa.assembly import assemble
+        from mosa.training.assembly import assemble
     except ModuleNotFoundError:  # a commit to compare with that has no such seam
         module = assembled_from_parts(cfg, device)
     else:
@@ -54,10 +54,10 @@ def assembled(overrides: list[str], device: str):
 
 
 def assembled_from_parts(cfg, device: str):
-    """The module of f7484c1 and later commits without `mosa.assembly`, by their functions."""
-    from mosa import pipeline
-    from mosa.config import plain, run_config
+    """The module of f7484c1 and later commits without `mosa.training.assembly`, by their functions."""
+    from mosa.config.build import plain, run_config
     from mosa.rendering.rasterizer import use_backend
+    from mosa.training import workflow as pipeline
 
     use_backend(cfg.rendering.backend)
     scene, _ = pipeline.scenes(cfg)

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from mosa.errors import MosaError
-from mosa.modules.identification import Identification
+from mosa.modules.fitting.identification import Identification
 
 
 def parser_of(description: str, inputs: str, folder: str, pictures: bool = False) -> argparse.ArgumentParser:

@@ -24,18 +24,18 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from mosa.analysis.stiffness import angle_between, stiffest
-from mosa.assembly import assemble
-from mosa.config import build_body
-from mosa.data.builtin.floor import floor_rollout, hidden_of
-from mosa.evaluation import true_motion
-from mosa.modules.body import Start
-from mosa.modules.gauss_newton import Posterior
-from mosa.modules.lit_mosa import LitMosa
-from mosa.modules.residuals import sampled
-from mosa.modules.takes import Take
-from mosa.prediction import DRAWS, LEAST_DRAWS, among_forms, determined, drawn_motions, rival_motions, total_spread
-from mosa.reconstruction.response import Response
+from mosa.config.build import build_body
+from mosa.evaluation.analysis.stiffness import angle_between, stiffest
+from mosa.evaluation.evaluate import true_motion
+from mosa.evaluation.floor import floor_rollout, hidden_of
+from mosa.evaluation.uncertainty import DRAWS, LEAST_DRAWS, among_forms, determined, drawn_motions, rival_motions, total_spread
+from mosa.modules.body.body import Start
+from mosa.modules.fitting.gauss_newton import Posterior
+from mosa.modules.fitting.residuals import sampled
+from mosa.modules.fitting.training_sequences import Take
+from mosa.reconstruction.motion.response import Response
+from mosa.training.assembly import assemble
+from mosa.training.lit_mosa import LitMosa
 from mosa.types import MotionCues
 
 CONF = Path(__file__).parents[1] / "conf"

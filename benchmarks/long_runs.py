@@ -94,7 +94,7 @@ def checkpoint(folder: Path, particles: int, device: str, gpu: int | None) -> Pa
 
 def rollouts(options: argparse.Namespace, folder: Path) -> list[Row]:
     """In this process: it is the one whose memory is looked at."""
-    from mosa.twin import Twin
+    from mosa.twin.twin import Twin
 
     path = checkpoint(folder, options.particles, options.device, None)
     twin, generator = Twin.load(path, options.device), torch.Generator().manual_seed(options.seed)
@@ -211,7 +211,7 @@ def price(gpu: int | None = None) -> str:
 
 def timed(exact: bool, device: str = "cuda") -> None:
     """Print the seconds of a frame of 64 substeps, by particles, forward and with gradient, as JSON."""
-    from mosa import exact_sums
+    from mosa.physics import exact_sums
     from mosa.physics.contact.planes import Plane
     from mosa.physics.engine.simulator import Simulator
     from mosa.types import ParticleState

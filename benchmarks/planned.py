@@ -22,10 +22,10 @@ import fits
 import identification
 import torch
 
-from mosa.data.builtin.objects import OBJECTS, Drop, object_named
-from mosa.modules.body import Start
-from mosa.plan import drawn_starts, plan
-from mosa.twin import Twin
+from mosa.data.synthetic.bodies.objects import OBJECTS, Drop, object_named
+from mosa.modules.body.body import Start
+from mosa.twin.drop_planning import drawn_starts, plan
+from mosa.twin.twin import Twin
 
 CANDIDATES = 6
 

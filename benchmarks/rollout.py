@@ -44,8 +44,8 @@ import warp as wp
 from omegaconf import OmegaConf
 from substep import body
 
-from mosa.config import build_adapter
-from mosa.modules.body import SimulationSettings
+from mosa.config.build import build_adapter
+from mosa.modules.body.body import SimulationSettings
 from mosa.physics import launching
 from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState

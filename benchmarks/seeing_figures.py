@@ -13,19 +13,19 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 from torch import Tensor
 
-from mosa.analysis.figures import to_uint8
-from mosa.assembly import Run, assemble
-from mosa.data.footage import read_json
+from mosa.data.formats.footage import read_json
+from mosa.data.hull import hull_bounds, visual_hull
 from mosa.data.scene import under
-from mosa.evaluation import image_metrics
-from mosa.modules.observer import Views, observe
-from mosa.reconstruction.filling import body_volume
-from mosa.reconstruction.hull import hull_bounds, visual_hull
+from mosa.evaluation.analysis.figures import to_uint8
+from mosa.evaluation.evaluate import image_metrics
+from mosa.reconstruction.geometry.filling import body_volume
 from mosa.reconstruction.pipeline import object_geometry
+from mosa.reconstruction.pose.starts import appearance_of, first_contact, sequence_start
 from mosa.reconstruction.settings import ReconstructionSettings
-from mosa.reconstruction.starts import appearance_of, first_contact, sequence_start
 from mosa.rendering.cameras import project
 from mosa.rendering.covariance import covariance_from
+from mosa.rendering.observer import Views, observe
+from mosa.training.assembly import Run, assemble
 from mosa.types import Cameras, Reconstruction, Scene
 
 CONF = Path(__file__).parents[1] / "conf"

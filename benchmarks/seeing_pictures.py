@@ -14,9 +14,9 @@ from PIL import Image
 from seeing_figures import HELD, Seen, real_flow
 from torch import Tensor
 
-from mosa.analysis.figures import label, to_uint8
-from mosa.analysis.flow_colors import color_wheel, flow_colors
-from mosa.reconstruction.cues import neighbourhood, polar
+from mosa.evaluation.analysis.figures import label, to_uint8
+from mosa.evaluation.analysis.flow_colors import color_wheel, flow_colors
+from mosa.reconstruction.motion.cues import neighbourhood, polar
 from mosa.rendering.cameras import crop_boxes, crop_images
 
 matplotlib.use("Agg")

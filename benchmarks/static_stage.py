@@ -17,16 +17,16 @@ import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
 
-from mosa.assembly import scenes
-from mosa.config import plain
-from mosa.evaluation import image_metrics
-from mosa.modules.observer import observe
-from mosa.reconstruction.hull import Volume
-from mosa.reconstruction.observed import object_windows
+from mosa.config.build import plain
+from mosa.data.hull import Volume
+from mosa.evaluation.evaluate import image_metrics
+from mosa.reconstruction.gaussians.static import fit_splats, start_splats
+from mosa.reconstruction.motion.observed import object_windows
 from mosa.reconstruction.pipeline import object_geometry
 from mosa.reconstruction.settings import ReconstructionSettings, build_settings
-from mosa.reconstruction.static import fit_splats, start_splats
 from mosa.rendering.covariance import covariance_from
+from mosa.rendering.observer import observe
+from mosa.training.assembly import scenes
 from mosa.types import Scene
 
 CONF = Path(__file__).parents[1] / "conf"

@@ -7,7 +7,7 @@
 A block of corotated material with the default adapter (an anisotropic stiffness) falls on the ground with friction; every world
 has a start, a shear modulus and, in the check, gravity and a moving ball of its own. `--substeps` are those of 0.02 s: 48 are as
 long as the 40 of the README's rabbit in 1/60 s. Rollouts have `--frames` intervals; forward + backward gives gradients with respect
-to every world's velocity and modulus and the adapter's numbers. Steps are those of `mosa.episode`, which `Twin.step` takes: 0.02 s
+to every world's velocity and modulus and the adapter's numbers. Steps are those of `Twin.step`: 0.02 s
 each, with a paddle that an action drives, each step with its own look at the result.
 
 Wall times, best of the repeats after those that compile and capture. On a CPU (default worlds 1 and 8) the many worlds run on as
@@ -26,14 +26,14 @@ from collections.abc import Callable
 import torch
 from substep import body as block
 
-from mosa.episode import Episode
-from mosa.modules.body import Body, SimulationSettings, Start, World
-from mosa.modules.hyperelastic import NUMBERS, HyperelasticAdapter
-from mosa.modules.material import Material
+from mosa.modules.adapters.hyperelastic import NUMBERS, HyperelasticAdapter
+from mosa.modules.body.body import Body, SimulationSettings, Start, World
+from mosa.modules.body.material import Material
 from mosa.physics.contact.colliders import Box, Collider, Sphere
 from mosa.physics.contact.motion import Motion
 from mosa.physics.engine.law_options import LawOptions
 from mosa.physics.engine.simulator import Simulator
+from mosa.twin.episode import Episode
 from mosa.types import Ground, ParticleState
 
 DX, STEP, DENSITY, MU, LAM = 1 / 32, 0.02, 1000.0, 1.2e4, 3e4

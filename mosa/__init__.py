@@ -13,24 +13,24 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from mosa.caches import settle_caches
+from mosa.system.caches import settle_caches
 
 __version__ = "0.2.0"
 settle_caches()
 
 _PLACES = {
-    "compose": "mosa.composition",
-    "SceneDataModule": "mosa.data.datamodule",
-    "LitMosa": "mosa.modules.lit_mosa",
+    "compose": "mosa.config.composition",
+    "SceneDataModule": "mosa.training.datamodule",
+    "LitMosa": "mosa.training.lit_mosa",
     "Twin": "mosa.twin",
 }
 __all__ = ["LitMosa", "SceneDataModule", "Twin", "__version__", "compose"]
 
 if TYPE_CHECKING:
-    from mosa.composition import compose
-    from mosa.data.datamodule import SceneDataModule
-    from mosa.modules.lit_mosa import LitMosa
-    from mosa.twin import Twin
+    from mosa.config.composition import compose
+    from mosa.training.datamodule import SceneDataModule
+    from mosa.training.lit_mosa import LitMosa
+    from mosa.twin.twin import Twin
 
 
 def __getattr__(name: str) -> Any:

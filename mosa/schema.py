@@ -1,6 +1,6 @@
 """Kinds of single values, and settings whose fields have one: `knob` writes default and kind of a field once.
 
-The dataclass checks itself by them, the check of a configuration and of a checkpoint follows from them (`mosa.keys`).
+The dataclass checks itself by them, the check of a configuration and of a checkpoint follows from them (`mosa.config.keys`).
 """
 
 from __future__ import annotations

@@ -131,8 +131,8 @@ class Splats:
 @dataclass(frozen=True)
 class Appearance:
     """Splats whose colours depend on the line of sight and on the light. harmonics: (N, K, 3), K = 1, 4, 9, 16 coefficients of real
-    spherical harmonics in the axes of the rest shape (`mosa.rendering.spherical_harmonics`); `splats.colors` are their means.
-    normals: (N, 3) of the surface at rest and light: (8,) by which the colours change as these turn (`mosa.rendering.lighting`);
+    spherical harmonics in the axes of the rest shape (`spherical_harmonics.py`); `splats.colors` are their means.
+    normals: (N, 3) of the surface at rest and light: (8,) by which the colours change as these turn (`lighting.py`);
     None: they do not."""
 
     splats: Splats
@@ -172,8 +172,8 @@ class MotionCues:
 class Reconstruction:
     """Particles P_0 with their appearance at frame 0 and the motion cues. spacing [m]; volume: (N,) [m^3] initial volume;
     static: Gaussians of the static stage, which carry the images where other sequences of the body are followed; geometry: figures
-    of the body that was filled (`mosa.reconstruction.geometry`); appearance: splats at frame 0 that the particles' motion carries
-    (`mosa.reconstruction.carried`); moving: what its motion was fitted with (`mosa.reconstruction.moved.MovingParts`), for the
+    of the body that was filled (`geometry/body.py`); appearance: splats at frame 0 that the particles' motion carries
+    (`gaussians/carried.py`); moving: what its motion was fitted with (`MovingParts`), for the
     second look at it."""
 
     splats: Splats

@@ -19,7 +19,7 @@ from pathlib import Path
 import torch
 
 ROOT = Path(__file__).parents[1]
-IMPORTED = ("mosa.pipeline", "lightning.pytorch.loggers", "torch.utils.tensorboard", "tensorboard.compat.proto.event_pb2")
+IMPORTED = ("mosa.training.workflow", "lightning.pytorch.loggers", "torch.utils.tensorboard", "tensorboard.compat.proto.event_pb2")
 SERVE = "import sys; sys.path.insert(0, sys.argv.pop(1)); import forked; forked.serve()"
 servers: list[subprocess.Popen] = []
 """Of this process, at most one; it ends with its standard input."""

@@ -8,8 +8,8 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from mosa.config import build_body
-from mosa.modules.body import Start
+from mosa.config.build import build_body
+from mosa.modules.body.body import Start
 
 ROOT = Path(__file__).parents[1]
 N = 27

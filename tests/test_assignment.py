@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from mosa.assignment import SMALL, assigned, potentials
+from mosa.evaluation.assignment import SMALL, assigned, potentials
 
 
 def clouds(count: int, apart: float, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 import mosa
-from mosa.caches import FOLDERS, cache_home, settle_caches
-from mosa.data.builtin.takes import default_cache
-from mosa.refused import disk_message
+from mosa.data.synthetic.films import default_cache
+from mosa.system.caches import FOLDERS, cache_home, settle_caches
+from mosa.system.refused import disk_message
 
 ROOT = Path(mosa.__file__).parents[1]
 ELSEWHERE = ("CUDA_CACHE_PATH", "TRITON_CACHE_DIR", "TORCHINDUCTOR_CACHE_DIR")

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mosa.callbacks import Pace, StageNotes
-from mosa.modules.stages import Stage
+from mosa.modules.fitting.stages import Stage
+from mosa.training.callbacks import Pace, StageNotes
 
 
 class Fit:

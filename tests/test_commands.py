@@ -13,7 +13,9 @@ import pytest
 from omegaconf import OmegaConf
 
 import mosa
-from mosa import composition, console, viewer
+from mosa.config import composition
+from mosa.system import console
+from mosa.viewer import recorded as viewer
 
 ROOT = Path(__file__).parents[1]
 
@@ -41,7 +43,7 @@ def test_a_wheel_holds_the_whole_configuration(built):
 
 def call(built, tmp_path, module, *arguments):
     """The command as an installed script runs it, with nothing of the repository in reach."""
-    start = f"import sys; sys.argv[0] = 'mosa'; from mosa.commands.{module} import main; sys.exit(main())"
+    start = f"import sys; sys.argv[0] = 'mosa'; from mosa.cli.{module} import main; sys.exit(main())"
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"PYTHONPATH": str(built)}
     return subprocess.run([sys.executable, "-c", start, *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True)
 
@@ -73,7 +75,7 @@ def test_a_command_is_the_name_of_its_configuration_and_of_its_runs(built, tmp_p
 def test_the_experiments_are_installed_with_the_paper_s_figures(built, tmp_path):
     result = call(built, tmp_path, "experiment")
     assert result.returncode == 0 and "table_generalisation" in result.stdout, result.stderr[-2000:]
-    assert (built / "mosa" / "experiments" / "printed.yaml").is_file()
+    assert (built / "mosa" / "experiments" / "report" / "printed.yaml").is_file()
     wrong = call(built, tmp_path, "experiment", "nothing", "--dry-run")
     assert wrong.returncode == 2 and "ConfigError: experiment: expected one of" in wrong.stderr
 

@@ -10,23 +10,23 @@ from hydra import compose, initialize_config_dir
 from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 
-from mosa.config import build_adapter, build_stages, rehearse
+from mosa.config.build import build_adapter, build_stages, rehearse
+from mosa.config.extensions import registered_keys
+from mosa.config.keys import EVALUATION, SIMULATION, TRAINING
 from mosa.errors import ConfigError
-from mosa.evaluation_settings import EvaluationSettings
-from mosa.extensions import registered_keys
-from mosa.keys import EVALUATION, SIMULATION, TRAINING
-from mosa.modules.adapters import ADAPTERS, adapter_class
-from mosa.modules.criteria import Criterion
-from mosa.modules.heterogeneity import HeterogeneitySettings
-from mosa.modules.identification_settings import IdentificationSettings
-from mosa.modules.simulation_settings import SimulationSettings
-from mosa.modules.stages import Stage
-from mosa.reconstruction.carried import CarriedSettings
-from mosa.reconstruction.dynamic import DynamicSettings
-from mosa.reconstruction.geometry import GeometrySettings
-from mosa.reconstruction.informed import InformedSettings
+from mosa.evaluation.settings import EvaluationSettings
+from mosa.modules.adapters.registry import ADAPTERS, adapter_class
+from mosa.modules.body.heterogeneity import HeterogeneitySettings
+from mosa.modules.body.simulation_settings import SimulationSettings
+from mosa.modules.fitting.criteria import Criterion
+from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.stages import Stage
+from mosa.reconstruction.gaussians.carried import CarriedSettings
+from mosa.reconstruction.gaussians.static import FitSettings, StaticSettings
+from mosa.reconstruction.geometry.body import GeometrySettings
+from mosa.reconstruction.motion.dynamic import DynamicSettings
+from mosa.reconstruction.motion.informed import InformedSettings
 from mosa.reconstruction.settings import ReconstructionSettings
-from mosa.reconstruction.static import FitSettings, StaticSettings
 from mosa.schema import arguments_of, check
 
 ROOT = Path(__file__).parents[1]
@@ -64,16 +64,16 @@ def test_a_mistyped_option_is_refused(override):
 
 
 @pytest.mark.parametrize("adapter, message", [
-    ({"_target_": "mosa.modules.adapter.StressAdapter", "alpha": 2}, "adapter.alpha"),
-    ({"_target_": "mosa.modules.direct.DirectAdapter", "no_C": True}, "no_C"),
-    ({"_target_": "mosa.modules.adapter.StressAdapter", "alfa": 0.1}, "adapter.alfa: unknown key; expected one of alpha"),
+    ({"_target_": "mosa.modules.adapters.stress.StressAdapter", "alpha": 2}, "adapter.alpha"),
+    ({"_target_": "mosa.baselines.direct.DirectAdapter", "no_C": True}, "no_C"),
+    ({"_target_": "mosa.modules.adapters.stress.StressAdapter", "alfa": 0.1}, "adapter.alfa: unknown key; expected one of alpha"),
     ({"name": "stress", "alfa": 0.1}, "adapter.alfa: unknown key; expected one of alpha"),
     ({"name": "stres"}, "adapter.name: expected hyperelastic, stress, direct, nclaw, neuma, interaction or null, found 'stres'"),
     ({"name": ["stress"]}, "adapter.name: expected hyperelastic, stress, direct, nclaw, neuma, interaction or null"),
     ({"name": "hyperelastic", "strain": "almansi"}, "adapter.strain: expected hencky or biot or green, found 'almansi'"),
     ({"name": "hyperelastic", "alpha": 0.2}, "adapter.alpha: unknown key; expected one of strain"),
-    ({"name": "direct", "_target_": "mosa.modules.adapter.StressAdapter"}, "found both"),
-    ({"_target_": "mosa.modules.adapter.Stress"}, "adapter._target_: expected a known adapter"),
+    ({"name": "direct", "_target_": "mosa.modules.adapters.stress.StressAdapter"}, "found both"),
+    ({"_target_": "mosa.modules.adapters.stress.Stress"}, "adapter._target_: expected a known adapter"),
     ({"_target_": ["subprocess.Popen"]}, "adapter._target_"),
 ])  # fmt: skip
 def test_a_mistake_in_the_adapter_names_its_key(adapter, message):

@@ -8,11 +8,11 @@ import torch
 from hydra import compose, initialize_config_dir
 from test_known import CONF
 
-from mosa import costs
-from mosa.config import plain
+from mosa.config.build import plain
 from mosa.data.scene import load_scene
 from mosa.errors import ConfigError
 from mosa.reconstruction.settings import build_settings
+from mosa.training import costs
 
 TINY = ["debug=default"]
 

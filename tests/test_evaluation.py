@@ -5,11 +5,11 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mosa import evaluation, metrics
-from mosa.data.builtin import floor
 from mosa.errors import SimulationDiverged
-from mosa.evaluation import Sequence, evaluate, floor_figures, motion_metrics
-from mosa.evaluation_settings import EvaluationSettings
+from mosa.evaluation import evaluate as evaluation
+from mosa.evaluation import floor, metrics
+from mosa.evaluation.evaluate import Sequence, evaluate, floor_figures, motion_metrics
+from mosa.evaluation.settings import EvaluationSettings
 from mosa.types import Truth
 
 

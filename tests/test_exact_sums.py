@@ -6,7 +6,7 @@ import pytest
 import torch
 import warp as wp
 
-from mosa import exact_sums
+from mosa.physics import exact_sums
 from mosa.physics.contact.colliders import Collider, Sphere
 from mosa.physics.contact.motion import Motion
 from mosa.physics.contact.planes import Plane

@@ -5,16 +5,18 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mosa import metrics
+from mosa.baselines import direct
+from mosa.baselines.direct import DirectAdapter
+from mosa.config.extensions import load_extensions, registered_keys
 from mosa.data import scene
 from mosa.errors import ConfigError
-from mosa.extensions import load_extensions, registered_keys
-from mosa.metrics import Metric, register_metric
-from mosa.modules import adapters, direct, terms
-from mosa.modules.adapters import register_adapter
-from mosa.modules.direct import DirectAdapter
-from mosa.modules.penalties import PENALTIES, OperatorStatistics
-from mosa.modules.terms import register_term
+from mosa.evaluation import metrics
+from mosa.evaluation.metrics import Metric, register_metric
+from mosa.modules.adapters import registry as adapters
+from mosa.modules.adapters.penalties import PENALTIES, OperatorStatistics
+from mosa.modules.adapters.registry import register_adapter
+from mosa.modules.fitting import terms
+from mosa.modules.fitting.terms import register_term
 
 
 @pytest.mark.parametrize("names", [["no_such_package"], "text", [1]])
@@ -80,7 +82,7 @@ def test_an_adapter_brings_its_penalties(monkeypatch):
         penalties = {**PENALTIES, "cost": lambda found, misfit: found.mean_abs_C + misfit}
 
     monkeypatch.setattr(direct, "Costly", Costly, raising=False)
-    monkeypatch.setattr(adapters, "ADAPTERS", adapters.ADAPTERS | {"costly": "mosa.modules.direct:Costly"})
+    monkeypatch.setattr(adapters, "ADAPTERS", adapters.ADAPTERS | {"costly": "mosa.baselines.direct:Costly"})
     assert "losses.cost" in registered_keys({"adapter": {"name": "costly"}})
     terms.check_terms({"cost": 1.0}, Costly())
     with pytest.raises(ConfigError, match="cost"):

@@ -6,14 +6,14 @@ from types import SimpleNamespace
 import pytest
 from hydra import compose, initialize_config_dir
 
-from mosa.analysis.tables import continued_text
-from mosa.assembly import assemble
-from mosa.composition import configuration
+from mosa.config.composition import configuration
 from mosa.errors import ConfigError
-from mosa.extrapolation import Identified, check_can_extrapolate, continued, extrapolated
-from mosa.modules.material import FORMS
-from mosa.modules.stages import Stage
-from mosa.prediction import INFLATION
+from mosa.evaluation.analysis.tables import continued_text
+from mosa.evaluation.uncertainty import INFLATION
+from mosa.modules.body.material import FORMS
+from mosa.modules.fitting.stages import Stage
+from mosa.training.assembly import assemble
+from mosa.training.extrapolation import Identified, check_can_extrapolate, continued, extrapolated
 
 
 def test_what_is_linear_in_the_spacing_is_continued_to_its_value_at_0():

@@ -15,16 +15,16 @@ from strangers import ROOT, saved
 from test_known import composed
 from test_world import twin
 
-from mosa.config import rehearse
-from mosa.data.export import export_pacnerf, export_spring_gaus, export_transforms
+from mosa.config.build import rehearse
+from mosa.config.extensions import registered_keys
+from mosa.config.keys import EVALUATION, TRAINING
+from mosa.config.known import check_known
+from mosa.data.formats.export import export_pacnerf, export_spring_gaus, export_transforms
 from mosa.data.scene import load_scene
 from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
-from mosa.extensions import registered_keys
-from mosa.keys import EVALUATION, TRAINING
-from mosa.known import check_known
-from mosa.npz import read_npz, write_npz
 from mosa.schema import check
-from mosa.twin import Twin
+from mosa.system.npz import read_npz, write_npz
+from mosa.twin.twin import Twin
 
 DEFAULT = functools.cache(lambda: composed("debug=default", "world.walls={mode: separate}"))
 TWIN = functools.cache(twin)

@@ -15,17 +15,17 @@ from omegaconf import OmegaConf
 from strangers import checkpoint, saved
 from test_known import composed
 
-from mosa.checkpoints import check_resumed, check_same, read_checkpoint
-from mosa.config import rehearse
-from mosa.data.images import check_amount, read_image
-from mosa.data.particles import read_ply
-from mosa.data.splats import load_ply
+from mosa.config.build import rehearse
+from mosa.config.checkpoints import check_resumed, check_same, read_checkpoint
+from mosa.data.formats.particles import read_ply
+from mosa.data.images.reading import check_amount, read_image
+from mosa.data.io.gaussian_ply import load_ply
 from mosa.errors import ConfigError, DataError
-from mosa.guards import check_begin, check_configuration, check_particles, check_seen
-from mosa.limits import machine_memory
 from mosa.physics.contact.mesh import field_of_mesh
 from mosa.reconstruction.cache import StageCache
-from mosa.run import read_figures
+from mosa.system.limits import machine_memory
+from mosa.training.preflight import check_begin, check_configuration, check_particles, check_seen
+from mosa.training.run_folder import read_figures
 from mosa.types import Ground
 
 

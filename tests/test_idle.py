@@ -6,8 +6,8 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from mosa.config import rehearse
-from mosa.idle import idle
+from mosa.config.build import rehearse
+from mosa.config.idle import idle
 
 CONF = Path(__file__).parents[1] / "conf"
 

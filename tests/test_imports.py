@@ -68,7 +68,7 @@ def f():
 
 def test_there_is_no_import_circle():
     graph = imports("mosa")
-    assert "mosa.modules.lit_mosa" in graph["mosa.assembly"] and "mosa.data.pacnerf" in graph["mosa.data.scene"]
+    assert "mosa.training.lit_mosa" in graph["mosa.training.assembly"] and "mosa.data.formats.pacnerf" in graph["mosa.data.scene"]
     assert len(graph) > 150
     assert circles(graph) == []
 
@@ -77,8 +77,8 @@ def test_the_physics_knows_nothing_of_learning():
     everything = imports("mosa.physics.")
     # ply: which files of points are safe to read; schema: kinds of single values; threads, limits: of the machine; exact_sums:
     # of kernels
-    allowed = ("mosa.physics", "mosa.errors", "mosa.types", "mosa.rotations", "mosa.ply", "mosa.schema", "mosa.threads",
-               "mosa.limits", "mosa.exact_sums")
+    allowed = ("mosa.physics", "mosa.errors", "mosa.types", "mosa.system.ply", "mosa.schema", "mosa.system.threads",
+               "mosa.system.limits", "mosa.physics.exact_sums")
     outside = {name: {f for f in found if not f.startswith(allowed)}
                for name, found in everything.items()}
     assert {name: found for name, found in outside.items() if found} == {}

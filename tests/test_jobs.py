@@ -19,10 +19,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
-from mosa import jobs, refused
 from mosa.errors import ConfigError
-from mosa.jobs import LONGEST, Failures, attempt, check_files, check_folders, folder_name, held, quoted
-from mosa.npz import write_npz
+from mosa.system import refused
+from mosa.system.npz import write_npz
+from mosa.training import jobs
+from mosa.training.jobs import LONGEST, Failures, attempt, check_files, check_folders, folder_name, held, quoted
 
 ROOT = Path(__file__).parents[1]
 
@@ -66,7 +67,8 @@ def test_a_mistake_of_the_program_is_not_swallowed(sweep):
 
 def test_a_run_folder_is_one_process_own_until_that_ends(tmp_path):
     """Two runs in one folder mixed their checkpoints and figures without a word."""
-    code = f"import time; from mosa.jobs import held\nwith held({str(tmp_path)!r}): print('held', flush=True); time.sleep(60)"
+    code = (f"import time; from mosa.training.jobs import held\nwith held({str(tmp_path)!r}):\n    print('held', flush=True)\n"
+            "    time.sleep(60)")
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=ROOT) as other:
         assert other.stdout.readline() == "held\n"
         with pytest.raises(ConfigError, match=r"hydra\.run\.dir: another process is at work in"), held(tmp_path):
@@ -80,7 +82,7 @@ def test_a_run_folder_is_one_process_own_until_that_ends(tmp_path):
 
 def test_a_run_that_is_to_go_on_waits_for_the_process_that_is_at_work_in_its_folder(tmp_path, caplog):
     """A worker that outlived its killed sweep made the job of the sweep that was given again fail."""
-    code = (f"import sys; from mosa.jobs import held\nwith held({str(tmp_path)!r}):\n    print('held', flush=True)\n"
+    code = (f"import sys; from mosa.training.jobs import held\nwith held({str(tmp_path)!r}):\n    print('held', flush=True)\n"
             "    sys.stdin.read()\n    print('ended', flush=True)")
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen([sys.executable, "-c", code], **pipes, text=True, cwd=ROOT) as other:
@@ -97,7 +99,7 @@ def test_a_worker_ends_once_its_launcher_is_gone_and_its_job_is_over(tmp_path):
     worker = tmp_path / "worker.py"
     worker.write_text(textwrap.dedent(f"""
         import os, pathlib, threading, time
-        from mosa.jobs import at_work, leave_after
+        from mosa.training.jobs import at_work, leave_after
         here = pathlib.Path({str(tmp_path)!r})
         at_work.set()
         threading.Thread(target=leave_after, args=(os.getppid(), 0.3), daemon=True).start()
@@ -279,7 +281,7 @@ def test_what_hydra_refuses_is_a_mistake_of_the_user_too(arguments):
 
 PROGRAM = """
     import os, signal, sys
-    from mosa.jobs import attempt
+    from mosa.training.jobs import attempt
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell that put pytest into the background had it ignored
     def job(cfg):
         os.kill(os.getpid(), signal.SIG{name})
@@ -313,8 +315,8 @@ def test_a_joblib_sweep_with_failed_jobs_does_not_exit_with_0(tmp_path):
 
 OUTLIVED = """
     import logging, sys
-    from mosa.console import begin_log
-    from mosa.screen import outlived
+    from mosa.system.console import begin_log
+    from mosa.system.screen import outlived
     with outlived():
         logging.basicConfig(stream=sys.stdout, level=logging.INFO)
         begin_log()
@@ -346,7 +348,7 @@ def test_a_working_folder_that_is_gone_is_said(tmp_path):
 
 def test_a_stop_before_the_first_job_is_no_traceback():
     code = textwrap.dedent("""
-        from mosa.jobs import run_command; import os, signal, sys
+        from mosa.training.jobs import run_command; import os, signal, sys
         sys.argv[1:] = []
         signal.signal(signal.SIGINT, signal.default_int_handler)
         run_command(lambda: os.kill(os.getpid(), signal.SIGINT), "conf")
@@ -367,7 +369,7 @@ print("imported", flush=True)
 """)
     program = """
         import signal, sys
-        from mosa.jobs import attempt, held_back
+        from mosa.training.jobs import attempt, held_back
         signal.signal(signal.SIGINT, signal.default_int_handler)
         def job(cfg):
             with held_back():

@@ -11,9 +11,9 @@ import yaml
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from mosa.config.keys import EVALUATION, SIMULATION, TRAINING
+from mosa.config.known import check_known, paths, tree_of
 from mosa.errors import ConfigError
-from mosa.keys import EVALUATION, SIMULATION, TRAINING
-from mosa.known import check_known, paths, tree_of
 
 ROOT = Path(__file__).parents[1]
 CONF = ROOT / "conf"

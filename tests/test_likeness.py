@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from mosa.data.scene import load_scene
-from mosa.guards import warn_of_little
-from mosa.likeness import likeness, warn_of_others
-from mosa.modules.body import Start
-from mosa.modules.carried_splats import seen
+from mosa.evaluation.likeness import likeness, warn_of_others
+from mosa.modules.body.body import Start
+from mosa.rendering.appearance.carried_splats import seen
+from mosa.training.preflight import warn_of_little
 from mosa.types import Ground
 
 

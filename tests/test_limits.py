@@ -7,21 +7,21 @@ import numpy as np
 import pytest
 import torch
 
+from mosa.data.hull import Volume
 from mosa.environments.task import Task
 from mosa.errors import ConfigError, DataError, MosaError, SimulationDiverged
-from mosa.limits import counted
-from mosa.modules.gauss_newton import Posterior
+from mosa.modules.fitting.gauss_newton import Posterior
 from mosa.physics.contact.mesh import field_of_triangles
 from mosa.physics.contact.motion import Motion, sample_poses
-from mosa.physics.engine.adaptive_steps import check_counts
 from mosa.physics.engine.simulator import Simulator
-from mosa.physics.engine.time_step import required_substeps
 from mosa.physics.grid.window import extent, grid_window
-from mosa.reconstruction.filling import fill
-from mosa.reconstruction.hull import Volume
-from mosa.reconstruction.shell import solid_of
+from mosa.physics.time.adaptive_steps import check_counts
+from mosa.physics.time.time_step import required_substeps
+from mosa.reconstruction.geometry.filling import fill
+from mosa.reconstruction.geometry.shell import solid_of
 from mosa.rendering.rasterizer import rasterize
 from mosa.rendering.tile_lists import tile_lists
+from mosa.system.limits import counted
 from mosa.types import Cameras, Splats
 
 TETRAHEDRON = np.eye(4)[:, :3], np.array([[0, 1, 2], [1, 0, 3], [2, 1, 3], [0, 2, 3]])

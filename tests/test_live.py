@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from mosa.config import build_world
+from mosa.config.build import build_world
 from mosa.errors import ConfigError
-from mosa.live import COURANT, FASTEST, GRAY, Live
-from mosa.modules.body import Body, SimulationSettings, Start
-from mosa.modules.material import Material
-from mosa.twin import Twin
+from mosa.modules.body.body import Body, SimulationSettings, Start
+from mosa.modules.body.material import Material
+from mosa.twin.twin import Twin
+from mosa.viewer.live import COURANT, FASTEST, GRAY, Live
 
 SPACING, DX, DT = 0.02, 0.04, 0.01
 START = 0.05
@@ -39,7 +39,7 @@ class Drawn:
     model_error = 1e-3
 
     def draws(self, count: int, generator: torch.Generator) -> torch.Tensor:
-        from mosa.modules.learned_numbers import read_numbers
+        from mosa.modules.fitting.parameters import read_numbers
 
         return read_numbers(twin().body)[None] + 0.5 * torch.linspace(-1, 1, count)[:, None]
 
@@ -181,7 +181,7 @@ def test_the_page_drops_steps_pushes_and_outlives_a_divergence():
     import time
     from urllib.request import urlopen
 
-    from mosa.live_viewer import LiveViewer
+    from mosa.viewer.live_viewer import LiveViewer
 
     live = Live(twin())
     shown = LiveViewer(live, port=0)

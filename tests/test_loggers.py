@@ -10,11 +10,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.compat.proto.summary_pb2 import DATA_CLASS_SCALAR
 
 from mosa import compose
-from mosa.callbacks import enlarged
-from mosa.curves import described, table
 from mosa.errors import ConfigError
-from mosa.fitting import instantiated
-from mosa.loggers import add_picture, log_outcome
+from mosa.training.callbacks import enlarged
+from mosa.training.curves import described, table
+from mosa.training.fitting import instantiated
+from mosa.training.loggers import add_picture, log_outcome
 
 
 def loggers(folder: Path, *overrides: str) -> list:

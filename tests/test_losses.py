@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from mosa import losses
+from mosa.modules.fitting import losses
 
 EYE = torch.eye(3, dtype=torch.float64)
 TOLERANCE = {"eps": 1e-6, "rtol": 1e-6, "atol": 1e-7}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from mosa import metrics
+from mosa.evaluation import metrics
 
 
 def drawn(*shape: int, seed: int = 0) -> torch.Tensor:

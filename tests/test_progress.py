@@ -4,7 +4,7 @@ import io
 
 import pytest
 
-from mosa import progress
+from mosa.system import progress
 
 
 class Terminal(io.StringIO):

@@ -8,11 +8,11 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from mosa import fitting
-from mosa.callbacks import KeepLast
-from mosa.checkpoints import check_same_scene
+from mosa.config.checkpoints import check_same_scene
 from mosa.errors import ConfigError, DataError
-from mosa.run import begins_from, finished, read_figures, write_figures
+from mosa.training import fitting
+from mosa.training.callbacks import KeepLast
+from mosa.training.run_folder import begins_from, finished, read_figures, write_figures
 
 
 def config(resume, ckpt_path=None):

@@ -9,7 +9,7 @@ from test_world import PLATE, twin
 
 from mosa.physics.contact.colliders import Collider, Sphere, colliders_from_config
 from mosa.physics.contact.motion import Motion
-from mosa.rollout_file import poses, save_rollout
+from mosa.twin.rollout_file import poses, save_rollout
 
 
 def test_forces_velocities_and_poses_are_in_the_file(tmp_path):

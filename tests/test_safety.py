@@ -11,13 +11,13 @@ import yaml
 from omegaconf import OmegaConf
 from strangers import checkpoint
 
-from mosa.checkpoints import read_checkpoint
-from mosa.data.transforms import read_transforms
+from mosa.config.checkpoints import read_checkpoint
+from mosa.config.known import tree_of
+from mosa.data.formats.transforms import read_transforms
 from mosa.errors import DataError
-from mosa.guards import evaluated_scene
-from mosa.known import tree_of
-from mosa.npz import read_npz, write_npz
-from mosa.twin import Twin
+from mosa.system.npz import read_npz, write_npz
+from mosa.training.preflight import evaluated_scene
+from mosa.twin.twin import Twin
 
 
 def set_adapter(value):
@@ -34,13 +34,13 @@ def test_the_checkpoint_of_these_tests_is_a_good_one(tmp_path):
 
 
 def test_the_adapter_of_an_older_checkpoint_is_still_known(tmp_path):
-    older = {"_target_": "mosa.modules.direct.DirectAdapter", "hidden": 8}
+    older = {"_target_": "mosa.baselines.direct.DirectAdapter", "hidden": 8}
     stored = checkpoint(tmp_path / "a.ckpt", "adapter=direct", "adapter.hidden=8", change=set_adapter(older))
     assert type(Twin.load(stored).body.adapter).__name__ == "DirectAdapter"
 
 
 @pytest.mark.parametrize("target", ["subprocess.Popen", "subprocess.run", "os.system", "builtins.exec",
-                                    "mosa.twin.Twin.load", "mosa.modules.body.Body", "strangers.checkpoint"])
+                                    "mosa.twin.Twin.load", "mosa.modules.body.body.Body", "strangers.checkpoint"])
 def test_what_a_checkpoint_names_is_not_called(tmp_path, target):
     touched = tmp_path / "touched"
     malicious = {"_target_": target, "args": ["touch", str(touched)], "command": f"touch {touched}"}

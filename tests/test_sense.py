@@ -10,15 +10,15 @@ import torch
 from strangers import checkpoint
 from test_world import twin
 
-from mosa.commands.experiment import arguments, run
+from mosa.cli.experiment import arguments, run
 from mosa.environments.arena import simulator_named
 from mosa.environments.tasks import TASKS, task_named
 from mosa.errors import ConfigError, DataError, MosaError
-from mosa.limits import named_device
-from mosa.refused import memory_message
-from mosa.twin import Twin
-from mosa.viewer import options
-from mosa.viewing import open_server
+from mosa.system.limits import named_device
+from mosa.system.refused import memory_message
+from mosa.twin.twin import Twin
+from mosa.viewer.pages import open_server
+from mosa.viewer.recorded import options
 
 
 @pytest.mark.parametrize("section, key, value, message", [

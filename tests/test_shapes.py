@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from mosa.losses import cofactors, polar_rotation, stretches
+from mosa.modules.fitting.losses import cofactors, polar_rotation, stretches
+from mosa.physics.rotations import axial, skew
 from mosa.rendering import covariance
-from mosa.rotations import axial, skew
 
 jaxtyping = pytest.importorskip("jaxtyping")
 beartype = pytest.importorskip("beartype").beartype

@@ -8,11 +8,11 @@ import torch
 from test_world import PLATE, twin
 
 from mosa.errors import ConfigError
-from mosa.modules.carried_splats import Seen
 from mosa.physics.contact.colliders import Box, Capsule, Cylinder, Sphere, colliders_from_config
+from mosa.rendering.appearance.carried_splats import Seen
+from mosa.rendering.appearance.spherical_harmonics import constant_coefficients
 from mosa.rendering.cameras import look_at
-from mosa.rendering.spherical_harmonics import constant_coefficients
-from mosa.shown_solids import SOLID, surface, with_solids
+from mosa.twin.shown_solids import SOLID, surface, with_solids
 from mosa.types import Cameras
 
 UP = torch.tensor([0.0, 1.0, 0.0])

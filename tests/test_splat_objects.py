@@ -14,15 +14,15 @@ from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 from strangers import ROOT, checkpoint
 
-from mosa.clips import read_run
-from mosa.data.splats import save_ply
+from mosa.data.io.gaussian_ply import save_ply
 from mosa.errors import ConfigError, DataError
-from mosa.guards import check_splats
-from mosa.reconstruction.filling import body_volume
-from mosa.reconstruction.shell import blocked, solid_of
+from mosa.reconstruction.geometry.filling import body_volume
+from mosa.reconstruction.geometry.shell import blocked, solid_of
 from mosa.splats.objects import object_twin, read_object, save_twin
-from mosa.twin import Twin
+from mosa.training.preflight import check_splats
+from mosa.twin.twin import Twin
 from mosa.types import Appearance, Splats
+from mosa.viewer.clips import read_run
 
 RADIUS = 0.1
 BALL = 4 / 3 * math.pi * RADIUS**3

@@ -3,7 +3,7 @@ import torch
 
 from mosa.data.batches import Epochs, ViewSchedule
 from mosa.errors import ConfigError
-from mosa.modules.stages import Stage
+from mosa.modules.fitting.stages import Stage
 
 
 def test_prior_stage_brings_frames_in_progressively_and_reaches_all():

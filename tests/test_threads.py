@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from mosa.threads import settle_threads, threaded
+from mosa.system.threads import settle_threads, threaded
 
 
 def test_results_keep_the_order_of_the_items(monkeypatch):

@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 import torch
 
-from mosa import viewer
-from mosa.clips import GRAY, Scale, covariances, read_run
-from mosa.config import build_world
+from mosa.config.build import build_world
 from mosa.errors import ConfigError, DataError
-from mosa.modules.body import Body, SimulationSettings, Start
-from mosa.modules.carried_splats import CarriedSplats
-from mosa.modules.heterogeneity import HeterogeneityField, HeterogeneitySettings
-from mosa.modules.material import Material
+from mosa.modules.body.body import Body, SimulationSettings, Start
+from mosa.modules.body.heterogeneity import HeterogeneityField, HeterogeneitySettings
+from mosa.modules.body.material import Material
 from mosa.physics.contact.colliders import domain_walls
-from mosa.rollout_file import save_observed, save_rollout
-from mosa.twin import Twin
+from mosa.rendering.appearance.carried_splats import CarriedSplats
+from mosa.twin.rollout_file import save_observed, save_rollout
+from mosa.twin.twin import Twin
 from mosa.types import Appearance, MotionCues, Rollout, Splats
-from mosa.viewing import FIELD_OF_VIEW, beside_panel, own_page, view_of
+from mosa.viewer import recorded as viewer
+from mosa.viewer.clips import GRAY, Scale, covariances, read_run
+from mosa.viewer.pages import FIELD_OF_VIEW, beside_panel, own_page, view_of
 
 N, T, SEEN = 27, 5, 3
 GROUND = -0.2

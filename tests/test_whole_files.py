@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import mosa.twin
-from mosa.twin import write_frames
-from mosa.whole_files import written_whole
+from mosa.system.whole_files import written_whole
+from mosa.twin.twin import write_frames
 
 
 def test_a_file_appears_whole_or_not_at_all(tmp_path):
@@ -29,7 +29,7 @@ def test_a_file_appears_whole_or_not_at_all(tmp_path):
 def test_what_a_killed_process_left_is_removed_by_the_next(tmp_path):
     path = tmp_path / "a[1].npz"
     code = f"""
-from mosa.whole_files import written_whole
+from mosa.system.whole_files import written_whole
 import os, signal
 with written_whole({str(path)!r}) as partial:
     partial.write_text("half")

@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mosa.config import build_world
+from mosa.config.build import build_world
 from mosa.errors import ConfigError
-from mosa.modules.body import Body, SimulationSettings, Start
-from mosa.modules.material import Material
-from mosa.twin import Twin
+from mosa.modules.body.body import Body, SimulationSettings, Start
+from mosa.modules.body.material import Material
+from mosa.twin.twin import Twin
 
 WORLD = {"ground": {"height": 0.0, "mode": "separate", "friction": 0.2}, "gravity": [0, -9.8, 0], "up": [0, 1, 0],
          "box": [[-0.5, -0.5, -0.5], [0.5, 1.0, 0.5]]}  # fmt: skip

@@ -1,4 +1,4 @@
-from mosa.commands.capture import main
+from mosa.cli.capture import main
 
 if __name__ == "__main__":
     main()

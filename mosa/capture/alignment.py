@@ -9,7 +9,7 @@ from mosa.capture.phones import Phone, nearest_point
 from mosa.errors import DataError
 
 MISS = 0.15
-"""Radii of the object by which lines of sight of one moment may pass each other (`mosa.data.agreement.AGREEMENT`: right
+"""Radii of the object by which lines of sight of one moment may pass each other (`mosa.data.checks.cameras.AGREEMENT`: right
 calibrations have up to 0.15)."""
 MOVING = 0.15
 """Share of a track's fastest motion from which on a frame counts: of an object at rest every offset fits."""

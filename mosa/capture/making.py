@@ -36,11 +36,11 @@ from mosa.capture.world import (
     write_images,
     write_transforms,
 )  # fmt: skip
-from mosa.config import plain
+from mosa.config.build import plain
 from mosa.errors import ConfigError, DataError
-from mosa.guards import check_capture
-from mosa.progress import tqdm
-from mosa.whole_files import write_whole
+from mosa.system.progress import tqdm
+from mosa.system.whole_files import write_whole
+from mosa.training.preflight import check_capture
 
 log = logging.getLogger(__name__)
 

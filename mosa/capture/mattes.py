@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 
 from mosa.capture.videos import Clip, find_videos, frames_of, open_clip, plate_of
-from mosa.data.agreement import HOLE
-from mosa.data.images import fill_holes
-from mosa.data.matting import SPECK, matte_from_plate
+from mosa.data.checks.cameras import HOLE
+from mosa.data.images.matting import SPECK, matte_from_plate
+from mosa.data.images.reading import fill_holes
 from mosa.errors import ConfigError, DataError
 
 REMBG = "isnet-general-use"

@@ -14,7 +14,7 @@ import numpy as np
 from mosa.capture.fall import Fall, Knowledge, row_share
 from mosa.capture.mattes import Track
 from mosa.capture.phones import Phone
-from mosa.limits import counted
+from mosa.system.limits import counted
 
 PITCH = 1 / 18
 """Of the hull's grid, in radii of the object."""

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mosa.data.lens import lens_of
+from mosa.data.images.lens import lens_of
 from mosa.errors import DataError
 
 FOCAL, BESIDE = (0.05, 1000.0), 1.0
@@ -23,7 +23,7 @@ HALF = 0.5
 @dataclass(frozen=True)
 class Camera:
     """K: (3, 3) [px, pixel centres at half integers]; w2c: (4, 4), OpenCV axes, length unit of the poses; size: (width, height)
-    [px]; coefficients: k1 to k4, p1, p2 of the lens (`mosa.data.lens`); where: file and entry, for messages."""
+    [px]; coefficients: k1 to k4, p1, p2 of the lens (`mosa.data.images.lens`); where: file and entry, for messages."""
 
     K: np.ndarray
     w2c: np.ndarray

@@ -11,8 +11,8 @@ import numpy as np
 
 from mosa.capture.colmap import is_model, read_model, read_points
 from mosa.capture.phones import Camera, Phone, plausible
-from mosa.data.footage import matrix, number, read_json, world_to_camera
-from mosa.data.lens import COEFFICIENTS, is_fisheye
+from mosa.data.formats.footage import matrix, number, read_json, world_to_camera
+from mosa.data.images.lens import COEFFICIENTS, is_fisheye
 from mosa.errors import DataError
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")

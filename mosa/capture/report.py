@@ -16,7 +16,7 @@ from mosa.capture.fall import Fall
 from mosa.capture.phones import Phone
 from mosa.capture.resampling import Exposure
 from mosa.capture.world import World
-from mosa.whole_files import write_whole
+from mosa.system.whole_files import write_whole
 
 TILE = 180
 """[px] height of a picture on the contact sheet."""

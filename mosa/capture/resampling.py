@@ -17,10 +17,10 @@ from scipy.interpolate import BSpline
 from mosa.capture.fall import Fall, Knowledge, row_share
 from mosa.capture.mattes import Matting, Track, matted_frames
 from mosa.capture.phones import Phone
-from mosa.data.agreement import HOLE
-from mosa.data.images import fill_holes
+from mosa.data.checks.cameras import HOLE
+from mosa.data.images.reading import fill_holes
 from mosa.errors import DataError
-from mosa.limits import counted
+from mosa.system.limits import counted
 
 KINDS = ("flow", "shift", "none")
 NEAR = 0.02

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from mosa.capture.poses import VIDEOS
-from mosa.data.images import read_image
+from mosa.data.images.reading import read_image
 from mosa.errors import ConfigError, DataError
 
 

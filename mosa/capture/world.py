@@ -13,11 +13,11 @@ import torch
 
 from mosa.capture.fall import Fall
 from mosa.capture.phones import Camera, Phone
-from mosa.data.footage import OPENGL_TO_OPENCV, Footage, matrix, number, read_json
-from mosa.data.transforms import read_transforms
+from mosa.data.formats.footage import OPENGL_TO_OPENCV, Footage, matrix, number, read_json
+from mosa.data.formats.transforms import read_transforms
+from mosa.data.hull import occupancy
 from mosa.errors import DataError
-from mosa.reconstruction.hull import occupancy
-from mosa.whole_files import write_whole
+from mosa.system.whole_files import write_whole
 
 FILE = "capture.json"
 REACH, PITCH = 2.2, 1 / 20

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mosa.modules.observer import observe
 from mosa.rendering.cameras import crop_boxes, crop_cameras, crop_images
+from mosa.rendering.observer import observe
 from mosa.types import Cameras, Reconstruction, Scene
 
 

@@ -8,17 +8,17 @@ import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from mosa.data.scene_from_footage import check_fps, scene_from_footage
-from mosa.data.validation import validate
+from mosa.data.checks.validation import validate
+from mosa.data.formats.scene_from_footage import check_fps, scene_from_footage
 from mosa.errors import ConfigError
 from mosa.schema import is_number
 from mosa.types import AUTO, GROUND_MODES, RUBBING, Ground, Scene
 
 FORMATS = {
-    "pacnerf": "mosa.data.pacnerf:load_pacnerf",
-    "spring_gaus": "mosa.data.spring_gaus:load_spring_gaus",
-    "transforms": "mosa.data.transforms:load_transforms",
-    "builtin": "mosa.data.builtin:load_builtin",
+    "pacnerf": "mosa.data.formats.pacnerf:load_pacnerf",
+    "spring_gaus": "mosa.data.formats.spring_gaus:load_spring_gaus",
+    "transforms": "mosa.data.formats.transforms:load_transforms",
+    "builtin": "mosa.data.synthetic:load_builtin",
 }
 """Format -> module:function. A new format is one function (path=..., the keys it needs) -> Scene and one line here, or a call of
 `register_format` from another package."""
@@ -84,7 +84,7 @@ def held_out_sequences(**keys) -> list[Scene]:
     user (`mosa.data.sequences`)."""
     if keys.get("format") != "builtin" or keys.get("sequence", "train") != "train":
         return []
-    from mosa.data.builtin import held_out_names
+    from mosa.data.synthetic import held_out_names
 
     return [
         load_scene(**{**keys, "sequence": s, "holdout_frames": None, "last_free_frame": None})

@@ -1,4 +1,4 @@
-from mosa.commands.environments import main
+from mosa.cli.environments import main
 
 if __name__ == "__main__":
     main()

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from mosa.environments.task import LAST, Task, Trials, View
 from mosa.environments.truth import true_twin
-from mosa.episode import TwinState
 from mosa.errors import ConfigError, DataError, SimulationDiverged
-from mosa.twin import Twin
+from mosa.twin.episode import TwinState
+from mosa.twin.twin import Twin
 
 SIMULATORS = ("learned", "isotropic", "truth")
 """The law that a run learned; the calibrated isotropic prior of the same run; the hidden truth of its built-in scene."""

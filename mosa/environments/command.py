@@ -11,14 +11,14 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mosa.config import known_keys, plain
+from mosa.config.build import known_keys, plain
 from mosa.environments.arena import SIMULATORS
 from mosa.environments.policies import METHODS, Search
 from mosa.environments.study import UNTRAINED, Bench, Setting, make_jobs, one, put_into, table
 from mosa.environments.tasks import TASKS
 from mosa.errors import ConfigError
-from mosa.guards import check_environments
-from mosa.limits import named_device
+from mosa.system.limits import named_device
+from mosa.training.preflight import check_environments
 
 log = logging.getLogger(__name__)
 

@@ -11,14 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mosa.analysis.figures import label, to_uint8, write_strip, write_video
 from mosa.environments.arena import Arena
-from mosa.modules.carried_splats import Seen, seen
+from mosa.evaluation.analysis.figures import label, to_uint8, write_strip, write_video
 from mosa.physics.contact.colliders import Collider, colliders_from_config
+from mosa.rendering.appearance.carried_splats import Seen, seen
+from mosa.rendering.appearance.spherical_harmonics import constant_coefficients
 from mosa.rendering.cameras import look_at
-from mosa.rendering.spherical_harmonics import constant_coefficients
-from mosa.rollout_file import pose
-from mosa.shown_solids import OPACITY, WIDTH, lattice, shaded, surface
+from mosa.twin.rollout_file import pose
+from mosa.twin.shown_solids import OPACITY, WIDTH, lattice, shaded, surface
 from mosa.types import Cameras
 
 PITCH = 0.011

@@ -17,15 +17,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mosa.analysis.tables import markdown
-from mosa.costs import duration
 from mosa.environments.arena import Arena, Simulator, play, play_all, scene_of, simulator_named, truth_of
 from mosa.environments.pictures import film, write_films
 from mosa.environments.policies import Found, LinearPolicy, Search, by_evolution, by_gradient, by_model, by_reinforcement
 from mosa.environments.task import Task
 from mosa.environments.tasks import task_named
 from mosa.errors import ConfigError, DataError
-from mosa.whole_files import write_whole, written_whole
+from mosa.evaluation.analysis.tables import markdown
+from mosa.system.whole_files import write_whole, written_whole
+from mosa.training.costs import duration
 
 log = logging.getLogger(__name__)
 

@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.limits import counted
-from mosa.modules.start import World
+from mosa.physics.world import World
 from mosa.schema import Kind, is_number, number, whole
+from mosa.system.limits import counted
 from mosa.types import Ground
 
 ROOM = 5.0

@@ -6,21 +6,21 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mosa.data.builtin import BOX
-from mosa.data.builtin.drop import CONTACT_CELLS, COURANT, GRAVITY, place
-from mosa.data.builtin.hidden import Hidden
-from mosa.data.builtin.objects import drop_named, object_named
-from mosa.data.builtin.published import PublishedMaterial
-from mosa.data.builtin.shapes import SHAPES
-from mosa.data.builtin.takes import built
+from mosa.data.synthetic import BOX
+from mosa.data.synthetic.bodies.objects import drop_named, object_named
+from mosa.data.synthetic.bodies.shapes import SHAPES
+from mosa.data.synthetic.drop import CONTACT_CELLS, COURANT, GRAVITY, place
+from mosa.data.synthetic.films import built
+from mosa.data.synthetic.materials.hidden import Hidden
+from mosa.data.synthetic.materials.published import PublishedMaterial
 from mosa.errors import ConfigError
-from mosa.limits import named_device
-from mosa.modules.body import Body
-from mosa.modules.model import Model
-from mosa.modules.simulation_settings import SimulationSettings
-from mosa.modules.start import Start, World
+from mosa.modules.body.body import Body
+from mosa.modules.body.model import Model
+from mosa.modules.body.simulation_settings import SimulationSettings
+from mosa.physics.world import Start, World
 from mosa.schema import number, whole
-from mosa.twin import Twin
+from mosa.system.limits import named_device
+from mosa.twin.twin import Twin
 from mosa.types import Ground
 
 MAX_SUBSTEPS = 5000

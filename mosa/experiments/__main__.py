@@ -1,4 +1,4 @@
-from mosa.commands.experiment import main
+from mosa.cli.experiment import main
 
 if __name__ == "__main__":
     main()

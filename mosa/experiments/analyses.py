@@ -13,18 +13,18 @@ import torch
 from matplotlib.figure import Figure as Canvas
 from torch import Tensor
 
-from mosa.analysis.anisotropy import directional_modulus, directions_in_plane, redistribution_response, stress_jacobian
-from mosa.analysis.stiffness import angle_between, directional_moduli
-from mosa.analysis.tables import markdown
-from mosa.data.builtin.objects import OBJECTS
+from mosa.data.synthetic.bodies.objects import OBJECTS
+from mosa.evaluation.analysis.anisotropy import directional_modulus, directions_in_plane, redistribution_response, stress_jacobian
+from mosa.evaluation.analysis.stiffness import angle_between, directional_moduli
+from mosa.evaluation.analysis.tables import markdown
 from mosa.experiments.collecting import Record
-from mosa.experiments.drawing import WIDTH, legend, logarithmic, save, say_cut, style_of, wide
 from mosa.experiments.parameters import parameters
+from mosa.experiments.report.drawing import WIDTH, legend, logarithmic, save, say_cut, style_of, wide
 from mosa.experiments.run_folders import label, loaded, prefix, write_table
 from mosa.experiments.specification import Experiment
 from mosa.experiments.specimens import compression
-from mosa.modules.body import Body
-from mosa.modules.material import material_states
+from mosa.modules.body.body import Body
+from mosa.modules.body.material import material_states
 
 log = logging.getLogger(__name__)
 

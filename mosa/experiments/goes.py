@@ -10,7 +10,7 @@ from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 
 from mosa.errors import DataError
-from mosa.whole_files import write_whole
+from mosa.system.whole_files import write_whole
 
 GOES = "goes.csv"
 """File in the folder of the runs: a row for each time that jobs were run there."""

@@ -7,12 +7,12 @@ import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
-from mosa.analysis.tables import markdown
-from mosa.data.builtin.objects import OBJECTS
+from mosa.data.synthetic.bodies.objects import OBJECTS
+from mosa.evaluation.analysis.tables import markdown
 from mosa.experiments.collecting import Record
 from mosa.experiments.run_folders import write_table
 from mosa.experiments.specification import Experiment
-from mosa.modules.material import RELATIVE, unit_of
+from mosa.modules.body.material import RELATIVE, unit_of
 
 
 def setting(overrides: Sequence[str], key: str) -> str | None:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from mosa.experiments.collecting import Record
 from mosa.experiments.specification import PRESSED, Experiment
-from mosa.twin import Twin
-from mosa.whole_files import written_whole
+from mosa.system.whole_files import written_whole
+from mosa.twin.twin import Twin
 
 
 def label(experiment: Experiment, record: Record) -> str:

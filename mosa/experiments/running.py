@@ -11,10 +11,10 @@ from pathlib import Path
 from mosa.experiments.commits import commit
 from mosa.experiments.processes import begun
 from mosa.experiments.specification import COMMIT, FAILED, MINUTES, PRESSED, Job, in_turn
-from mosa.jobs import held_back
-from mosa.whole_files import write_whole
+from mosa.system.whole_files import write_whole
+from mosa.training.jobs import held_back
 
-PROGRAM = "mosa.commands.train:main"
+PROGRAM = "mosa.cli.train:main"
 WAIT = 0.2
 """Seconds between looks at the running jobs."""
 

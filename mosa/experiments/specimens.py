@@ -1,4 +1,4 @@
-"""Specimens of learned laws between two plates (`mosa.analysis.compression`): E(theta) and the force, against the true law.
+"""Specimens of learned laws between two plates (`analysis/compression.py`): E(theta) and the force, against the true law.
 
 What was measured of a run stays in its folder (`pressed.json`): tables and pictures are made again without its checkpoint."""
 
@@ -15,19 +15,19 @@ import torch
 from matplotlib.figure import Figure as Canvas
 from torch import Tensor
 
-from mosa.analysis.anisotropy import directions_in_plane
-from mosa.analysis.compression import Pressed, press
-from mosa.analysis.tables import markdown
-from mosa.analysis.vibration import longitudinal_modulus
-from mosa.data.builtin.objects import OBJECTS
+from mosa.data.synthetic.bodies.objects import OBJECTS
 from mosa.errors import DataError, SimulationDiverged
+from mosa.evaluation.analysis.anisotropy import directions_in_plane
+from mosa.evaluation.analysis.compression import Pressed, press
+from mosa.evaluation.analysis.tables import markdown
+from mosa.evaluation.analysis.vibration import longitudinal_modulus
 from mosa.experiments.collecting import Record
-from mosa.experiments.drawing import WIDTH, legend, save, style_of
+from mosa.experiments.report.drawing import WIDTH, legend, save, style_of
 from mosa.experiments.run_folders import checkpoint, first_seeds, label, prefix, pressed_file, write_table
 from mosa.experiments.specification import Experiment
-from mosa.modules.body import Body
-from mosa.twin import Twin
-from mosa.whole_files import write_whole
+from mosa.modules.body.body import Body
+from mosa.system.whole_files import write_whole
+from mosa.twin.twin import Twin
 
 log = logging.getLogger(__name__)
 

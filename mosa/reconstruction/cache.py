@@ -17,10 +17,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mosa.reconstruction.observed import Windows
-from mosa.rendering.lighting import LIGHT
-from mosa.rendering.spherical_harmonics import degree_of
-from mosa.whole_files import written_whole
+from mosa.reconstruction.motion.observed import Windows
+from mosa.rendering.appearance.lighting import LIGHT
+from mosa.rendering.appearance.spherical_harmonics import degree_of
+from mosa.system.whole_files import written_whole
 
 log = logging.getLogger(__name__)
 SPLATS = {"means": (3,), "scales": (3,), "rotations": (4,), "opacities": (), "colors": (3,)}

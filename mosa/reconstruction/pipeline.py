@@ -14,26 +14,26 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mosa.data.outlines import left_open, whole_views
-from mosa.data.splats import load_ply
+from mosa.data.checks.silhouettes import left_open, whole_views
+from mosa.data.hull import Volume, hull_bounds, occupancy, visual_hull
+from mosa.data.io.gaussian_ply import load_ply
 from mosa.errors import ConfigError, DataError
-from mosa.progress import tqdm
 from mosa.reconstruction.cache import StageCache
-from mosa.reconstruction.carried import fit_carried
-from mosa.reconstruction.filling import Particles, body_volume, fill
-from mosa.reconstruction.geometry import Geometry, find_geometry
-from mosa.reconstruction.hull import Volume, hull_bounds, occupancy, visual_hull
-from mosa.reconstruction.initial import inherited_colors
-from mosa.reconstruction.moved import MovingParts, cues_of, first_motion
-from mosa.reconstruction.observed import Windows, object_windows
-from mosa.reconstruction.registration import light_of
+from mosa.reconstruction.gaussians.carried import fit_carried
+from mosa.reconstruction.gaussians.initial import inherited_colors
+from mosa.reconstruction.gaussians.static import fit_splats, start_splats
+from mosa.reconstruction.geometry.body import Geometry, find_geometry
+from mosa.reconstruction.geometry.filling import Particles, body_volume, fill
+from mosa.reconstruction.motion.moved import MovingParts, cues_of, first_motion
+from mosa.reconstruction.motion.observed import Windows, object_windows
+from mosa.reconstruction.pose.registration import light_of
 from mosa.reconstruction.resolution import PER_CELL, particles_for
 from mosa.reconstruction.settings import ReconstructionSettings
-from mosa.reconstruction.static import fit_splats, start_splats
+from mosa.rendering.appearance.lighting import shading, surface_normals
+from mosa.rendering.appearance.spherical_harmonics import constant_coefficients
 from mosa.rendering.covariance import covariance_from, matrix_to_quaternion, quaternion_multiply
-from mosa.rendering.lighting import shading, surface_normals
 from mosa.rendering.rasterizer import rasterize
-from mosa.rendering.spherical_harmonics import constant_coefficients
+from mosa.system.progress import tqdm
 from mosa.types import Appearance, Reconstruction, Scene, Splats
 
 CACHE_VERSION = 3

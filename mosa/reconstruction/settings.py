@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from mosa.errors import ConfigError
-from mosa.reconstruction.carried import CarriedSettings
-from mosa.reconstruction.dynamic import DynamicSettings
-from mosa.reconstruction.geometry import GeometrySettings
-from mosa.reconstruction.informed import InformedSettings
-from mosa.reconstruction.static import FitSettings, StaticSettings
+from mosa.reconstruction.gaussians.carried import CarriedSettings
+from mosa.reconstruction.gaussians.static import FitSettings, StaticSettings
+from mosa.reconstruction.geometry.body import GeometrySettings
+from mosa.reconstruction.motion.dynamic import DynamicSettings
+from mosa.reconstruction.motion.informed import InformedSettings
 from mosa.schema import TEXT, check_knobs, knob, known_keys, one_of, or_null, whole
 
 

@@ -8,7 +8,7 @@ import functools
 
 import warp as wp
 
-from mosa.exact_sums import COLUMNS, HIGH, LARGEST, LOW
+from mosa.physics.exact_sums import COLUMNS, HIGH, LARGEST, LOW
 from mosa.rendering.records import record_type
 
 

@@ -17,10 +17,10 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError, DataError
-from mosa.limits import counted
 from mosa.rendering import gsplat_backend
 from mosa.rendering.records import SIDE_MAX
 from mosa.rendering.splatting import PRESETS, SCALARS, Geometry, Splat, start_warp
+from mosa.system.limits import counted
 from mosa.types import Cameras
 
 BACKENDS = ("warp", "gsplat")

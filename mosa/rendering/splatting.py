@@ -15,7 +15,7 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mosa.exact_sums import COLUMNS, needed, sum_functions
+from mosa.physics.exact_sums import COLUMNS, needed, sum_functions
 from mosa.rendering.covariance import CLAMP_MARGIN
 from mosa.rendering.projection_kernels import projection_kernels
 from mosa.rendering.raster_kernels import raster_kernels

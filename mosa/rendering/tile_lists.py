@@ -10,9 +10,9 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from mosa.limits import counted
 from mosa.rendering.projection_kernels import TILE
 from mosa.rendering.records import record_functions, record_type
+from mosa.system.limits import counted
 
 ENTRIES_MAX = 2**30
 

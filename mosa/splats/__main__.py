@@ -1,4 +1,4 @@
-from mosa.commands.splats import main
+from mosa.cli.splats import main
 
 if __name__ == "__main__":
     main()

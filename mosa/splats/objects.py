@@ -18,23 +18,23 @@ from omegaconf import DictConfig, OmegaConf
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from mosa.checkpoints import VERSION
-from mosa.config import build_body, build_world, plain
-from mosa.data.splats import load_ply
+from mosa.config.build import build_body, build_world, plain
+from mosa.config.checkpoints import VERSION
+from mosa.config.extensions import load_extensions
+from mosa.data.io.gaussian_ply import load_ply
 from mosa.errors import ConfigError, DataError
-from mosa.extensions import load_extensions
-from mosa.guards import check_splats
-from mosa.limits import named_device
-from mosa.modules.body import Body, Start
-from mosa.modules.carried_splats import CarriedSplats
-from mosa.reconstruction.filling import fill
-from mosa.reconstruction.initial import inherited_colors
+from mosa.modules.body.body import Body, Start
+from mosa.reconstruction.gaussians.initial import inherited_colors
+from mosa.reconstruction.geometry.filling import fill
+from mosa.reconstruction.geometry.shell import solid_of
 from mosa.reconstruction.pipeline import FEW, filling_spacing
 from mosa.reconstruction.resolution import PER_CELL, grid_spacing
-from mosa.reconstruction.shell import solid_of
-from mosa.run import most_particles, quiet, run_folder
-from mosa.twin import Twin
-from mosa.twin_start import numbers
+from mosa.rendering.appearance.carried_splats import CarriedSplats
+from mosa.system.limits import named_device
+from mosa.training.preflight import check_splats
+from mosa.training.run_folder import most_particles, quiet, run_folder
+from mosa.twin.start import numbers
+from mosa.twin.twin import Twin
 from mosa.types import Appearance, Splats
 
 log = logging.getLogger(__name__)

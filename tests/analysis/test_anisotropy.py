@@ -1,4 +1,4 @@
-"""Directional figures of a law (mosa/analysis/anisotropy.py) against closed forms of linear elasticity."""
+"""Directional figures of a law (mosa/evaluation/analysis/anisotropy.py) against closed forms of linear elasticity."""
 
 import math
 
@@ -6,15 +6,15 @@ import pytest
 import torch
 from scipy.optimize import brentq
 
-from mosa.analysis import anisotropy
 from mosa.errors import ConfigError, SimulationDiverged
-from mosa.modules.adapter import StressAdapter
-from mosa.modules.adapter_base import Adapter
-from mosa.modules.hyperelastic import HyperelasticAdapter
-from mosa.modules.material import material_states
-from mosa.modules.microplane import MANDEL
+from mosa.evaluation.analysis import anisotropy
+from mosa.modules.adapters.base import Adapter
+from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
+from mosa.modules.adapters.microplane import MANDEL
+from mosa.modules.adapters.stress import StressAdapter
+from mosa.modules.body.material import material_states
+from mosa.physics.adapters.interface import AdapterOperator
 from mosa.physics.constitutive.elasticity import lame
-from mosa.physics.engine.adapter_interface import AdapterOperator
 
 E, NU = 1e5, 0.35
 MU, LAM = lame(torch.tensor(E, dtype=torch.float64), torch.tensor(NU, dtype=torch.float64))

@@ -10,11 +10,20 @@ import numpy as np
 import pytest
 import torch
 
-from mosa.analysis.comparison import Comparison, compare, ground_lines, legend, on_ground, paint, round_up, write_comparisons
-from mosa.analysis.figures import side_by_side, write_strip
-from mosa.evaluation import Sequence
-from mosa.modules.body import Body, SimulationSettings, Start
-from mosa.modules.material import Material
+from mosa.evaluation.analysis.comparison import (
+    Comparison,
+    compare,
+    ground_lines,
+    legend,
+    on_ground,
+    paint,
+    round_up,
+    write_comparisons,
+)
+from mosa.evaluation.analysis.figures import side_by_side, write_strip
+from mosa.evaluation.evaluate import Sequence
+from mosa.modules.body.body import Body, SimulationSettings, Start
+from mosa.modules.body.material import Material
 from mosa.rendering.cameras import look_at
 from mosa.types import Cameras, Ground, Rollout, Scene, Truth
 

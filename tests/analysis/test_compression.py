@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from mosa.analysis.anisotropy import directional_modulus, directions_in_plane
-from mosa.analysis.compression import press, turned_to
-from mosa.analysis.stiffness import directional_moduli
-from mosa.data.builtin.objects import CYLINDER
-from mosa.modules.hyperelastic import NUMBERS, HyperelasticAdapter
-from mosa.modules.material import Material, material_states
+from mosa.data.synthetic.bodies.objects import CYLINDER
+from mosa.evaluation.analysis.anisotropy import directional_modulus, directions_in_plane
+from mosa.evaluation.analysis.compression import press, turned_to
+from mosa.evaluation.analysis.stiffness import directional_moduli
+from mosa.modules.adapters.hyperelastic import NUMBERS, HyperelasticAdapter
+from mosa.modules.body.material import Material, material_states
 
 E, NU = 2e5, 0.3
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mosa.analysis.figures import LEFT, SMALLEST, bar, fitted, text_width, write_strip, write_video
+from mosa.evaluation.analysis.figures import LEFT, SMALLEST, bar, fitted, text_width, write_strip, write_video
 
 
 def test_a_strip_takes_rows_of_different_sizes(tmp_path):

@@ -6,8 +6,8 @@ import math
 import pytest
 import torch
 
-from mosa.analysis.flow_colors import color_wheel, flow_colors
 from mosa.errors import DataError
+from mosa.evaluation.analysis.flow_colors import color_wheel, flow_colors
 
 
 @pytest.mark.parametrize("angle", [0, 60, 135, 200, 330])

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from mosa.analysis.stiffness import angle_between, cone, directional_moduli, stiffest
-from mosa.modules.microplane import isotropic_stiffness
+from mosa.evaluation.analysis.stiffness import angle_between, cone, directional_moduli, stiffest
+from mosa.modules.adapters.microplane import isotropic_stiffness
 
 E1, E2, E3, NU12, NU13, NU23, G12, G13, G23 = 3.0, 2.0, 1.0, 0.2, 0.25, 0.3, 0.9, 0.6, 0.5
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from mosa.analysis.tables import columns_text, continued_text, determined_text, parameter_table
-from mosa.modules import material
-from mosa.modules.material import LOG, register_form, unit_of
+from mosa.evaluation.analysis.tables import columns_text, continued_text, determined_text, parameter_table
+from mosa.modules.body import material
+from mosa.modules.body.material import LOG, register_form, unit_of
 
 PRIORS = Path(__file__).parents[2] / "conf" / "prior"
 

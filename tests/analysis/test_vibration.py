@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 
-from mosa.analysis.vibration import GROWTH_LIMIT, vibration_growth
-from mosa.modules.adapter import StressAdapter
-from mosa.modules.hyperelastic import HyperelasticAdapter, anisotropic_basis, root_stiffness
-from mosa.modules.material import Material
-from mosa.modules.microplane import isotropic_stiffness
+from mosa.evaluation.analysis.vibration import GROWTH_LIMIT, vibration_growth
+from mosa.modules.adapters.hyperelastic import HyperelasticAdapter, anisotropic_basis, root_stiffness
+from mosa.modules.adapters.microplane import isotropic_stiffness
+from mosa.modules.adapters.stress import StressAdapter
+from mosa.modules.body.material import Material
 
 SIGNS = "+++---+-----+-+-+-++--+---+-+----++-+++++-+++---"
 """Of the entries of the four matrices: the most indefinite of 102 drawn patterns at nu 0.4."""

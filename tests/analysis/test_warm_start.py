@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from mosa.analysis.anisotropy import directional_modulus, directions_on_sphere, response_of
 from mosa.errors import ConfigError
-from mosa.modules.adapter import StressAdapter
-from mosa.modules.material import material_states
-from mosa.modules.warm_start import drawn_stretches, warm_start
+from mosa.evaluation.analysis.anisotropy import directional_modulus, directions_on_sphere, response_of
+from mosa.modules.adapters.stress import StressAdapter
+from mosa.modules.adapters.warm_start import drawn_stretches, warm_start
+from mosa.modules.body.material import material_states
 from mosa.physics.constitutive.elasticity import lame
 from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState

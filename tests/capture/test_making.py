@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 
 from mosa.capture.making import capture, make
 from mosa.capture.world import floor_of_points, ground_height, read_world
-from mosa.composition import configuration
+from mosa.config.composition import configuration
 from mosa.data.scene import load_scene
 from mosa.errors import ConfigError, DataError
 

@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from mosa.data.builtin.renderer import ring_of_cameras
-from mosa.data.export import export_pacnerf, export_transforms
-from mosa.data.falling import track_of
+from mosa.data.checks.free_fall import track_of
+from mosa.data.formats.export import export_pacnerf, export_transforms
+from mosa.data.synthetic.renderer import ring_of_cameras
 from mosa.types import Ground, Scene
 
 BOX = [[-1.0, -0.1, -1.0], [1.0, 1.0, 1.0]]

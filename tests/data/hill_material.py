@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from mosa.data.builtin.axes import axes_parameter
-from mosa.data.builtin.hill import COEFFICIENTS
+from mosa.data.synthetic.materials.axes import axes_parameter
+from mosa.data.synthetic.materials.hill import COEFFICIENTS
 from mosa.errors import ConfigError
 from mosa.physics.constitutive.elasticity import lame
 

@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from mosa.data.builtin.axes import axes_matrix, axes_parameter, axes_rotation
+from mosa.data.synthetic.materials.axes import axes_matrix, axes_parameter, axes_rotation
 from mosa.errors import ConfigError
 from mosa.physics.constitutive.kinematics import ROTATION_FLOOR, svd
 from mosa.physics.constitutive.laws import LawParameters, register_law

@@ -10,19 +10,20 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from mosa.data.builtin import sequences, takes
-from mosa.data.builtin.drop import CONTACT_CELLS, COURANT, place
-from mosa.data.builtin.floor import floor_rollout
-from mosa.data.builtin.objects import OBJECTS
-from mosa.data.builtin.renderer import render_surface, ring_of_cameras
-from mosa.data.builtin.shapes import SHAPES
-from mosa.data.builtin.standin_shapes import STANDIN_SHAPES
-from mosa.data.builtin.surface import Surface, bind, extract_surface, fill
-from mosa.data.images import composite, resize
+from mosa.data.images.reading import composite, resize
 from mosa.data.scene import held_out_sequences, load_scene
+from mosa.data.synthetic import films as takes
+from mosa.data.synthetic import sequences
+from mosa.data.synthetic.bodies.objects import OBJECTS
+from mosa.data.synthetic.bodies.shapes import SHAPES
+from mosa.data.synthetic.bodies.standin_shapes import STANDIN_SHAPES
+from mosa.data.synthetic.drop import CONTACT_CELLS, COURANT, place
+from mosa.data.synthetic.renderer import render_surface, ring_of_cameras
+from mosa.data.synthetic.surface import Surface, bind, extract_surface, fill
 from mosa.errors import ConfigError
-from mosa.modules.body import World
-from mosa.modules.contact import ContactOffset
+from mosa.evaluation.floor import floor_rollout
+from mosa.modules.body.body import World
+from mosa.modules.body.contact import ContactOffset
 from mosa.physics.contact.colliders import Collider, HalfSpace
 from mosa.physics.contact.motion import Motion
 from mosa.physics.contact.planes import Plane

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from mosa.data.builtin.renderer import ring_of_cameras
-from mosa.data.falling import check_direction, check_fall, parabola, track_of
+from mosa.data.checks.free_fall import check_direction, check_fall, parabola, track_of
+from mosa.data.checks.validation import validate
 from mosa.data.scene import load_scene
-from mosa.data.validation import validate
+from mosa.data.synthetic.renderer import ring_of_cameras
 from mosa.errors import DataError
 from mosa.rendering.cameras import rays
 from mosa.types import Ground, Scene

@@ -4,8 +4,8 @@ import pytest
 import torch
 import warp as wp
 
-from mosa.data.builtin.hidden_material import LAW, fibre_energy, fibre_neo_hookean, fibre_stiffness
-from mosa.data.builtin.objects import OBJECTS, PEANUT, RABBIT
+from mosa.data.synthetic.bodies.objects import OBJECTS, PEANUT, RABBIT
+from mosa.data.synthetic.materials.hidden_material import LAW, fibre_energy, fibre_neo_hookean, fibre_stiffness
 from mosa.errors import ConfigError
 from mosa.physics.constitutive.laws import LawParameters, law_named
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from mosa.data.builtin.hill import COEFFICIENTS, HILL
+from mosa.data.synthetic.materials.hill import COEFFICIENTS, HILL
 from mosa.errors import ConfigError
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.reference import deviator, hencky_material, polar

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mosa.data.builtin.axes import axes_matrix, axes_parameter
+from mosa.data.synthetic.materials.axes import axes_matrix, axes_parameter
 from mosa.errors import ConfigError
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.reference import polar

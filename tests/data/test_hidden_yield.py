@@ -7,16 +7,17 @@ import numpy as np
 import pytest
 import torch
 
-from mosa.data.builtin import floor, held_out_names
-from mosa.data.builtin.drop import simulate
-from mosa.data.builtin.hill import COEFFICIENTS
-from mosa.data.builtin.objects import CLAY, OBJECTS, RABBIT
-from mosa.data.builtin.shapes import SHAPES
-from mosa.data.builtin.surface import fill
 from mosa.data.scene import load_scene
+from mosa.data.synthetic import held_out_names
+from mosa.data.synthetic.bodies.objects import CLAY, OBJECTS, RABBIT
+from mosa.data.synthetic.bodies.shapes import SHAPES
+from mosa.data.synthetic.drop import simulate
+from mosa.data.synthetic.materials.hill import COEFFICIENTS
+from mosa.data.synthetic.surface import fill
 from mosa.errors import ConfigError
-from mosa.modules.body import World
-from mosa.modules.contact import ContactOffset
+from mosa.evaluation import floor
+from mosa.modules.body.body import World
+from mosa.modules.body.contact import ContactOffset
 
 SMALL = replace(OBJECTS["tiny"], footage=replace(OBJECTS["tiny"].footage, frames=9))
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from mosa.data.builtin.renderer import render_surface, ring_of_cameras
-from mosa.data.builtin.shapes import SHAPES
-from mosa.data.builtin.surface import extract_surface
-from mosa.data.export import opengl_pose
-from mosa.data.images import composite
-from mosa.data.lens import lens_of
+from mosa.data.formats.export import opengl_pose
+from mosa.data.images.lens import lens_of
+from mosa.data.images.reading import composite
 from mosa.data.scene import load_scene
+from mosa.data.synthetic.bodies.shapes import SHAPES
+from mosa.data.synthetic.renderer import render_surface, ring_of_cameras
+from mosa.data.synthetic.surface import extract_surface
 from mosa.errors import DataError
 from mosa.rendering.cameras import scale_cameras
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from mosa.data.export import export_particles, export_transforms
+from mosa.data.formats.export import export_particles, export_transforms
 from mosa.data.scene import held_out_sequences, load_scene
 
 from .conftest import WORLD, assert_same_footage, clouds_of

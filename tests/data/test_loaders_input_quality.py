@@ -9,11 +9,11 @@ import pytest
 import torch
 from PIL import Image
 
-from mosa.data.builtin.renderer import ring_of_cameras
-from mosa.data.images import fill_holes, read_image
-from mosa.data.matting import matte_from_plate
+from mosa.data.checks.validation import validate
+from mosa.data.images.matting import matte_from_plate
+from mosa.data.images.reading import fill_holes, read_image
 from mosa.data.scene import load_scene
-from mosa.data.validation import validate
+from mosa.data.synthetic.renderer import ring_of_cameras
 from mosa.errors import DataError
 from mosa.rendering.cameras import rays
 

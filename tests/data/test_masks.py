@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mosa.data.images import faintless, matte_of, read_image
+from mosa.data.images.reading import faintless, matte_of, read_image
 from mosa.errors import DataError
 
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from mosa.data.agreement import lines_of_sight
-from mosa.data.export import export_pacnerf, export_transforms
+from mosa.data.checks.cameras import lines_of_sight
+from mosa.data.checks.validation import validate
+from mosa.data.formats.export import export_pacnerf, export_transforms
+from mosa.data.hull import visual_hull
 from mosa.data.scene import load_scene
-from mosa.data.validation import validate
 from mosa.errors import DataError
-from mosa.reconstruction.hull import visual_hull
 from mosa.rendering.cameras import crop_cameras, crop_images, rays
 
 from .conftest import WORLD, block_scene
@@ -21,7 +21,7 @@ from .conftest import WORLD, block_scene
 
 def ball_scene(center=(0.1, 0.3, 0.0), size=48, radius=0.15, samples=4, frames=3, **camera):
     """A grey ball seen by six cameras as it falls from rest; mattes are coverages of samples x samples points a pixel."""
-    from mosa.data.builtin.renderer import ring_of_cameras
+    from mosa.data.synthetic.renderer import ring_of_cameras
 
     scene = block_scene(6, frames)
     options = {"target": (0, 0.3, 0), "distance": 1.5, "elevations": (0.2, 0.6), "field": 0.6, "turn": 0.4}

@@ -8,7 +8,7 @@ from itertools import permutations
 import pytest
 import torch
 
-from mosa.data.export import export_pacnerf, export_particles, export_transforms
+from mosa.data.formats.export import export_pacnerf, export_particles, export_transforms
 from mosa.data.sequences import load_sequences, sequence_names, taught_names
 from mosa.errors import ConfigError, DataError
 

@@ -8,10 +8,10 @@ import torch
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
-from mosa.data.splat_files import load_splat, save_frames, splats_at
+from mosa.data.io.splat_formats import load_splat, save_frames, splats_at
 from mosa.errors import ConfigError, DataError
-from mosa.modules.carried_splats import Seen
-from mosa.rendering.spherical_harmonics import basis, colors_in
+from mosa.rendering.appearance.carried_splats import Seen
+from mosa.rendering.appearance.spherical_harmonics import basis, colors_in
 
 M, T = 30, 3
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from plyfile import PlyData, PlyElement
 
-from mosa.data.splats import export_splats, load_ply, save_ply
+from mosa.data.io.gaussian_ply import export_splats, load_ply, save_ply
 from mosa.errors import ConfigError, DataError
 from mosa.rendering.covariance import covariance_from, quaternion_to_matrix
 from mosa.types import Splats

@@ -11,7 +11,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from mosa.data.export import export_particles, export_spring_gaus
+from mosa.data.formats.export import export_particles, export_spring_gaus
 from mosa.data.scene import load_scene
 from mosa.errors import DataError
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from mosa.data.builtin import load_builtin
-from mosa.data.builtin.objects import OBJECTS
-from mosa.data.builtin.standin_shapes import STANDIN_SHAPES
-from mosa.data.builtin.surface import flowing_surface
-from mosa.data.pacnerf import PUBLISHED
-from mosa.modules.material import Material
+from mosa.data.formats.pacnerf import PUBLISHED
+from mosa.data.synthetic import load_builtin
+from mosa.data.synthetic.bodies.objects import OBJECTS
+from mosa.data.synthetic.bodies.standin_shapes import STANDIN_SHAPES
+from mosa.data.synthetic.surface import flowing_surface
+from mosa.modules.body.material import Material
 
 
 @pytest.mark.parametrize("name", STANDIN_SHAPES)

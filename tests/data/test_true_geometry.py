@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from mosa.analysis.tables import geometry_lines
-from mosa.data.builtin.objects import OBJECTS
-from mosa.data.builtin.shapes import SHAPES
-from mosa.data.builtin.surface import fill
-from mosa.data.builtin.true_geometry import geometry_figures, origin
 from mosa.data.scene import load_scene
+from mosa.data.synthetic.bodies.objects import OBJECTS
+from mosa.data.synthetic.bodies.shapes import SHAPES
+from mosa.data.synthetic.surface import fill
+from mosa.data.synthetic.true_geometry import geometry_figures, origin
 from mosa.errors import ConfigError
+from mosa.evaluation.analysis.tables import geometry_lines
 
 
 @pytest.fixture(scope="module")

@@ -14,14 +14,14 @@ from matplotlib.colors import to_rgba
 from mosa.experiments import analyses
 from mosa.experiments.analyses import ANALYSES
 from mosa.experiments.collecting import Cell, records_of, table
-from mosa.experiments.drawing import FURTHER, MARKED, STYLES, draw, style_of
+from mosa.experiments.report.drawing import FURTHER, MARKED, STYLES, draw, style_of
+from mosa.experiments.report.writing import write_results
 from mosa.experiments.specification import (
     Figure,
     jobs_of,
     load_experiment,
     narrowed,
 )
-from mosa.experiments.writing import write_results
 
 
 @pytest.mark.parametrize("plot", ["lines", "map", None])

@@ -16,16 +16,17 @@ from hydra import compose, initialize_config_dir
 from made_up import CONF, NAMES, PAPER, experiment, made_up, write_metrics
 from omegaconf import OmegaConf
 
-from mosa import whole_files
-from mosa.commands.experiment import arguments, run, run_counted, shown
-from mosa.config import rehearse
+from mosa.cli.experiment import arguments, run, run_counted, shown
+from mosa.config.build import rehearse
+from mosa.config.keys import EVALUATION, TRAINING
 from mosa.errors import ConfigError, DataError
 from mosa.experiments import processes, running, specimens
 from mosa.experiments.analyses import ANALYSES
 from mosa.experiments.collecting import Cell, best_of, records_of, table
 from mosa.experiments.goes import Clock, Go
-from mosa.experiments.page import read_tables
-from mosa.experiments.printed import printed_table
+from mosa.experiments.report.page import read_tables
+from mosa.experiments.report.printed import printed_table
+from mosa.experiments.report.writing import write_results
 from mosa.experiments.specification import (
     CROWD,
     MINUTES,
@@ -41,9 +42,8 @@ from mosa.experiments.specification import (
     narrowed,
     pairs,
 )
-from mosa.experiments.writing import write_results
-from mosa.keys import EVALUATION, TRAINING
 from mosa.schema import check
+from mosa.system import whole_files
 
 
 # ------------------------------------------------------------------------------------------------ files

@@ -7,11 +7,12 @@ from dataclasses import replace
 import pytest
 from made_up import NAMES, PAPER, experiment, made_up, write_metrics
 
-from mosa.commands.experiment import arguments, run
+from mosa.cli.experiment import arguments, run
 from mosa.errors import ConfigError, DataError
 from mosa.experiments import commits
 from mosa.experiments.collecting import Cell
-from mosa.experiments.page import older, verdict
+from mosa.experiments.report.page import older, verdict
+from mosa.experiments.report.writing import made_by, write_results
 from mosa.experiments.specification import (
     Claim,
     Figure,
@@ -19,7 +20,6 @@ from mosa.experiments.specification import (
     load_experiment,
     narrowed,
 )
-from mosa.experiments.writing import made_by, write_results
 
 
 def cells(**rows) -> dict:

@@ -5,8 +5,8 @@ import threading
 import pytest
 
 from mosa.errors import DataError
+from mosa.experiments.report.writer import Writer
 from mosa.experiments.specification import Job
-from mosa.experiments.writer import Writer
 
 
 def job(folder, complete=False) -> Job:

@@ -7,11 +7,11 @@ from unittest.mock import patch
 import lightning as L
 
 from mosa import compose
-from mosa.assembly import Run, assemble
-from mosa.data import datamodule
-from mosa.modules.body import Start
-from mosa.modules.rest_shape import RestShape
-from mosa.reconstruction.starts import sequence_start
+from mosa.modules.body.body import Start
+from mosa.reconstruction.pose.starts import sequence_start
+from mosa.reconstruction.rest_shape import RestShape
+from mosa.training import datamodule
+from mosa.training.assembly import Run, assemble
 from mosa.types import Appearance, Scene
 
 ROOT = Path(__file__).parents[2]

@@ -12,11 +12,11 @@ from unittest.mock import patch
 
 import torch
 
-from mosa import refused
-from mosa.data import datamodule
-from mosa.modules.body import Body
-from mosa.modules.start import Start
-from mosa.reconstruction.starts import sequence_start
+from mosa.modules.body.body import Body
+from mosa.physics.world import Start
+from mosa.reconstruction.pose.starts import sequence_start
+from mosa.system import refused
+from mosa.training import datamodule
 from mosa.types import Appearance, Scene
 
 TORCH = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has a total capacity of 139.80 GiB")
@@ -53,20 +53,20 @@ class Later:
 
 
 PLACES = [  # command, its words, where memory ends, what is raised there
-    ("train", FIRST, "mosa.pipeline:estimate", MODULE), ("train", FIRST, "mosa.data.datamodule:reconstruct", TORCH),
-    ("train", FIRST, "mosa.data.datamodule:sequence_start", HANDLE),
-    ("train", FIRST, "mosa.modules.lit_mosa:LitMosa.training_step", WARP),
-    ("train", AGAIN, "mosa.modules.lit_mosa:LitMosa.on_load_checkpoint", TORCH),
-    ("train", AGAIN, "mosa.modules.lit_mosa:LitMosa.end", ALLOC), ("train", AGAIN, "mosa.evaluation:rollouts", WARP),
-    ("eval", other("eval", f"ckpt_path={CHECKPOINT}", f"cache={cache}"), "mosa.pipeline:figures_of", HANDLE),
-    ("eval", other("sim", f"ckpt_path={CHECKPOINT}", "simulate.height=0.1"), "mosa.twin:Twin.simulate", MODULE),
-    ("eval", other("device", f"ckpt_path={CHECKPOINT}"), "mosa.limits:torch.empty", TORCH),
+    ("train", FIRST, "mosa.training.workflow:estimate", MODULE), ("train", FIRST, "mosa.training.datamodule:reconstruct", TORCH),
+    ("train", FIRST, "mosa.training.datamodule:sequence_start", HANDLE),
+    ("train", FIRST, "mosa.training.lit_mosa:LitMosa.training_step", WARP),
+    ("train", AGAIN, "mosa.training.lit_mosa:LitMosa.on_load_checkpoint", TORCH),
+    ("train", AGAIN, "mosa.training.lit_mosa:LitMosa.end", ALLOC), ("train", AGAIN, "mosa.evaluation.evaluate:rollouts", WARP),
+    ("eval", other("eval", f"ckpt_path={CHECKPOINT}", f"cache={cache}"), "mosa.training.workflow:figures_of", HANDLE),
+    ("eval", other("sim", f"ckpt_path={CHECKPOINT}", "simulate.height=0.1"), "mosa.twin.twin:Twin.simulate", MODULE),
+    ("eval", other("device", f"ckpt_path={CHECKPOINT}"), "mosa.system.limits:torch.empty", TORCH),
     ("splats", other("splats", f"ply={folder}/none.ply"), "mosa.splats.objects:check_splats", ALLOC),
     ("capture", other("capture", f"videos={folder}", f"poses={folder}", f"output={folder}/o"), "mosa.capture.making:check_capture",
      WARP),
     ("environments", other("environments", "task=pushing"), "mosa.environments.command:check_environments", TORCH),
-    ("view", [f"run={folder}"], "mosa.viewer:opened", HANDLE),
-    ("experiment", ["table_time"], "mosa.commands.experiment:run", MODULE),
+    ("view", [f"run={folder}"], "mosa.viewer.recorded:opened", HANDLE),
+    ("experiment", ["table_time"], "mosa.cli.experiment:run", MODULE),
 ]  # fmt: skip
 
 
@@ -81,7 +81,7 @@ def tried(command: str, words: list[str], place: str, error: Exception) -> None:
     screen, code = io.StringIO(), None
     with patch.object(target, name, broken), contextlib.redirect_stderr(screen):
         try:
-            importlib.import_module(f"mosa.commands.{command}").main()
+            importlib.import_module(f"mosa.cli.{command}").main()
         except SystemExit as ended:
             code = ended.code
         except Exception as escaped:  # a traceback, of a program that is not in a loop

@@ -10,12 +10,12 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
-from mosa import pipeline
-from mosa.data.export import export_particles, export_transforms
+from mosa.data.formats.export import export_particles, export_transforms
 from mosa.data.scene import load_scene
-from mosa.evaluation import run_sequences
-from mosa.modules.ground_choice import named, taken_of
-from mosa.twin import Twin
+from mosa.evaluation.evaluate import run_sequences
+from mosa.modules.fitting.search.ground_choice import named, taken_of
+from mosa.training import workflow as pipeline
+from mosa.twin.twin import Twin
 
 ROOT = Path(__file__).parents[2]
 QUICK = ["debug=default", "scene=transforms", "scene.scale=1", "scene.box=[[-0.7,-0.1,-0.7],[0.7,1,0.7]]", "fit.prior.iterations=1",

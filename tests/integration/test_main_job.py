@@ -20,14 +20,16 @@ import torch
 from hydra import compose, initialize_config_dir
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from mosa import __version__, evaluation, pipeline
-from mosa.clips import read_run
+from mosa import __version__
 from mosa.errors import SimulationDiverged
-from mosa.modules.body import Body, ContactOffset, Start
-from mosa.modules.lit_mosa import LitMosa
-from mosa.run import read_figures
-from mosa.twin import Twin
+from mosa.evaluation import evaluate as evaluation
+from mosa.modules.body.body import Body, ContactOffset, Start
+from mosa.training import workflow as pipeline
+from mosa.training.lit_mosa import LitMosa
+from mosa.training.run_folder import read_figures
+from mosa.twin.twin import Twin
 from mosa.types import Ground
+from mosa.viewer.clips import read_run
 
 ROOT = Path(__file__).parents[2]
 FIGURES = (ROOT / "docs" / "figures.md").read_text()
@@ -141,7 +143,7 @@ def test_rates_of_adam_are_logged(stepped):
     events, rows = events_of(stepped), table_of(stepped)
     seconds = [event.value for event in events.Scalars("time/step_s")]
     assert len(seconds) == 5 and all(0 < s < 400 for s in seconds)
-    rates = [event.value for event in events.Scalars("lr/material")]  # conf/fit/tiny.yaml with the decay of mosa/modules/stages.py
+    rates = [event.value for event in events.Scalars("lr/material")]  # conf/fit/tiny.yaml, decayed
     assert rates == pytest.approx([0.1, 0.1, 0.02, 0.01, 0.01])
     assert [event.value for event in events.Scalars("lr/adapter")] == pytest.approx([2e-3, 2e-3])
     assert [float(row["lr/material"]) for row in rows] == pytest.approx(rates)

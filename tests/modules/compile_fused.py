@@ -12,7 +12,7 @@ import torch
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource, compile
 
-from mosa.modules.fused.operation import LANES, Settings, _Launch
+from mosa.modules.adapters.fused.operation import LANES, Settings, _Launch
 
 FORWARD = ("phi_forward", "psi1_forward", "psi2_forward", "theta_forward")
 BACKWARD = ("phi_backward", "psi1_backward", "psi2_backward", "theta_backward")
@@ -22,7 +22,7 @@ INTEGERS, FLOATS = ("N", "M", "known", "start", "size"), ("scale", "bound", "alp
 
 
 def compiled(module: str, name: str, options: dict) -> dict:
-    function = getattr(importlib.import_module(f"mosa.modules.fused.{module}"), name)
+    function = getattr(importlib.import_module(f"mosa.modules.adapters.fused.{module}"), name)
     values = FLAGS | options
     signature, constants, divisible = {}, {}, {}
     for place, argument in enumerate(inspect.signature(function.fn).parameters):

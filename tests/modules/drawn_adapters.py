@@ -2,8 +2,8 @@
 
 import torch
 
-from mosa.modules.adapter import StressAdapter
-from mosa.physics.engine.adapter_interface import MaterialState
+from mosa.modules.adapters.stress import StressAdapter
+from mosa.physics.adapters.interface import MaterialState
 
 E_REF = 2e5
 

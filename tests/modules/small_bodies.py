@@ -4,11 +4,11 @@ from types import SimpleNamespace
 
 import torch
 
-from mosa.modules.body import Body, SimulationSettings, Start, World
-from mosa.modules.heterogeneity import HeterogeneitySettings
-from mosa.modules.hyperelastic import HyperelasticAdapter
-from mosa.modules.material import Material
-from mosa.modules.stiffness_modes import StiffnessModes
+from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
+from mosa.modules.body.body import Body, SimulationSettings, Start, World
+from mosa.modules.body.heterogeneity import HeterogeneitySettings
+from mosa.modules.body.material import Material
+from mosa.modules.body.stiffness_modes import StiffnessModes
 from mosa.physics.constitutive.singular_values import singular_value_decomposition
 from mosa.types import Ground, MotionCues
 

@@ -10,10 +10,10 @@ from drawn_adapters import E_REF, drawn_adapter, drawn_states, material_state, r
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mosa.baselines.direct import DirectAdapter
 from mosa.errors import ConfigError
-from mosa.modules.adapter import StressAdapter
-from mosa.modules.direct import DirectAdapter
-from mosa.modules.penalties import pool, statistics
+from mosa.modules.adapters.penalties import pool, statistics
+from mosa.modules.adapters.stress import StressAdapter
 
 OPTIONS = {
     "paper's form": {},

@@ -11,13 +11,13 @@ from drawn_adapters import E_REF, drawn_states, material_state, randomise
 from small_bodies import FRAME_DT, WORLD, lattice, small_body, start
 
 import mosa
-from mosa.config import fitting
+from mosa.config.build import fitting
 from mosa.errors import ConfigError
-from mosa.modules.adapter_protocol import AdapterProtocol
-from mosa.modules.adapters import ADAPTERS, adapter_class
-from mosa.modules.material import Material, material_states
-from mosa.modules.penalties import PENALTIES
-from mosa.modules.warm_start import drawn_stretches
+from mosa.modules.adapters.penalties import PENALTIES
+from mosa.modules.adapters.protocol import AdapterProtocol
+from mosa.modules.adapters.registry import ADAPTERS, adapter_class
+from mosa.modules.adapters.warm_start import drawn_stretches
+from mosa.modules.body.material import Material, material_states
 from mosa.physics.constitutive.laws import law_named
 
 NU = 0.35

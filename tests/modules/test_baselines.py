@@ -12,15 +12,15 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from small_bodies import DX, FRAME_DT, FREE, STICKY, WORLD, lattice, small_body, start
 
-from mosa.config import build_body
+from mosa.baselines.interaction import InteractionNetwork
+from mosa.baselines.nclaw import NeuralLaw, invariants, matrix_of, polar_rotation, pretrain, vech_of
+from mosa.baselines.neuma import LowRankLaw
+from mosa.baselines.pair_dynamics import Frame
+from mosa.config.build import build_body
 from mosa.errors import ConfigError
-from mosa.modules.adapters import adapter_class
-from mosa.modules.body import Body
-from mosa.modules.interaction import InteractionNetwork
-from mosa.modules.material import Material, material_states
-from mosa.modules.nclaw import NeuralLaw, invariants, matrix_of, polar_rotation, pretrain, vech_of
-from mosa.modules.neuma import LowRankLaw
-from mosa.modules.pair_dynamics import Frame
+from mosa.modules.adapters.registry import adapter_class
+from mosa.modules.body.body import Body
+from mosa.modules.body.material import Material, material_states
 from mosa.physics.contact.planes import Plane
 
 CONF = Path(__file__).parents[2] / "conf"

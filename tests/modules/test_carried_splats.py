@@ -8,13 +8,13 @@ import torch
 from scipy.spatial.transform import Rotation
 from strangers import N, checkpoint, cube, saved
 
-from mosa.config import build_body
+from mosa.config.build import build_body
 from mosa.errors import DataError
-from mosa.modules.carried_splats import CarriedSplats, seen
-from mosa.modules.observer import deformed_covariances, observe
+from mosa.rendering.appearance.carried_splats import CarriedSplats, seen
+from mosa.rendering.appearance.lighting import LIGHT, shading, surface_normals
 from mosa.rendering.cameras import look_at
-from mosa.rendering.lighting import LIGHT, shading, surface_normals
-from mosa.twin import Twin
+from mosa.rendering.observer import deformed_covariances, observe
+from mosa.twin.twin import Twin
 from mosa.types import Appearance, Cameras, Splats
 
 BACKGROUND = torch.ones(3)

@@ -5,9 +5,9 @@ import torch
 from small_bodies import DX, FRAME_DT, FREE, WORLD, small_body, start
 
 from mosa.errors import ConfigError
-from mosa.modules.body import Ready
-from mosa.modules.criteria import Criterion
-from mosa.modules.learned_numbers import each_law, read_numbers
+from mosa.modules.body.body import Ready
+from mosa.modules.fitting.criteria import Criterion
+from mosa.modules.fitting.parameters import each_law, read_numbers
 
 
 def simulated(body, begins, frames=10, world=WORLD, **options):

@@ -8,10 +8,10 @@ import torch
 from drawn_adapters import E_REF, drawn_states, material_state, randomise
 from omegaconf import OmegaConf
 
+from mosa.baselines.direct import DirectAdapter
 from mosa.errors import ConfigError
-from mosa.modules.adapter import StressAdapter
-from mosa.modules.adapters import adapter_class
-from mosa.modules.direct import DirectAdapter
+from mosa.modules.adapters.registry import adapter_class
+from mosa.modules.adapters.stress import StressAdapter
 
 CONF = Path(__file__).parents[2] / "conf" / "adapter"
 

@@ -12,9 +12,9 @@ import torch
 from omegaconf import OmegaConf
 from small_bodies import small_body, start
 
-from mosa.data.builtin.drop import simulate
-from mosa.data.builtin.objects import object_named
-from mosa.data.builtin.takes import built
+from mosa.data.synthetic.bodies.objects import object_named
+from mosa.data.synthetic.drop import simulate
+from mosa.data.synthetic.films import built
 from mosa.environments import arena as arenas
 from mosa.environments import command, pictures, study
 from mosa.environments.arena import LOST, Arena, Simulator, play, play_all, simulator_named, world_of
@@ -25,8 +25,8 @@ from mosa.environments.task import View
 from mosa.environments.tasks import CLEARANCE, TASKS, task_named
 from mosa.environments.truth import true_twin
 from mosa.errors import ConfigError, DataError, SimulationDiverged
-from mosa.modules.start import World
-from mosa.twin import Twin
+from mosa.physics.world import World
+from mosa.twin.twin import Twin
 from mosa.types import Ground
 
 WORLD = World(Ground(0.0, "sticky"), torch.tensor([0.0, -9.8, 0.0]), torch.tensor([0.0, 1.0, 0.0]),

@@ -11,12 +11,12 @@ import pytest
 import torch
 from small_bodies import FRAME_DT, STICKY, WORLD, small_body, start
 
-from mosa.episode import TwinState
 from mosa.errors import ConfigError, DataError, SimulationDiverged
-from mosa.modules.learned_numbers import read_numbers
+from mosa.modules.fitting.parameters import read_numbers
 from mosa.physics.contact.colliders import colliders_from_config
 from mosa.physics.contact.motion import Trajectory, exponential
-from mosa.twin import Twin
+from mosa.twin.episode import TwinState
+from mosa.twin.twin import Twin
 
 STEPS = 8
 NUMBERS = 0.2 * torch.linspace(-1, 1, 19).double()
@@ -312,7 +312,7 @@ def test_gradients_of_worlds_are_those_of_their_twins():
 
 
 def _with(body, numbers):
-    from mosa.modules.learned_numbers import each_law
+    from mosa.modules.fitting.parameters import each_law
 
     for _ in each_law(body, numbers[None]):
         made = small_body(contact=True, numbers=NUMBERS)

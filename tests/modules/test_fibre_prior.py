@@ -4,14 +4,14 @@ import pytest
 import torch
 from small_bodies import NU, WORLD, E, small_body, start, take_of
 
-from mosa.data.builtin.hidden_material import LAW
-from mosa.modules import material as material_module
-from mosa.modules.criteria import Criterion
-from mosa.modules.identification import Identification
-from mosa.modules.identification_settings import IdentificationSettings
-from mosa.modules.material import FORMS, LOG, Direction, Material, register_form
-from mosa.modules.ready import Ready
-from mosa.modules.stages import Stage
+from mosa.data.synthetic.materials.hidden_material import LAW
+from mosa.modules.body import material as material_module
+from mosa.modules.body.material import FORMS, LOG, Direction, Material, register_form
+from mosa.modules.body.ready import Ready
+from mosa.modules.fitting.criteria import Criterion
+from mosa.modules.fitting.identification import Identification
+from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.stages import Stage
 
 FRAMES = 10
 

@@ -7,10 +7,10 @@ import torch
 from drawn_adapters import E_REF, drawn_adapter, drawn_states, material_state
 
 from mosa.errors import ConfigError
-from mosa.modules.adapter import StressAdapter
-from mosa.modules.fused.half_weights import packed
-from mosa.modules.fused.selection import weights_of
-from mosa.physics.engine.network_evaluation import at_hand, from_weights, same_weights
+from mosa.modules.adapters.fused.half_weights import packed
+from mosa.modules.adapters.fused.selection import weights_of
+from mosa.modules.adapters.stress import StressAdapter
+from mosa.physics.adapters.network_evaluation import at_hand, from_weights, same_weights
 from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 pytest.importorskip("triton")
-from mosa.modules.fused.operation import HALF_SHARED
+from mosa.modules.adapters.fused.operation import HALF_SHARED
 
 SHARED = 227 * 1024
 """Bytes of a multiprocessor's shared memory that one program may have (compute capability 9.0)."""

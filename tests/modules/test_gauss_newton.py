@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError, SimulationDiverged
-from mosa.modules.gauss_newton import Block, GaussNewton, Posterior, Seat
+from mosa.modules.fitting.gauss_newton import Block, GaussNewton, Posterior, Seat
 
 
 def drawn(*shape, seed=0):

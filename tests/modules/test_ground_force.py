@@ -10,7 +10,7 @@ from mosa.errors import ConfigError
 from mosa.physics.contact.colliders import colliders_from_config
 from mosa.physics.contact.motion import rotation_matrices
 from mosa.physics.contact.reference import signed_distance
-from mosa.twin_start import start_in
+from mosa.twin.start import start_in
 
 FLOOR = {"type": "plane", "normal": [0, 1, 0]}
 

@@ -7,21 +7,23 @@ import pytest
 import torch
 from small_bodies import NU, WORLD, E, small_body, start, take_of
 
-from mosa.analysis.tables import determined_text, ground_table, ground_text, parameter_table
-from mosa.checkpoints import check_resumed
+from mosa.config.checkpoints import check_resumed
 from mosa.errors import DataError, SimulationDiverged
-from mosa.modules import ground_choice, ground_search, newton_steps
-from mosa.modules.body import World
-from mosa.modules.contact import ContactOffset
-from mosa.modules.criteria import Criterion
-from mosa.modules.ground_choice import contact, named, rivals_of, taken_of
-from mosa.modules.ground_search import better_friction, choose_ground
-from mosa.modules.identification import Identification
-from mosa.modules.identification_settings import IdentificationSettings
-from mosa.modules.learned_numbers import read_numbers
-from mosa.modules.lit_mosa import LitMosa
-from mosa.modules.newton_steps import NewtonSteps
-from mosa.modules.stages import Stage
+from mosa.evaluation.analysis.tables import determined_text, ground_table, ground_text, parameter_table
+from mosa.modules.body.body import World
+from mosa.modules.body.contact import ContactOffset
+from mosa.modules.fitting import newton_steps
+from mosa.modules.fitting.criteria import Criterion
+from mosa.modules.fitting.identification import Identification
+from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.newton_steps import NewtonSteps
+from mosa.modules.fitting.parameters import read_numbers
+from mosa.modules.fitting.search import ground as ground_search
+from mosa.modules.fitting.search import ground_choice
+from mosa.modules.fitting.search.ground import better_friction, choose_ground
+from mosa.modules.fitting.search.ground_choice import contact, named, rivals_of, taken_of
+from mosa.modules.fitting.stages import Stage
+from mosa.training.lit_mosa import LitMosa
 from mosa.types import AUTO, Ground
 
 FRAMES = 9

@@ -5,7 +5,7 @@ import torch
 from drawn_adapters import randomise
 
 from mosa.errors import ConfigError
-from mosa.modules.heterogeneity import HeterogeneityField, HeterogeneitySettings
+from mosa.modules.body.heterogeneity import HeterogeneityField, HeterogeneitySettings
 
 LOW, HIGH = torch.tensor([-0.1, 0.0, 0.2]), torch.tensor([0.1, 0.4, 0.5])
 

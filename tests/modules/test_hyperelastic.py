@@ -8,16 +8,16 @@ import torch
 import warp as wp
 from small_bodies import FRAME_DT, FREE, STICKY, WORLD, small_body, start
 
-from mosa.analysis.stiffness import directional_moduli
 from mosa.errors import ConfigError
-from mosa.modules.hyperelastic import NUMBERS, HyperelasticAdapter, anisotropic_basis, root_stiffness
-from mosa.modules.microplane import isotropic_stiffness
-from mosa.modules.stiffening import ADAPTER_MARGIN
+from mosa.evaluation.analysis.stiffness import directional_moduli
+from mosa.modules.adapters.hyperelastic import NUMBERS, HyperelasticAdapter, anisotropic_basis, root_stiffness
+from mosa.modules.adapters.microplane import isotropic_stiffness
+from mosa.modules.adapters.stiffening import ADAPTER_MARGIN
 from mosa.physics import reference
+from mosa.physics.adapters.interface import MaterialState
 from mosa.physics.constitutive.laws import SLOTS, law_named
 from mosa.physics.constitutive.material_kernels import field_types, stress_kernel
 from mosa.physics.constitutive.strain import STRAINS
-from mosa.physics.engine.adapter_interface import MaterialState
 
 SCALE = torch.tensor([1, 1, 1, 2**0.5, 2**0.5, 2**0.5], dtype=torch.float64)
 

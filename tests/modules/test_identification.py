@@ -8,19 +8,19 @@ import pytest
 import torch
 from small_bodies import DX, FRAME_DT, NU, WORLD, E, cues_of, small_body, start, take_of
 
-from mosa.analysis.anisotropy import dyads
-from mosa.analysis.stiffness import angle_between, stiffest
 from mosa.errors import ConfigError, SimulationDiverged
-from mosa.modules import identification as identification_module
-from mosa.modules.backbone_search import compass
-from mosa.modules.criteria import Criterion
-from mosa.modules.gauss_newton import Seat
-from mosa.modules.hyperelastic import anisotropic_basis
-from mosa.modules.identification import COARSER, EVIDENCE_ITERATIONS, SOFTLY, Identification
-from mosa.modules.identification_settings import IdentificationSettings
-from mosa.modules.learned_numbers import as_rival, read_numbers, write_numbers
-from mosa.modules.stages import Stage
-from mosa.reconstruction.response import Response
+from mosa.evaluation.analysis.anisotropy import dyads
+from mosa.evaluation.analysis.stiffness import angle_between, stiffest
+from mosa.modules.adapters.hyperelastic import anisotropic_basis
+from mosa.modules.fitting import identification as identification_module
+from mosa.modules.fitting.criteria import Criterion
+from mosa.modules.fitting.gauss_newton import Seat
+from mosa.modules.fitting.identification import COARSER, EVIDENCE_ITERATIONS, SOFTLY, Identification
+from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.parameters import as_rival, read_numbers, write_numbers
+from mosa.modules.fitting.search.backbone import compass
+from mosa.modules.fitting.stages import Stage
+from mosa.reconstruction.motion.response import Response
 
 FRAMES = 12
 AXIS = torch.nn.functional.normalize(torch.tensor([1.0, 0.6, 0.3], dtype=torch.float64), dim=0)

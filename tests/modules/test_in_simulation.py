@@ -6,7 +6,7 @@ import pytest
 import torch
 from drawn_adapters import drawn_adapter, randomise
 
-from mosa.modules.adapter import StressAdapter
+from mosa.modules.adapters.stress import StressAdapter
 from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from mosa.modules.hyperelastic import anisotropic_basis
-from mosa.modules.microplane import _constants, _placement, _triangles
-from mosa.rendering.spherical_harmonics import _projections
+from mosa.modules.adapters.hyperelastic import anisotropic_basis
+from mosa.modules.adapters.microplane import _constants, _placement, _triangles
+from mosa.rendering.appearance.spherical_harmonics import _projections
 
 CPU = torch.device("cpu")
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from mosa.errors import ConfigError
-from mosa.modules import material as material_module
-from mosa.modules.material import ANGLE_MAX, FORMS, LOG, NU_MAX, SOFTPLUS, Direction, Material, register_form
+from mosa.modules.body import material as material_module
+from mosa.modules.body.material import ANGLE_MAX, FORMS, LOG, NU_MAX, SOFTPLUS, Direction, Material, register_form
 from mosa.physics.constitutive import laws
 from mosa.physics.constitutive.laws import law_named
 

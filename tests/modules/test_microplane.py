@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mosa.modules import microplane
+from mosa.modules.adapters import microplane
 
 MANDEL = torch.tensor(microplane.MANDEL, dtype=torch.float64)
 

@@ -3,7 +3,7 @@
 import torch
 from torch.autograd import gradcheck
 
-from mosa.modules.networks import TwoHiddenLayers, zero_outputs
+from mosa.modules.adapters.networks import TwoHiddenLayers, zero_outputs
 
 
 def test_value_and_gradients_are_those_of_the_layers_in_a_row():

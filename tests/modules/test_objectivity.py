@@ -4,10 +4,10 @@ import pytest
 import torch
 from drawn_adapters import E_REF, drawn_adapter, randomise
 
-from mosa.modules.direct import DirectAdapter
-from mosa.modules.material import material_states
+from mosa.baselines.direct import DirectAdapter
+from mosa.modules.body.material import material_states
 from mosa.physics import reference
-from mosa.physics.engine.adapter_interface import MaterialState
+from mosa.physics.adapters.interface import MaterialState
 
 MU, LAM = 0.8e5, 1.1e5
 LAWS = {"neo_hookean": {}, "corotated": {}, "stvk": {}, "von_mises": {"yield_stress": 5e3},

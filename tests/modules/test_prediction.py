@@ -7,15 +7,15 @@ import pytest
 import torch
 from small_bodies import WORLD, small_body, start
 
-from mosa import prediction
 from mosa.errors import ConfigError, SimulationDiverged
-from mosa.evaluation import Sequence
-from mosa.modules.gauss_newton import Posterior
-from mosa.modules.learned_numbers import as_rival, each_law, limits_of, read_numbers
-from mosa.modules.material import NU_MAX
-from mosa.plan import drawn_starts, information, plan
-from mosa.prediction import DRAWN, ELSEWHERE, FORMS, INFLATION, among_forms, determined, physical_sd, total_spread
-from mosa.twin import Twin
+from mosa.evaluation import uncertainty as prediction
+from mosa.evaluation.evaluate import Sequence
+from mosa.evaluation.uncertainty import DRAWN, ELSEWHERE, FORMS, INFLATION, among_forms, determined, physical_sd, total_spread
+from mosa.modules.body.material import NU_MAX
+from mosa.modules.fitting.gauss_newton import Posterior
+from mosa.modules.fitting.parameters import as_rival, each_law, limits_of, read_numbers
+from mosa.twin.drop_planning import drawn_starts, information, plan
+from mosa.twin.twin import Twin
 
 
 def posterior_of(body, sd: float, model_error: float = 0.004) -> Posterior:

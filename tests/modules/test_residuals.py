@@ -7,7 +7,7 @@ import pytest
 import torch
 from small_bodies import FRAME_DT, WORLD, cues_of, small_body, start
 
-from mosa.modules import residuals
+from mosa.modules.fitting import residuals
 from mosa.types import MotionCues
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mosa.errors import DataError
-from mosa.modules.retreat import MOST_HALVINGS, Retreat
+from mosa.modules.fitting.retreat import MOST_HALVINGS, Retreat
 
 
 @pytest.fixture

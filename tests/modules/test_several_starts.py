@@ -9,9 +9,9 @@ from test_identification import identification
 from torch import nn
 
 from mosa.errors import SimulationDiverged
-from mosa.modules import backbone_search
-from mosa.modules.backbone_search import FIRST, LAST, moved, nearest_end, rollouts_of_search
-from mosa.modules.material import Material
+from mosa.modules.body.material import Material
+from mosa.modules.fitting.search import backbone as backbone_search
+from mosa.modules.fitting.search.backbone import FIRST, LAST, moved, nearest_end, rollouts_of_search
 
 
 class Valleys:

@@ -3,13 +3,13 @@
 import pytest
 import torch
 
-from mosa.modules import microplane
-from mosa.modules.adapter import StressAdapter
-from mosa.modules.body import EVEN, Body, SimulationSettings
-from mosa.modules.direct import DirectAdapter
-from mosa.modules.material import Material
-from mosa.modules.stiffening import ADAPTER_MARGIN, acoustic_stiffening, worst_stiffening
-from mosa.physics.engine.time_step import required_substeps
+from mosa.baselines.direct import DirectAdapter
+from mosa.modules.adapters import microplane
+from mosa.modules.adapters.stiffening import ADAPTER_MARGIN, acoustic_stiffening, worst_stiffening
+from mosa.modules.adapters.stress import StressAdapter
+from mosa.modules.body.body import EVEN, Body, SimulationSettings
+from mosa.modules.body.material import Material
+from mosa.physics.time.time_step import required_substeps
 
 PLACES = ((0, 0), (1, 1), (2, 2), (1, 2), (2, 0), (0, 1))
 OPERATOR = {"state_dependence": "constant", "major_symmetry": True, "no_pre": True, "no_post": True}

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError
-from mosa.modules.heterogeneity import HeterogeneitySettings
-from mosa.modules.stiffness_modes import StiffnessModes
+from mosa.modules.body.heterogeneity import HeterogeneitySettings
+from mosa.modules.body.stiffness_modes import StiffnessModes
 
 LOW, HIGH = torch.tensor([-0.1, 0.0, 0.2]).double(), torch.tensor([0.3, 0.2, 0.4]).double()
 """Sides 0.4, 0.2, 0.2 m."""

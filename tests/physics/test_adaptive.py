@@ -6,14 +6,14 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError
+from mosa.physics.adapters.interface import AdapterOperator
 from mosa.physics.constitutive.elasticity import lame
 from mosa.physics.contact.colliders import Box, Collider
 from mosa.physics.contact.motion import Motion, Trajectory
-from mosa.physics.engine.adapter_interface import AdapterOperator
-from mosa.physics.engine.adaptive_steps import StepControl, current_modulus
-from mosa.physics.engine.clock import Adaptive, Replay
 from mosa.physics.engine.simulator import Simulator
-from mosa.physics.engine.time_step import required_substeps
+from mosa.physics.time.adaptive_steps import StepControl, current_modulus
+from mosa.physics.time.clock import Adaptive, Replay
+from mosa.physics.time.time_step import required_substeps
 from mosa.types import Ground, ParticleState
 
 DENSITY = 1000.0

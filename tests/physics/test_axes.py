@@ -11,10 +11,10 @@ from mosa.errors import ConfigError, SimulationDiverged
 from mosa.physics.contact.colliders import Box, Collider
 from mosa.physics.contact.motion import Motion, rotation_matrices
 from mosa.physics.contact.planes import Plane
-from mosa.physics.engine.adaptive_steps import StepControl
 from mosa.physics.engine.axes import PERIOD, Axes, shift_to, turn_along
-from mosa.physics.engine.clock import Adaptive
 from mosa.physics.engine.simulator import Simulator
+from mosa.physics.time.adaptive_steps import StepControl
+from mosa.physics.time.clock import Adaptive
 from mosa.types import Ground, ParticleState
 
 DX, FRAME_DT, SUBSTEPS = 0.04, 0.02, 40

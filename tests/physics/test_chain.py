@@ -10,20 +10,20 @@ from torch import nn
 from torch.func import functional_call
 
 from mosa.errors import ConfigError, SimulationDiverged
-from mosa.modules.adapter import StressAdapter
-from mosa.modules.penalties import pool
+from mosa.modules.adapters.penalties import pool
+from mosa.modules.adapters.stress import StressAdapter
+from mosa.physics.adapters.chain_schedule import SEGMENT, Chains, Plan, chain_length, grouped
+from mosa.physics.adapters.interface import AdapterOperator
 from mosa.physics.contact.colliders import Collider, Sphere
 from mosa.physics.contact.motion import Motion
 from mosa.physics.engine import budget
 from mosa.physics.engine import solver as solver_module
 from mosa.physics.engine import stepping as stepping_module
-from mosa.physics.engine.adapter_interface import AdapterOperator
-from mosa.physics.engine.adaptive_steps import StepControl
 from mosa.physics.engine.capture import ATTEMPTS
-from mosa.physics.engine.chain_schedule import SEGMENT, Chains, Plan, chain_length, grouped
-from mosa.physics.engine.clock import Adaptive, Replay
 from mosa.physics.engine.law_options import LawOptions
 from mosa.physics.engine.simulator import Simulator
+from mosa.physics.time.adaptive_steps import StepControl
+from mosa.physics.time.clock import Adaptive, Replay
 from mosa.types import Ground, ParticleState
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]

@@ -13,7 +13,7 @@ from mosa.physics.contact.planes import Plane
 from mosa.physics.contact.reference import signed_distance
 from mosa.physics.contact.touch import GRIP
 from mosa.physics.engine.simulator import Simulator
-from mosa.physics.engine.time_step import required_substeps
+from mosa.physics.time.time_step import required_substeps
 from mosa.types import ParticleState
 
 DX, SPACING, DENSITY = 0.04, 0.02, 1000.0

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mosa.physics.engine.adapter_interface import AdapterOperator
+from mosa.physics.adapters.interface import AdapterOperator
 from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState
 

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 import mosa.physics
-from mosa.physics.engine.adaptive_steps import StepControl
+from mosa.physics.adapters.network_evaluation import from_weights, same_weights
 from mosa.physics.engine.budget import Budget
 from mosa.physics.engine.capture import ATTEMPTS, MAX_GRAPHS, Graphs, Strategy
-from mosa.physics.engine.clock import Adaptive, Clock, Moment, Replay
-from mosa.physics.engine.network_evaluation import from_weights, same_weights
 from mosa.physics.launching import same_memory
+from mosa.physics.time.adaptive_steps import StepControl
+from mosa.physics.time.clock import Adaptive, Clock, Moment, Replay
 
 
 class Counted(Strategy):

@@ -7,8 +7,8 @@ import torch
 
 from mosa.errors import ConfigError
 from mosa.physics import reference
+from mosa.physics.adapters.interface import AdapterOperator
 from mosa.physics.contact.planes import Plane
-from mosa.physics.engine.adapter_interface import AdapterOperator
 from mosa.physics.engine.simulator import Simulator
 from mosa.types import ParticleState
 

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError, SimulationDiverged
+from mosa.physics.adapters.interface import AdapterOperator, MaterialState
 from mosa.physics.constitutive.elasticity import lame
 from mosa.physics.contact.colliders import Collider, Sphere
-from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState
 from mosa.physics.engine.law_options import LawOptions
 from mosa.physics.engine.simulator import Simulator
 from mosa.physics.engine.solver import SegmentSolver, grid_window, substep_bytes

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mosa.physics.engine.adapter_interface import AdapterOperator
+from mosa.physics.adapters.interface import AdapterOperator
 from mosa.physics.engine.simulator import Simulator
 from mosa.types import Ground, ParticleState
 

@@ -10,13 +10,13 @@ import warp as wp
 from mpmath import mpf
 
 from mosa.errors import ConfigError
-from mosa.modules.adapter import StressAdapter
-from mosa.modules.hyperelastic import HyperelasticAdapter
+from mosa.modules.adapters.hyperelastic import HyperelasticAdapter
+from mosa.modules.adapters.stress import StressAdapter
 from mosa.physics import reference
+from mosa.physics.adapters.interface import MaterialState
 from mosa.physics.constitutive.laws import SLOTS, law_named, register_law
 from mosa.physics.constitutive.material_kernels import field_types, stress_kernel
 from mosa.physics.constitutive.strain import STRAINS
-from mosa.physics.engine.adapter_interface import MaterialState
 from mosa.physics.engine.simulator import Simulator
 
 LAW, MU, LAM, NU = "corotated", 2.0, 3.0, 0.3

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError, SimulationDiverged
-from mosa.modules.material import Material
+from mosa.modules.body.material import Material
 from mosa.physics.engine.simulator import Simulator
-from mosa.physics.engine.time_step import VISCOUS_NUMBER, required_substeps, wave_speed
+from mosa.physics.time.time_step import VISCOUS_NUMBER, required_substeps, wave_speed
 
 
 def test_bounds():

@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError, SimulationDiverged
+from mosa.physics.adapters.interface import AdapterOperator
 from mosa.physics.contact.colliders import Collider, Sphere
 from mosa.physics.contact.motion import Motion, Poses, sample_poses
 from mosa.physics.contact.planes import Plane
-from mosa.physics.engine.adapter_interface import AdapterOperator
-from mosa.physics.engine.adaptive_steps import StepControl
-from mosa.physics.engine.clock import Adaptive
 from mosa.physics.engine.simulator import Simulator
+from mosa.physics.time.adaptive_steps import StepControl
+from mosa.physics.time.clock import Adaptive
 from mosa.types import ParticleState
 
 WORLDS, SUBSTEPS, FRAMES, DT = 4, 14, 4, 4e-4

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mosa.modules.adapter import StressAdapter
+from mosa.modules.adapters.stress import StressAdapter
 from mosa.physics.constitutive.laws import law_named, law_names
 from mosa.types import ParticleState
 

@@ -8,8 +8,8 @@ import torch
 from bodies import DENSITY, LAM, LAWS, MU, PRECISIONS, random_adapter
 from closed_systems import asymmetric_control, conservation, vibration
 
-from mosa.analysis.vibration import GROWTH_LIMIT, vibration_growth
-from mosa.modules.material import Material
+from mosa.evaluation.analysis.vibration import GROWTH_LIMIT, vibration_growth
+from mosa.modules.body.material import Material
 
 
 @pytest.mark.parametrize("dtype", PRECISIONS)

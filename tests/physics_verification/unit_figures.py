@@ -11,7 +11,7 @@ from bodies import DENSITY, LAM, MU, agitated, eyes, parameters_of, random_adapt
 from stresses import deformations, stress
 
 from mosa.errors import ConfigError
-from mosa.modules.adapter import StressAdapter
+from mosa.modules.adapters.stress import StressAdapter
 from mosa.physics import reference
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.engine.law_options import LawOptions

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from squashed_body import make_scene
 
-from mosa.reconstruction.hull import visual_hull
-from mosa.reconstruction.observed import object_windows
+from mosa.data.hull import visual_hull
+from mosa.reconstruction.motion.observed import object_windows
 from mosa.types import Scene
 
 

@@ -6,15 +6,15 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from mosa.modules.carried_splats import CarriedSplats, Seen
-from mosa.reconstruction.carried import CarriedSettings, fit_carried
-from mosa.reconstruction.observed import Windows
+from mosa.reconstruction.gaussians.carried import CarriedSettings, fit_carried
+from mosa.reconstruction.motion.observed import Windows
 from mosa.reconstruction.pipeline import reconstruct
 from mosa.reconstruction.settings import build_settings
+from mosa.rendering.appearance.carried_splats import CarriedSplats, Seen
+from mosa.rendering.appearance.lighting import shading
+from mosa.rendering.appearance.spherical_harmonics import constant_coefficients
 from mosa.rendering.cameras import look_at
 from mosa.rendering.covariance import covariance_from
-from mosa.rendering.lighting import shading
-from mosa.rendering.spherical_harmonics import constant_coefficients
 from mosa.types import Appearance, Cameras, Splats
 
 FRAMES, SIZE = 5, 40

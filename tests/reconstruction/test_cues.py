@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from mosa.errors import DataError
-from mosa.reconstruction.cues import (
+from mosa.reconstruction.motion.cues import (
     gaussian_cues,
     neighbourhood,
     neighbourhood_cues,
     polar,
 )
-from mosa.reconstruction.modes import deformation_modes
+from mosa.reconstruction.motion.modes import deformation_modes
 from mosa.rendering.covariance import quaternion_to_matrix
 from mosa.types import Splats
 

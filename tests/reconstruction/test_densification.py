@@ -9,15 +9,15 @@ import pytest
 import squashed_body
 import torch
 
+from mosa.data.hull import visual_hull
 from mosa.errors import ConfigError
-from mosa.reconstruction import densification
-from mosa.reconstruction.densification import MarkovChain, perturb, prune, refine, relocate, shared_opacity
-from mosa.reconstruction.gaussians import FreeGaussians, Rates
-from mosa.reconstruction.hull import visual_hull
-from mosa.reconstruction.initial import random_splats
-from mosa.reconstruction.observed import object_windows
+from mosa.reconstruction.gaussians import densification
+from mosa.reconstruction.gaussians.densification import MarkovChain, perturb, prune, refine, relocate, shared_opacity
+from mosa.reconstruction.gaussians.gaussians import FreeGaussians, Rates
+from mosa.reconstruction.gaussians.initial import random_splats
+from mosa.reconstruction.gaussians.static import StaticSettings, fit_splats, start_splats
+from mosa.reconstruction.motion.observed import object_windows
 from mosa.reconstruction.settings import build_settings
-from mosa.reconstruction.static import StaticSettings, fit_splats, start_splats
 from mosa.rendering.covariance import covariance_from, matrix_to_quaternion, quaternion_to_matrix
 from mosa.rendering.rasterizer import rasterize
 from mosa.types import Splats

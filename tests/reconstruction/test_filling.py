@@ -9,9 +9,7 @@ import pytest
 import squashed_body
 import torch
 
-from mosa.errors import DataError
-from mosa.reconstruction.filling import body_volume, fill
-from mosa.reconstruction.hull import (
+from mosa.data.hull import (
     Volume,
     hull_bounds,
     hull_centroid,
@@ -19,6 +17,8 @@ from mosa.reconstruction.hull import (
     shave_ridges,
     visual_hull,
 )
+from mosa.errors import DataError
+from mosa.reconstruction.geometry.filling import body_volume, fill
 
 TRUE_VOLUME = 4 / 3 * np.pi * np.prod(squashed_body.RADII)
 CENTRE = torch.tensor(squashed_body.forward(np.zeros((1, 3)), 0.0, 1.0)[0], dtype=torch.float32)

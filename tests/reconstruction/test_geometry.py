@@ -10,18 +10,18 @@ import pytest
 import squashed_body
 import torch
 
-from mosa.data.builtin.parts import Shape, coat, ellipsoid
-from mosa.data.builtin.renderer import render_surface, ring_of_cameras
-from mosa.data.builtin.surface import extract_surface
-from mosa.data.builtin.takes import pictures_to_footage
+from mosa.data.hull import Volume, visual_hull
+from mosa.data.synthetic.bodies.parts import Shape, coat, ellipsoid
+from mosa.data.synthetic.films import pictures_to_footage
+from mosa.data.synthetic.renderer import render_surface, ring_of_cameras
+from mosa.data.synthetic.surface import extract_surface
 from mosa.errors import ConfigError, DataError
-from mosa.reconstruction.carving import CarvingSettings, carve, keep_silhouettes
-from mosa.reconstruction.field import first_crossing, sample, scatter, smooth
-from mosa.reconstruction.flight import Motion, free_motions
-from mosa.reconstruction.geometry import Geometry, GeometrySettings, find_geometry, surface_of
-from mosa.reconstruction.hull import Volume, visual_hull
-from mosa.reconstruction.observed import Windows, object_windows
-from mosa.reconstruction.refinement import refine, signed_distance, surface_information
+from mosa.reconstruction.geometry.body import Geometry, GeometrySettings, find_geometry, surface_of
+from mosa.reconstruction.geometry.carving import CarvingSettings, carve, keep_silhouettes
+from mosa.reconstruction.geometry.field import first_crossing, sample, scatter, smooth
+from mosa.reconstruction.geometry.refinement import refine, signed_distance, surface_information
+from mosa.reconstruction.motion.observed import Windows, object_windows
+from mosa.reconstruction.pose.flight import Motion, free_motions
 from mosa.types import Ground, Scene
 
 SIZE, PITCH = 80, 0.006
@@ -150,7 +150,8 @@ def test_the_surface_moves_to_where_colours_and_outlines_put_it(squashed):
 
 
 def test_a_body_of_which_images_leave_nothing_is_its_hull_and_an_empty_hull_is_named(bowl, monkeypatch):
-    monkeypatch.setattr("mosa.reconstruction.geometry.carve", lambda body, *_: replace(body, values=torch.zeros_like(body.values)))
+    monkeypatch.setattr("mosa.reconstruction.geometry.body.carve",
+                        lambda body, *_: replace(body, values=torch.zeros_like(body.values)))
     with pytest.warns(UserWarning, match=r"scene bowl: carving and refinement left nothing of a visual hull of \d+ voxels of 6 mm"):
         hull, geometry = found(bowl, first=(), then=())
     assert torch.equal(geometry.body.values, found(bowl, source="hull")[1].body.values) and geometry.free_frames == 1

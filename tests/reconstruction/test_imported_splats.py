@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mosa.data.splats import save_ply
+from mosa.data.io.gaussian_ply import save_ply
 from mosa.errors import DataError
 from mosa.reconstruction import pipeline
-from mosa.reconstruction.initial import initial_splats
-from mosa.reconstruction.observed import object_windows
+from mosa.reconstruction.gaussians.initial import initial_splats
+from mosa.reconstruction.motion.observed import object_windows
 from mosa.reconstruction.pipeline import object_hull, reconstruct
 from mosa.reconstruction.settings import build_settings
 

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError
-from mosa.reconstruction.cues import neighbourhood
-from mosa.reconstruction.dynamic import DynamicSettings, Scaffold
-from mosa.reconstruction.informed import InformedSettings, informed_motion, laid_onto, project
-from mosa.reconstruction.modes import deformation_modes
-from mosa.reconstruction.motion import ModalMotion
-from mosa.reconstruction.observed import object_windows
+from mosa.reconstruction.motion.cues import neighbourhood
+from mosa.reconstruction.motion.dynamic import DynamicSettings, Scaffold
+from mosa.reconstruction.motion.informed import InformedSettings, informed_motion, laid_onto, project
+from mosa.reconstruction.motion.modes import deformation_modes
+from mosa.reconstruction.motion.motion import ModalMotion
+from mosa.reconstruction.motion.observed import object_windows
 from mosa.rendering.covariance import quaternion_to_matrix
 from mosa.types import Splats
 from tests.reconstruction.test_dynamic import block, rendered_windows

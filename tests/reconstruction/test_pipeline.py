@@ -12,11 +12,12 @@ import torch
 import yaml
 
 from mosa.errors import ConfigError
-from mosa.reconstruction import moved, pipeline
-from mosa.reconstruction.informed import InformedSettings
+from mosa.reconstruction import pipeline
+from mosa.reconstruction.motion import moved
+from mosa.reconstruction.motion.informed import InformedSettings
 from mosa.reconstruction.pipeline import follow, reconstruct, spacing_for
 from mosa.reconstruction.settings import build_settings
-from mosa.rendering.lighting import shading, surface_normals
+from mosa.rendering.appearance.lighting import shading, surface_normals
 
 CONF = Path(__file__).parents[2] / "conf" / "reconstruction"
 SETTINGS = build_settings(
@@ -66,7 +67,7 @@ def test_particle_motion_against_truth(squashed, found):
 
 
 def test_cues_against_truth(squashed, found):
-    from mosa.reconstruction.cues import neighbourhood, neighbourhood_cues
+    from mosa.reconstruction.motion.cues import neighbourhood, neighbourhood_cues
 
     true = true_positions(squashed, found.splats.means)
     expected = neighbourhood_cues(true, found.cues.covariances, neighbourhood(found.splats.means))

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mosa.errors import DataError
-from mosa.reconstruction.registration import (
+from mosa.reconstruction.pose.registration import (
     flight,
     flight_jacobian,
     initial_velocity,
@@ -14,9 +14,9 @@ from mosa.reconstruction.registration import (
     register_pose,
     spread_rotations,
 )
-from mosa.reconstruction.rigid import Poses, RigidBody, rotation_exp
+from mosa.reconstruction.pose.rigid import Poses, RigidBody, rotation_exp
+from mosa.rendering.appearance.lighting import shading
 from mosa.rendering.cameras import look_at
-from mosa.rendering.lighting import shading
 from mosa.types import Cameras, Splats
 
 WHITE = torch.ones(3)

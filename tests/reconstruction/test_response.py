@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from mosa.errors import ConfigError
-from mosa.reconstruction.dynamic import DynamicSettings
-from mosa.reconstruction.informed import InformedSettings, informed_motion
-from mosa.reconstruction.modes import Modes
-from mosa.reconstruction.moved import SecondLook
-from mosa.reconstruction.response import BENT, Response, image_matrices, measured, response_of, responses
+from mosa.reconstruction.motion.dynamic import DynamicSettings
+from mosa.reconstruction.motion.informed import InformedSettings, informed_motion
+from mosa.reconstruction.motion.modes import Modes
+from mosa.reconstruction.motion.moved import SecondLook
+from mosa.reconstruction.motion.response import BENT, Response, image_matrices, measured, response_of, responses
 from tests.reconstruction.test_informed import EVERY, OFFSETS, away, bent, scaffold  # noqa: F401
 
 K, N, T = 5, 40, 4
@@ -124,6 +124,6 @@ def test_the_response_of_another_sequence_is_refused(known):
 def test_a_part_of_large_pictures_tells_what_all_of_them_do(bent, monkeypatch):  # noqa: F811
     windows, body, true = bent
     whole = image_matrices(body, body, windows, OFFSETS, torch.ones(3), true, reach=0.1, views=6)
-    monkeypatch.setattr("mosa.reconstruction.response.VALUES", windows.images[0].numel() // 5)
+    monkeypatch.setattr("mosa.reconstruction.motion.response.VALUES", windows.images[0].numel() // 5)
     part = image_matrices(body, body, windows, OFFSETS, torch.ones(3), true, reach=0.1, views=6)
     assert not torch.equal(part, whole) and float((part - whole).norm() / whole.norm()) < 0.2

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from mosa.reconstruction import modes
-from mosa.reconstruction.cues import neighbourhood
-from mosa.reconstruction.softest import softest_vectors
+from mosa.reconstruction.motion import modes
+from mosa.reconstruction.motion.cues import neighbourhood
+from mosa.reconstruction.motion.softest import softest_vectors
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mosa.errors import DataError
-from mosa.reconstruction import starts
+from mosa.reconstruction.pose import starts
 from mosa.types import Ground
 
 GRAVITY, FPS, HEIGHT, SPEED = -9.8, 50.0, 0.20, 2.0  # the lowest point is at 0.1: contact between frames 2 and 3

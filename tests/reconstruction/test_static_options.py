@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mosa.data.splats import load_ply, save_ply
-from mosa.reconstruction.cues import neighbourhood
-from mosa.reconstruction.modes import deformation_modes
-from mosa.reconstruction.motion import ModalMotion
+from mosa.data.io.gaussian_ply import load_ply, save_ply
+from mosa.reconstruction.motion.cues import neighbourhood
+from mosa.reconstruction.motion.modes import deformation_modes
+from mosa.reconstruction.motion.motion import ModalMotion
 from mosa.reconstruction.pipeline import posed, reconstruct, spacing_for
 from mosa.reconstruction.settings import build_settings
 from mosa.rendering.covariance import covariance_from

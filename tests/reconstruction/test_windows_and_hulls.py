@@ -6,9 +6,9 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from mosa.data.builtin.renderer import ring_of_cameras
-from mosa.reconstruction import hull
-from mosa.reconstruction.observed import object_windows
+from mosa.data import hull
+from mosa.data.synthetic.renderer import ring_of_cameras
+from mosa.reconstruction.motion.observed import object_windows
 
 
 @pytest.mark.parametrize("margin", [2, 60])

@@ -7,11 +7,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from mosa.errors import DataError
+from mosa.rendering.appearance.carrying import STRETCH_LIMIT, bind
+from mosa.rendering.appearance.spherical_harmonics import basis, colors_in, rotated
 from mosa.rendering.cameras import look_at
-from mosa.rendering.carrying import STRETCH_LIMIT, bind
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import rasterize
-from mosa.rendering.spherical_harmonics import basis, colors_in, rotated
 from mosa.types import Cameras
 
 

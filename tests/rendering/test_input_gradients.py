@@ -8,10 +8,10 @@ import torch
 from depth import expected_depth, rasterize_with_depth
 from drawn_splats import CASES, NAMES, draw, objective, render, slopes
 
+from mosa.rendering.appearance.spherical_harmonics import view_colors
 from mosa.rendering.covariance import covariance_from
 from mosa.rendering.rasterizer import rasterize
 from mosa.rendering.reference import rasterize_reference
-from mosa.rendering.spherical_harmonics import view_colors
 
 
 def agree(picture, leaves):

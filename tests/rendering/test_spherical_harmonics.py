@@ -8,7 +8,7 @@ from drawn_splats import draw
 from scipy.special import sph_harm_y
 
 from mosa.errors import ConfigError
-from mosa.rendering.spherical_harmonics import basis, colors_in, constant_coefficients, mean_colors, view_colors
+from mosa.rendering.appearance.spherical_harmonics import basis, colors_in, constant_coefficients, mean_colors, view_colors
 
 
 def test_basis_is_the_real_one_of_the_complex_harmonics():

@@ -8,8 +8,8 @@ import torch
 import warp as wp
 from drawn_splats import NAMES, draw, gradients, objective, render, ring, slopes
 
-from mosa import exact_sums
 from mosa.errors import ConfigError
+from mosa.physics import exact_sums
 from mosa.rendering.projection_kernels import ALPHA_MIN, TILE
 from mosa.rendering.rasterizer import rasterize
 from mosa.rendering.records import record_functions

@@ -7,9 +7,9 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from mosa.exact_sums import COLUMNS, sum_functions
 from mosa.physics.contact.collider_kernels import collider_kernels
 from mosa.physics.contact.colliders import PackedColliders
+from mosa.physics.exact_sums import COLUMNS, sum_functions
 
 
 class ColliderBuffers:

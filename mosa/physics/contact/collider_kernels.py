@@ -15,9 +15,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from mosa.exact_sums import sum_functions
 from mosa.physics.contact.shapes import shape_functions
 from mosa.physics.contact.touch import touch_functions
+from mosa.physics.exact_sums import sum_functions
 
 
 @cache

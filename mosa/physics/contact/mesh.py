@@ -13,7 +13,7 @@ import warp as wp
 from torch import Tensor
 
 from mosa.errors import ConfigError, DataError
-from mosa.limits import counted
+from mosa.system.limits import counted
 
 MAX_LATTICE = 2**24
 FARTHEST, SMALLEST = 1e6, 1e-6
@@ -163,7 +163,7 @@ def _read_obj(path: Path) -> tuple[np.ndarray, list]:
 def _read_ply(path: Path) -> tuple[np.ndarray, list]:
     from plyfile import PlyData
 
-    from mosa.ply import check_ply
+    from mosa.system.ply import check_ply
 
     check_ply(path)
     data = PlyData.read(str(path))

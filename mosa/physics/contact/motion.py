@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.limits import counted
+from mosa.system.limits import counted
 
 
 class Poses(NamedTuple):

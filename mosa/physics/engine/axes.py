@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mosa.errors import ConfigError
 from mosa.physics.contact.planes import NODE_MODES, Plane
-from mosa.rotations import skew
+from mosa.physics.rotations import skew
 from mosa.types import ParticleState
 
 ALONG, ASKEW = 1e-6, 1e-2

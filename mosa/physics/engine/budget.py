@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mosa.limits import machine_memory
 from mosa.physics.engine.numerics import Numerics
+from mosa.system.limits import machine_memory
 
 KEPT_SHARE = 0.25
 """Of a GPU's free memory, for the states of all substeps of a rollout, where that is enough for them."""

@@ -10,7 +10,7 @@ from torch import Tensor
 from mosa.physics.engine.buffers import Buffers
 from mosa.physics.engine.numerics import State
 from mosa.physics.engine.solver import SegmentSolver
-from mosa.threads import threaded
+from mosa.system.threads import threaded
 
 
 class Lanes:

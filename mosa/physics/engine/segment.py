@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mosa.physics.engine.adapter_interface import ANSWER
+from mosa.physics.adapters.interface import ANSWER
 from mosa.physics.engine.lanes import Lanes
 from mosa.physics.engine.numerics import State, Steps
 from mosa.physics.engine.operation import Stretch, advance

@@ -16,18 +16,15 @@ import torch
 from torch import Tensor
 
 from mosa.errors import ConfigError
-from mosa.limits import counted
+from mosa.physics.adapters.interface import AdapterOperator, MaterialState, Several, ask
 from mosa.physics.constitutive.laws import law_named
 from mosa.physics.constitutive.plasticity import YIELD_CONVENTIONS
 from mosa.physics.constitutive.strain import STRAINS
 from mosa.physics.contact.colliders import Collider, pack_colliders, reach
 from mosa.physics.contact.motion import sample_frame, sample_poses
 from mosa.physics.contact.planes import Plane, ground_plane, pack_planes
-from mosa.physics.engine.adapter_interface import AdapterOperator, MaterialState, Several, ask
-from mosa.physics.engine.adaptive_steps import StepChooser, check_counts
 from mosa.physics.engine.axes import Axes, shift_to, turn_along
 from mosa.physics.engine.buffers import Buffers
-from mosa.physics.engine.clock import Adaptive, Clock, Frame, Moment, Replay
 from mosa.physics.engine.inputs import (
     check_state,
     checked_density,
@@ -44,8 +41,11 @@ from mosa.physics.engine.material_operations import material_state
 from mosa.physics.engine.numerics import Numerics, flat
 from mosa.physics.engine.solver import SegmentSolver
 from mosa.physics.engine.stepping import Prepared, Stepper
-from mosa.physics.engine.time_step import MOST_SUBSTEPS
 from mosa.physics.launching import SCALARS
+from mosa.physics.time.adaptive_steps import StepChooser, check_counts
+from mosa.physics.time.clock import Adaptive, Clock, Frame, Moment, Replay
+from mosa.physics.time.time_step import MOST_SUBSTEPS
+from mosa.system.limits import counted
 from mosa.types import Ground, ParticleState, Rollout
 
 

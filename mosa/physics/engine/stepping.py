@@ -15,14 +15,13 @@ import torch
 from torch import Tensor, nn
 
 from mosa.errors import ConfigError, SimulationDiverged
+from mosa.physics.adapters.chain import ChainOfSegments
+from mosa.physics.adapters.chain_schedule import SEGMENT, Chains
+from mosa.physics.adapters.interface import ANSWER, AdapterOperator, MaterialState
 from mosa.physics.contact.colliders import Collider, reach
 from mosa.physics.contact.motion import Motion, Poses, Trajectory, sample_poses
-from mosa.physics.engine.adapter_chain import ChainOfSegments
-from mosa.physics.engine.adapter_interface import ANSWER, AdapterOperator, MaterialState
 from mosa.physics.engine.axes import Axes
 from mosa.physics.engine.budget import room, substep_bytes
-from mosa.physics.engine.chain_schedule import SEGMENT, Chains
-from mosa.physics.engine.clock import Clock, Frame, Moment
 from mosa.physics.engine.lanes import Lanes
 from mosa.physics.engine.material_operations import first_advance
 from mosa.physics.engine.numerics import Numerics, State, Steps, flat
@@ -30,6 +29,7 @@ from mosa.physics.engine.operation import wants_gradient
 from mosa.physics.engine.segment import HeldSegment, advance_segment
 from mosa.physics.engine.solver import LeftWindow
 from mosa.physics.grid.transfer_kernels import OUTSIDE
+from mosa.physics.time.clock import Clock, Frame, Moment
 from mosa.types import ParticleState
 
 AHEAD = 256

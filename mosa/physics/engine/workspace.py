@@ -14,8 +14,6 @@ import warp as wp
 from torch import Tensor
 
 from mosa.errors import SimulationDiverged
-from mosa.exact_sums import COLUMNS, needed
-from mosa.limits import counted
 from mosa.physics.constitutive.laws import SLOTS
 from mosa.physics.constitutive.material_kernels import kernels_of
 from mosa.physics.contact.collider_buffers import ColliderBuffers
@@ -23,9 +21,11 @@ from mosa.physics.contact.grid_update import update_kernels
 from mosa.physics.contact.touch import springs, touch_kernels
 from mosa.physics.engine.capture import Graphs, WarpCapture
 from mosa.physics.engine.numerics import Numerics, State, Steps
+from mosa.physics.exact_sums import COLUMNS, needed
 from mosa.physics.grid.transfer_kernels import NO_EVENT, transfer_kernels
 from mosa.physics.grid.window import SMALL
 from mosa.physics.launching import SCALARS, aligned, copies, launch, zeros_in_one
+from mosa.system.limits import counted
 
 SPARE = 8
 """Room for larger windows: half as many nodes again, at most `window.SMALL`, or one in so many where that is more. A window that

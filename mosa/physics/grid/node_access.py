@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from mosa.exact_sums import sum_functions
+from mosa.physics.exact_sums import sum_functions
 from mosa.physics.memory_sums import added
 
 

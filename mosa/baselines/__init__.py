@@ -1,0 +1,1 @@
+"""Methods that the learned law is compared with."""

@@ -1,0 +1,55 @@
+"""Black-box comparison to the paper's adapter: one bounded network on the same inputs, without the structure."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from mosa.errors import ConfigError
+from mosa.modules.adapters.base import Adapter
+from mosa.modules.adapters.networks import TwoHiddenLayers, zero_outputs
+from mosa.modules.adapters.stress import ABLATIONS, NETWORK, rested
+from mosa.physics.adapters.interface import AdapterOperator, MaterialState
+from mosa.schema import FLAG
+
+
+class DirectAdapter(Adapter):
+    """tau_hat = tau + E_ref R mat(l_max tanh net(w, s)) R^T, exactly the prior at initialisation.
+
+    l_max: bound in units of E_ref, None for an unbounded network; rest_free, input_scale, hidden: as `StressAdapter`.
+    no_C, no_pre, no_post, no_prior_stress: ablations of the paper's adapter that have no meaning here.
+    Errors: ConfigError naming the key for values out of range, or for an ablation of parts it has not.
+    """
+
+    knobs = {**NETWORK, **dict.fromkeys(("rest_free", *ABLATIONS), FLAG)}
+
+    def __init__(
+        self, *, l_max: float | None = 0.1, input_scale: float = 10.0, hidden: int = 64, rest_free: bool = True,
+        no_C: bool = False, no_pre: bool = False, no_post: bool = False, no_prior_stress: bool = False,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        switches = {"no_C": no_C, "no_pre": no_pre, "no_post": no_post, "no_prior_stress": no_prior_stress}
+        if on := [name for name, value in switches.items() if value]:
+            raise ConfigError(f"adapter=direct: {', '.join(on)} ablates parts of adapter=mosa that a black box has not")
+        self.l_max, self.scale, self.rest_free = l_max, input_scale, rest_free
+        self.net = TwoHiddenLayers(12, 6, hidden)
+        zero_outputs(self.net[-1])
+
+    def increment(self, w: Tensor, s: Tensor) -> Tensor:
+        """(N, 6) dimensionless stress added to s (N, 6) at stretch w (N, 6)."""
+        inputs = self.scale * torch.cat([w, s], -1)
+        raw = self.net(torch.cat([inputs, torch.zeros_like(inputs[:1])]))
+        b = raw if self.l_max is None else self.l_max * torch.tanh(raw)
+        return rested(b[:-1], b[-1:], w, s) if self.rest_free else b[:-1]
+
+    def redistribution(self, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """(I (N, 6, 6), b (N, 6)): a black box redistributes nothing."""
+        return torch.eye(6).to(s).expand(len(s), 6, 6), self.increment(w, s)
+
+    def forward(self, state: MaterialState) -> AdapterOperator:
+        """As `StressAdapter.forward`, with G = 0."""
+        self.check_on()
+        outer, inner = state.w.dtype, self.E_ref.dtype
+        b = self.increment(state.w.to(inner), state.stress.to(inner) / self.E_ref)
+        self.note_stress(b)
+        return AdapterOperator(torch.zeros(len(b), 6, 6, dtype=outer, device=b.device), (self.E_ref * b).to(outer))

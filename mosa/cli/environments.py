@@ -1,0 +1,5 @@
+"""Policies trained in a twin and tested in the hidden truth:  mosa-environments task=pushing checkpoint=..."""
+
+from mosa.cli.configured import command
+
+main = command(__name__, "mosa.environments.command:train_and_test")

@@ -1,0 +1,243 @@
+"""Run the jobs of a table or figure of the paper and write its results:  mosa-experiment table_generalisation --quick"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mosa.config.composition import configuration
+from mosa.errors import ConfigError, MosaError
+from mosa.system.refused import explained
+from mosa.system.screen import outlived
+from mosa.system.threads import settle_threads
+
+if TYPE_CHECKING:
+    from mosa.experiments.specification import Job
+
+RESULTS = Path("docs/results")
+
+
+def arguments(words: list[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="mosa-experiment", description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME",
+                        help="experiments, or all; the jobs of what is named first begin first; none: list them")
+    parser.add_argument("--quick", action="store_true", help="the small variant, minutes on two cores")
+    parser.add_argument("--dry-run", action="store_true", help="list the jobs with the estimated time, run nothing")
+    parser.add_argument("--collect", action="store_true", help="run nothing, write the results of the jobs that are complete")
+    parser.add_argument("--page", action="store_true", help="write the page of all results, results.md beside their folder")
+    parser.add_argument("--runs", type=Path, default=Path("experiments"), help="folder of the jobs' run folders")
+    parser.add_argument(
+        "--results", type=Path, default=None, help="folder of the tables; default: docs/results, quick: RUNS/results"
+    )
+    parser.add_argument("--jobs", type=int, default=1, help="jobs side by side, on each device where there are devices")
+    parser.add_argument("--devices", default=None, help="GPUs by number, as 0,1; default: the CPU")
+    parser.add_argument("--seeds", default=None, help="instead of the experiment's, as 0,1,2")
+    parser.add_argument("--only", action="append", default=[], metavar="AXIS=NAME,NAME",
+                        help="these of an axis; EXPERIMENT:AXIS=NAME,NAME of one experiment's alone")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        dest="overrides",
+        help="override for every job, as train.py takes it",
+    )
+    return parser.parse_args(words)
+
+
+def main(words: list[str] | None = None) -> None:
+    settle_threads()
+    signal.signal(signal.SIGTERM, interrupt)  # or the jobs would go on without anyone who waits for them
+    with outlived():  # hours of jobs do not end with whoever read their lines
+        code = code_of(words)
+    sys.exit(code)
+
+
+def code_of(words: list[str] | None) -> int:
+    """Exit code of a command line, of which a mistake or a stop is one message."""
+    try:
+        code = run(arguments(sys.argv[1:] if words is None else words))
+    except MosaError as error:
+        print(f"\n{type(error).__name__}: {error}", file=sys.stderr)
+        code = 2
+    except Exception as error:
+        if (reason := explained(error)) is None:
+            raise
+        print(f"\n{reason}", file=sys.stderr)
+        code = 2
+    except KeyboardInterrupt:
+        print("\nstopped; the same command goes on from here", file=sys.stderr)
+        code = 130
+    return code
+
+
+def interrupt(*_) -> None:
+    raise KeyboardInterrupt
+
+
+def run(options: argparse.Namespace) -> int:
+    """Exit code: 1 where jobs failed. Errors: ConfigError naming argument or file."""
+    from mosa.experiments.specification import estimate, experiment_names, jobs_of, load_experiment, narrowed, pairs, total_minutes
+
+    folder = Path(configuration()) / "experiment" / "paper"
+    if options.page and not options.names:
+        print(write_the_page(folder, options))
+        return 0
+    if not options.names:
+        for name in experiment_names(folder):
+            print(f"{name:28s} {load_experiment(folder, name).title}")
+        return 0
+    devices = [None] if options.devices is None else whole_numbers("--devices", options.devices)
+    if options.jobs < 1:
+        raise ConfigError(f"--jobs: expected at least 1, found {options.jobs}")
+    turns: dict[str, int] = {}
+    for turn, word in enumerate(options.names):
+        for name in experiment_names(folder) if word == "all" else [word]:
+            turns.setdefault(name, turn)
+    experiments = [load_experiment(folder, name, quick=options.quick) for name in turns]
+    seeds = None if options.seeds is None else tuple(whole_numbers("--seeds", options.seeds))
+    experiments = [
+        narrowed(e, pairs(options.only, experiments), seeds) for e in experiments
+    ]
+    more = [*options.overrides, *(["trainer=gpu"] if devices != [None] else [])]
+    planned = {e.name: jobs_of(e, options.runs, more) for e in experiments}
+    wanted: dict[Path, Job] = {}
+    for name, found in planned.items():
+        for job in found:
+            wanted.setdefault(job.folder, replace(job, turn=turns[name]))
+    jobs = list(wanted.values())
+    check_overrides(options.overrides, list(jobs[0].overrides) if jobs else [])
+    lines, minutes = estimate(jobs, devices, options.jobs)
+    for line in lines:
+        print(line, flush=True)
+    results = options.results or (options.runs / "results" if options.quick else RESULTS)
+    if options.dry_run:
+        return 0
+    writable("--runs", options.runs)
+    writable("--results", results)
+    from mosa.experiments.report.writer import Writer
+
+    by_name, command = {experiment.name: experiment for experiment in experiments}, shown(options)
+
+    def write(name: str) -> None:
+        from mosa.experiments.report.writing import write_results  # which imports the simulator: jobs do not wait for it
+
+        page = write_results(by_name[name], planned[name], results, command)
+        print(f"{name}: {page}, {total_minutes(planned[name]):.1f} minutes of jobs", flush=True)
+
+    with Writer(planned, write) as writer:
+        failed = {} if options.collect else run_counted(options, jobs, devices, minutes, writer.ended)
+        writer.finish()
+    if options.page:
+        print(write_the_page(folder, options))
+    for where, reason in failed.items():
+        print(f"failed: {where}: {reason}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def run_counted(
+    options: argparse.Namespace,
+    jobs: Sequence[Job],
+    devices: Sequence[int | None],
+    minutes: float,
+    ended: Callable[[Job], None],
+) -> dict[str, str]:
+    """`run_jobs`, with a row in the runs' `goes.csv` and a line at its end that says how long all goes of this command have taken.
+
+    minutes: as estimated; ended: told of each job that has, whether it failed or not."""
+    from mosa.experiments.commits import commit
+    from mosa.experiments.goes import Clock, Go, now, said_of
+    from mosa.experiments.running import run_jobs
+
+    left = sum(not job.finished for job in jobs)
+    if not left:
+        return {}
+    clock = Clock(options.runs, Go(now(), shown(options), commit(), len(devices), options.jobs, left, round(minutes, 1)))
+
+    def told(job: Job, job_failed: bool) -> None:
+        with only_said():
+            clock.ended(job_failed)
+        ended(job)
+
+    try:
+        return run_jobs(jobs, devices, options.jobs, told)
+    finally:
+        with only_said():
+            print(said_of([go for go in clock.write() if go.command == clock.go.command]), flush=True)
+
+
+@contextmanager
+def only_said() -> Iterator[None]:
+    """What goes wrong in keeping count is a line on the screen: it ends no jobs."""
+    try:
+        yield
+    except (MosaError, OSError) as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+
+
+def write_the_page(folder: Path, options: argparse.Namespace) -> Path:
+    from mosa.experiments.report.page import write_page
+    from mosa.experiments.specification import experiment_names
+
+    return write_page(folder, experiment_names(folder), options.results or RESULTS)
+
+
+def shown(options: argparse.Namespace) -> str:
+    """The command as it stands in the results: without folders of this machine."""
+    words = ["mosa-experiment", *options.names, *(["--quick"] if options.quick else [])]
+    for name in ("seeds", "devices"):
+        words += [f"--{name}", getattr(options, name)] if getattr(options, name) is not None else []
+    words += ["--jobs", str(options.jobs)] if options.jobs != 1 else []
+    words += [word for each in options.only for word in ("--only", each)]
+    return shlex.join([*words, *(word for each in options.overrides for word in ("--set", each))])
+
+
+def whole_numbers(where: str, text: str) -> list[int]:
+    try:
+        found = [int(part) for part in text.split(",")]
+    except ValueError:
+        raise ConfigError(f"{where}: expected whole numbers as 0,1, found {text!r}") from None
+    if len(set(found)) < len(found) or min(found) < 0 or max(found) >= 2**32:
+        raise ConfigError(f"{where}: expected different whole numbers of at least 0 and below 2^32, found {text!r}")
+    return found
+
+
+def check_overrides(words: list[str], overrides: list[str]) -> None:
+    """What --set says is known to train.py: each job would end in it, one after the other. overrides: of a job, with it.
+
+    Errors: ConfigError."""
+    for word in words:
+        key = word.partition("=")[0].lstrip("+~")
+        if "=" not in word or key.split(".")[0] == "hydra" or key in ("resume", "seed"):
+            raise ConfigError(f"--set: expected KEY=VALUE of train.py, without hydra's, resume and seed, which are the jobs' own, "
+                              f"found {word!r}")
+    if not words:
+        return
+    from hydra import compose, initialize_config_dir
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    from mosa.config.build import plain
+    from mosa.training.preflight import check_configuration
+
+    try:
+        with initialize_config_dir(configuration(), version_base="1.3"):
+            values = plain(compose("train", overrides))
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(f"--set: {' '.join(str(error).split())[:300]}") from error
+    check_configuration(values, Path(configuration()))
+
+
+def writable(where: str, folder: Path) -> None:
+    """Errors: ConfigError for a folder that cannot be made."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{where}: expected a folder that can be written, found {folder} ({error.strerror})") from error

@@ -1,5 +1,0 @@
-"""From phone videos to a scene that trains:  mosa-capture videos=<folder> poses=<COLMAP model> output=<folder>"""
-
-from mosa.commands.configured import command
-
-main = command(__name__, "mosa.capture.making:make")

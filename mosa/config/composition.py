@@ -1,0 +1,48 @@
+"""A run's configuration in Python, as the command line composes it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+GROUPED = "scene"
+"""The group whose option a bare name chooses."""
+
+
+def current_folder() -> str:
+    """Of the job that Hydra runs, for ${run_folder:} in conf/; outputs where there is none, as in a script or a notebook."""
+    return HydraConfig.get().runtime.output_dir if HydraConfig.initialized() else "outputs"
+
+
+OmegaConf.register_new_resolver("run_folder", current_folder, replace=True)
+
+
+def configuration() -> str:
+    """Folder of the configuration: inside of an installed package, beside it in a clone."""
+    package = Path(__file__).parents[1]
+    inside = package / "conf"
+    return str(inside if inside.is_dir() else package.parent / "conf")
+
+
+def compose(*overrides: str, name: str = "train") -> DictConfig:
+    """conf/<name>.yaml with overrides as on the command line: `compose("scene=rabbit", "prior=neo_hookean")`.
+
+    Errors: Hydra's for an override that it does not know."""
+    with initialize_config_dir(configuration(), version_base="1.3"):
+        return hydra_compose(name, overrides=list(overrides))
+
+
+def composed(first: str | Mapping[str, Any] | DictConfig | None, overrides: tuple[str, ...]) -> DictConfig:
+    """A whole configuration, from one (which takes no overrides), or from overrides, of which the first may be a scene's name."""
+    if isinstance(first, Mapping | DictConfig):
+        if overrides:
+            raise TypeError(f"overrides: expected none beside a whole configuration, found {overrides}; give them to mosa.compose")
+        return first if isinstance(first, DictConfig) else OmegaConf.create(dict(first))
+    given = () if first is None else (first if "=" in first else f"{GROUPED}={first}",)
+    return compose(*given, *overrides)

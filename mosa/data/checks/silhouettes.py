@@ -1,0 +1,164 @@
+"""Do outlines and ground fit the cameras? What is inside of all mattes at once has to fill each of them, and to meet the ground.
+
+Centroids' lines of sight meet as well where focal lengths, aspect ratios or mirrored poses are wrong; a visual hull does not then
+fill the mattes that it was carved with. A wrong ground, or an up that is another axis, leaves it below the ground or above it.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from mosa.data.checks.free_fall import track_of
+from mosa.data.hull import hull_bounds, visual_hull
+from mosa.errors import DataError
+from mosa.types import Cameras, Scene
+
+RESOLUTION = 40
+"""Voxels along the hull's longest side."""
+OPEN, SUSPECT = 0.2, 0.04
+"""Share of a matte that the hull leaves open from which on data are refused, and warned of. With a right calibration it is at most
+0.001 (built-in films of 64 to 400 px, PAC-NeRF's bird)."""
+ISLAND = 4
+"""Pixels of a matte, in pieces that no other camera sees, from which on they are said; single ones are noise of matting."""
+SUNK = 0.25
+"""Share of the hull below the ground in frame 0 from which on the ground is elsewhere."""
+APART = 0.35
+"""Radii between the ground and the lowest point of the hull where the object turns round, from which on it is said. Bodies of films
+that are right turn within 0.15."""
+
+
+STRAY, LOST = 0.3, 0.6
+"""Radii from the middle of the true particles to where the cameras see the object, from which on they are warned of, and refused.
+Of the built-in films it is at most 0.1."""
+
+
+def check_particles(scene: Scene, label: str) -> None:
+    """True particles lie where the cameras see the object, in every frame. Errors: DataError naming scene.particles and frame."""
+    track = None if scene.particles is None else track_of(scene)
+    if track is None:
+        return
+    far = torch.stack([(cloud.double().mean(0) - point).norm() for cloud, point in zip(scene.particles, track.points)])
+    frame = int(far.argmax())
+    extent = float((scene.particles[0].amax(0) - scene.particles[0].amin(0)).max())
+    said = (f"{label}: scene.particles: expected the particles of frame {frame} where the cameras see the object, at "
+            f"{[round(x, 3) for x in track.points[frame].tolist()]} m, found their middle "
+            f"{float(far[frame]):.3g} m beside it: check their unit and axes, and which file is which frame")
+    if float(far[frame]) > LOST * track.radius:
+        raise DataError(said)
+    if not 0.5 * track.radius < extent < 8 * track.radius:
+        raise DataError(f"{label}: scene.particles: expected a cloud of the object's size, whose radius is {track.radius:.3g} m, "
+                        f"found one of {len(scene.particles[0])} particles over {extent:.3g} m")
+    if float(far[frame]) > STRAY * track.radius:
+        warnings.warn(said, stacklevel=3)
+
+
+def hull_points(mattes: Tensor, cameras: Cameras, box: Tensor) -> tuple[Tensor, float]:
+    """Points (M, 3) [m] of the visual hull of mattes (V, H, W), and their distance [m]. Errors: DataError where there are none."""
+    bounds = hull_bounds(mattes, cameras, box, resolution=32)
+    pitch = float((bounds[1] - bounds[0]).max()) / RESOLUTION
+    hull = visual_hull(mattes, cameras, box, pitch=pitch)
+    return hull.points()[hull.values > 0.5], pitch
+
+
+def left_open(points: Tensor, pitch: float, mattes: Tensor, cameras: Cameras) -> Tensor:
+    """Share (V,) of each matte (V, H, W) that is further than a voxel from where points (M, 3) are seen."""
+    return open_and_apart(points, pitch, mattes, cameras)[0]
+
+
+def open_and_apart(points: Tensor, pitch: float, mattes: Tensor, cameras: Cameras) -> tuple[Tensor, list[int]]:
+    """What `left_open` says, and how many pixels of each matte are in pieces of which all is open."""
+    shares, islands = [], []
+    for matte, K, w2c in zip(mattes, cameras.K, cameras.w2c):
+        seen = points @ w2c[:3, :3].T + w2c[:3, 3]
+        pixel = seen @ K.T
+        column, row = (pixel[:, :2] / pixel[:, 2:].clamp(min=1e-6)).floor().long().T
+        shown = (seen[:, 2] > 0) & (column >= 0) & (row >= 0) & (column < cameras.width) & (row < cameras.height)
+        covered = np.zeros(tuple(matte.shape), np.uint8)
+        covered[row[shown].numpy(), column[shown].numpy()] = 1
+        reach = math.ceil(pitch * float(K[[0, 1], [0, 1]].max()) / float(seen[:, 2].mean().clamp(min=1e-6)))
+        reach = min(max(reach, 1), max(tuple(matte.shape)))
+        covered = cv2.dilate(covered, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)).astype(bool)
+        inside = (matte > 0.5).numpy()
+        shares.append(float((inside & ~covered).sum() / max(inside.sum(), 1)))
+        _, pieces = cv2.connectedComponents(inside.astype(np.uint8), connectivity=8)
+        islands.append(int((inside & ~np.isin(pieces, np.unique(pieces[covered & inside]))).sum()))
+    return torch.tensor(shares), islands
+
+
+def whole_views(scene: Scene, frame: int) -> list[int]:
+    """Cameras whose matte shows something and does not touch the border."""
+    shown = scene.mattes[:, frame] > 0.5
+    cut = torch.cat([shown[:, 0], shown[:, -1], shown[..., 0], shown[..., -1]], 1).any(1)
+    return [v for v in range(len(shown)) if bool(shown[v].any()) and not bool(cut[v])]
+
+
+def check_outlines(scene: Scene, label: str) -> None:
+    """The mattes of a frame are those of one solid, and it meets the ground where the ground is said to be.
+
+    Looks at frame 0 and at the one where the object is lowest. Errors: DataError naming cameras and frame, or scene.ground.height
+    and scene.up. Silent where fewer than three mattes are whole.
+    """
+    track = track_of(scene)
+    turn = 0 if track is None else int((track.points @ scene.up.double()).argmin())
+    worst = (0.0, "")
+    for frame in sorted({0, turn}):
+        views = whole_views(scene, frame)
+        if len(views) < 3:
+            continue
+        mattes, cameras = scene.mattes[views, frame], scene.cameras.select(views)
+        try:
+            points, pitch = hull_points(mattes, cameras, scene.box)
+        except DataError as error:
+            raise DataError(f"{label}, frame {frame}: {error}") from error
+        if not len(points):
+            continue  # thinner than a voxel
+        shares, islands = open_and_apart(points, pitch, mattes, cameras)
+        worst = max(worst, most_open(shares, cameras.names, frame, label))
+        if frame == 0 and max(islands) >= ISLAND:  # later it may splash, and drops are thinner than a voxel
+            v = islands.index(max(islands))
+            many = sum(pixels >= ISLAND for pixels in islands)
+            warnings.warn(f"{label}: the matte of camera {cameras.names[v]}, frame 0, has {islands[v]} pixels apart from the "
+                          f"object, where the other cameras see nothing ({many} cameras have such): expected one object; clear "
+                          "them", stacklevel=3)  # fmt: skip
+        if scene.ground is None:
+            continue
+        heights = points @ scene.up - scene.ground.height
+        below = float((heights < 0).float().mean())
+        if frame == 0 and below > SUNK:
+            raise DataError(
+                f"{label}: scene.ground.height: expected the object above the ground of {scene.ground.height:g} m in frame 0, "
+                f"found {below:.0%} of it below, its lowest point at {float(heights.min()) + scene.ground.height:.3g} m; correct "
+                f"it, or scene.up (now {[round(float(x), 3) for x in scene.up]}), or the axes of the poses"
+            )
+        if 0 < frame < scene.frames - 1:
+            check_landing(float(heights.min()), track.radius, frame, label)
+    if worst[0] > OPEN:
+        raise DataError(worst[1])
+    if worst[0] > SUSPECT:
+        warnings.warn(worst[1], stacklevel=3)
+
+
+def most_open(shares: Tensor, names: tuple[str, ...], frame: int, label: str) -> tuple[float, str]:
+    """The largest share of a matte that is open, and what is said of it."""
+    order = shares.argsort(descending=True)[:4].tolist()
+    listed = ", ".join(f"{names[v]} ({float(shares[v]):.0%})" for v in order if float(shares[v]) > 0.25 * float(shares.max()))
+    return float(shares.max()), (
+        f"{label}: the outlines of frame {frame} are not those of one solid: what all cameras see together should fill every "
+        f"matte, and leaves open of the cameras {listed}: check focal lengths (fl_x, fl_y), principal points, lens distortion, "
+        "mirrored or exchanged poses, a scene.box that cuts the object, and mattes that belong to another moment"
+    )
+
+
+def check_landing(height: float, radius: float, frame: int, label: str) -> None:
+    """A warning where the object turns round far from the ground."""
+    if abs(height) > APART * radius:
+        where = "above" if height > 0 else "below"
+        warnings.warn(f"{label}: the object turns round in frame {frame} with its lowest point {abs(height):.3g} m {where} the "
+                      "ground: expected it there; check scene.ground.height and scene.up (what else it lands on "
+                      "is one of world.colliders)", stacklevel=4)  # fmt: skip

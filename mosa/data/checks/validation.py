@@ -1,0 +1,267 @@
+"""Checks that a scene makes sense before anything is learned from it, and the key under which results are cached."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import warnings
+from dataclasses import replace
+
+import torch
+
+from mosa.data.checks.cameras import check_agreement, holes_report
+from mosa.data.checks.free_fall import check_fall
+from mosa.data.checks.silhouettes import check_outlines, check_particles
+from mosa.data.checks.tangents import check_pictures
+from mosa.data.formats.footage import TIME_JITTER
+from mosa.errors import DataError
+from mosa.types import Scene
+
+FULL = 0.99
+"""Share of an image from which on a matte says nothing."""
+CLEAR = 0.9
+"""Coverage that a camera's matte has somewhere in a film."""
+FLASH = 0.2
+"""By which an object's mean colour, of 0 to 1, may leave the line between the frames beside it. Built-in films stay
+below 0.04."""
+DRIFT = 0.15
+"""By which it may change over a film, averaged over all learning cameras, so that what turns into one's view leaves another's: a
+body in one light that is exposed the same stays below 0.075 in the built-in films, at 0.022 in the bird's."""
+CORNER = 0.1
+"""Share of an image's size from its corner within which a principal point was measured from the image's centre."""
+FARTHEST = 100.0
+"""[m] of a camera from the origin: float32 rounds positions to 0.008 mm there, a thousandth of a pixel."""
+APART = 3.0
+"""Of the cameras' distances from their middle: farther off the whole capture is away from the origin, and not in another unit."""
+SQUARE, NEARLY = 2.0, 1.05
+"""Ratios of the two focal lengths of a camera from which on they are refused, and warned of: sensors have square pixels."""
+
+
+def validate(scene: Scene) -> Scene:
+    """The scene itself. Errors: DataError naming camera and frame, what was expected and what was found.
+
+    Suspicious holes in the mattes of real footage are a warning: only who took it knows whether they are openings.
+    """
+    V, T = len(scene.cameras), scene.frames
+    H, W = scene.cameras.height, scene.cameras.width
+    label = f"scene {scene.name} ({scene.sequence})"
+    for name, found, expected in (
+        ("images", scene.images.shape, (V, T, H, W, 3)), ("mattes", scene.mattes.shape, (V, T, H, W)),
+        ("times", scene.times.shape, (T,)),
+    ):  # fmt: skip
+        if tuple(found) != expected:
+            raise DataError(f"{label}: {name}: expected shape {expected}, found {tuple(found)}")
+    for name in ("images", "mattes"):
+        value = getattr(scene, name)
+        if value.numel() and all(map(math.isfinite, map(float, value.aminmax()))):  # of which NaN is the least and the largest
+            continue
+        for v in range(V):
+            for t in range(T):
+                if not bool(torch.isfinite(value[v, t]).all()):
+                    raise DataError(f"{label}: {name}: NaN or infinite pixels in camera {scene.cameras.names[v]}, frame {t}")
+    check_cameras(scene, label)
+    check_times(scene, label)
+    check_mattes(scene, label)
+    check_borders(scene, label)
+    learned = scene.training_cameras
+    check_film(replace(scene, images=scene.images[learned], mattes=scene.mattes[learned], cameras=scene.cameras.select(learned),
+                       holdout_cameras=()) if scene.holdout_cameras else scene, label)  # fmt: skip
+    if scene.holdout_cameras:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # they are said
+                check_film(scene, label)
+        except DataError as error:
+            warnings.warn(f"{error} (nothing is learned from cameras that are held out; figures of their images count on them)",
+                          stacklevel=2)
+    if not scene.synthetic:
+        check_colors(scene, label)
+    holes = None if scene.synthetic else holes_report(scene)
+    if holes:
+        warnings.warn(f"{label}: {holes}", stacklevel=2)
+    return scene
+
+
+def check_film(scene: Scene, label: str) -> None:
+    """All cameras see one object, at every moment, and it moves as one that falls. Errors: DataError."""
+    check_agreement(scene, label)
+    check_pictures(scene, label)
+    for frame in range(1, scene.frames):
+        check_agreement(scene, label, frame)
+    check_fall(scene, label)
+    if not scene.synthetic:
+        check_outlines(scene, label)
+        check_particles(scene, label)
+
+
+def check_cameras(scene: Scene, label: str) -> None:
+    """Proper poses, near the origin, and positive focal lengths."""
+    cameras = scene.cameras
+    places = -torch.einsum("vji,vj->vi", cameras.w2c[:, :3, :3], cameras.w2c[:, :3, 3]).double()
+    spread = float((places - places.mean(0)).norm(dim=1).max())
+    for v, name in enumerate(cameras.names):
+        if not bool(torch.isfinite(cameras.K[v]).all() and torch.isfinite(cameras.w2c[v]).all()):
+            raise DataError(f"{label}: camera {name}: NaN or infinite numbers in its calibration")
+        if (far := float(places[v].norm())) > FARTHEST and far > APART * spread:  # else the unit is wrong, which is said below
+            raise DataError(f"{label}: camera {name}: expected within {FARTHEST:g} m of the origin, where float32 has digits for "
+                            f"an image, found {far:.5g} m: subtract one offset from all cameras, the box, ground and solids")
+        if not bool((cameras.K[v].diagonal()[:2] > 0).all()):
+            raise DataError(
+                f"{label}: camera {name}: expected positive focal lengths, found {cameras.K[v].diagonal()[:2].tolist()}"
+            )
+        check_pixels(cameras.K[v], f"{label}: camera {name}")
+        R = cameras.w2c[v, :3, :3].double()
+        if float((R @ R.T - torch.eye(3, dtype=R.dtype)).abs().max()) > 2e-3 or float(torch.linalg.det(R)) < 0:
+            raise DataError(f"{label}: camera {name}: expected a rotation in its pose, found {R.tolist()}")
+        cx, cy = cameras.K[v, 0, 2].item(), cameras.K[v, 1, 2].item()
+        inside = 0 < cx < cameras.width and 0 < cy < cameras.height
+        centred = max(abs(cx) / cameras.width, abs(cy) / cameras.height) < CORNER
+        said = (f"{label}: camera {name}: the principal point cx, cy = ({cx:.1f}, {cy:.1f}) px lies "
+                f"{'in the corner' if inside else 'outside'} of its {cameras.width}x{cameras.height} px images: ")
+        said += ("measured from their centre? Expected from the upper left corner: add half of their size" if centred else
+                 "intrinsics of another resolution?")
+        if not inside:
+            raise DataError(said)
+        if centred:
+            warnings.warn(said, stacklevel=3)
+
+
+def check_pixels(K: torch.Tensor, label: str) -> None:
+    """A pinhole camera's matrix, and both focal lengths nearly one. Errors: DataError where one is twice the other; a warning where
+    they differ visibly."""
+    if float((K[[1, 2, 2, 2], [0, 0, 1, 2]] - torch.tensor([0.0, 0.0, 0.0, 1.0])).abs().max()) > 1e-6:
+        raise DataError(f"{label}: intrinsics: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]], found {K.tolist()}")
+    across, down = K[0, 0].item(), K[1, 1].item()
+    ratio = max(across / down, down / across)
+    said = (f"{label}: expected focal lengths of square pixels, found fl_x = {across:.5g} and fl_y = {down:.5g} px: were the "
+            "images stretched, or one of them taken for another size?")
+    if ratio >= SQUARE:
+        raise DataError(said)
+    if ratio > NEARLY:
+        warnings.warn(said, stacklevel=4)
+
+
+def check_times(scene: Scene, label: str) -> None:
+    """Increasing times at one frame rate."""
+    steps = scene.times.double().diff()
+    if not bool(torch.isfinite(scene.times).all()) or not bool((steps > 0).all()):
+        raise DataError(f"{label}: expected increasing frame times, found {[round(t, 5) for t in scene.times.tolist()]}")
+    # float32 keeps 7 digits of the time itself, which is more than the jitter only for steps far smaller than the time
+    allowed = TIME_JITTER * float(steps.median()) + 2e-7 * float(scene.times.abs().max())
+    worst = int((steps - steps.median()).abs().argmax())
+    if abs(float(steps[worst] - steps.median())) > allowed:
+        raise DataError(
+            f"{label}: expected one frame rate, found {float(steps[worst]):.6f} s between frames {worst} and {worst + 1} and "
+            f"{float(steps.median()):.6f} s elsewhere; restrict scene.frames, or set scene.fps if the times are wrong"
+        )
+
+
+def check_mattes(scene: Scene, label: str) -> None:
+    """The object is seen by every camera at frame 0, and is not everything a camera sees."""
+    covered = scene.mattes.mean((2, 3))
+    for v, name in enumerate(scene.cameras.names):
+        if float(covered[v, 0]) == 0:
+            raise DataError(
+                f"{label}: camera {name}: the matte of the first frame is empty; expected the object in view of every "
+                "camera there: matte it, remove the camera, or start later with scene.frames"
+            )
+        if float(covered[v].max()) > FULL:
+            t = int(covered[v].argmax())
+            every = "; the footage has no matte (an alpha channel that is opaque everywhere?)"
+            one = ": an opaque alpha channel, or an object too near; matte it, or restrict scene.frames"
+            raise DataError(f"{label}: camera {name}, frame {t}: the matte covers {float(covered[v, t]):.0%} of the image"
+                            f"{every if float(covered[v].min()) > FULL else one}")
+    check_gaps(scene, covered > 0, label)
+    most = scene.mattes.amax((1, 2, 3))
+    if float(most.min()) < CLEAR:
+        v = int(most.argmin())
+        warnings.warn(f"{label}: camera {scene.cameras.names[v]}: the matte is nowhere more than {float(most[v]):.2f} in any "
+                      "frame: expected 1 inside of the object; what is missing mixes the background into its colours", stacklevel=3)
+
+
+def check_gaps(scene: Scene, seen: torch.Tensor, label: str) -> None:
+    """No frame loses the object that frames after it show: in all cameras that is refused, in one a warning. seen: (V, T)."""
+    later = seen.flip(1).cummax(1).values.flip(1)
+    gap = later & ~seen
+    views = seen.sum(0)
+    if bool((lost := (views < 2) & (later.sum(0) >= 2)).any()):
+        t = int(lost.int().argmax())
+        raise DataError(f"{label}: {int(views[t])} of {len(seen)} cameras have a matte of the object in frame {t}, and more of "
+                        "them in a later one: expected two at least in every frame between; matte it, or restrict scene.frames")
+    if bool(gap.any()):
+        v, t = (int(i) for i in gap.nonzero()[0])
+        warnings.warn(f"{label}: camera {scene.cameras.names[v]}, frame {t}: the matte is empty, where it shows the object in a "
+                      f"later frame ({int(gap.sum())} such mattes): expected the object; what the camera shows there counts as "
+                      "nothing being there", stacklevel=4)  # fmt: skip
+
+
+def check_colors(scene: Scene, label: str) -> None:
+    """A warning where the object's mean colour jumps in one frame of a camera and comes back: a frame that was not exposed, or
+    dropped and filled with black. And one where all cameras' changes over the film: another exposure, or a light that changes."""
+    inside = (scene.mattes > CLEAR).float()
+    means = (scene.images * inside[..., None]).sum((2, 3)) / inside.sum((2, 3))[..., None].clamp(min=1)
+    seen = inside.sum((2, 3)) > 0
+    jump = (means[:, 1:-1] - (means[:, :-2] + means[:, 2:]) / 2).abs().amax(2) * (seen[:, 1:-1] & seen[:, :-2] & seen[:, 2:])
+    if jump.numel() and float(jump.max()) > FLASH:
+        v, t = divmod(int(jump.argmax()), jump.shape[1])
+        warnings.warn(f"{label}: camera {scene.cameras.names[v]}, frame {t + 1}: the object's mean colour is "
+                      f"{float(jump[v, t]):.2f} beside that of the frames before and after: a dropped or flashed frame? expected "
+                      "one light", stacklevel=3)
+        return
+    chosen = scene.training_cameras
+    weight = inside[chosen]
+    together = (scene.images[chosen] * weight[..., None]).sum((0, 2, 3)) / weight.sum((0, 2, 3))[:, None].clamp(min=1)
+    shown = weight.sum((0, 2, 3)) > 0
+    if int(shown.sum()) < 2:
+        return
+    change = together[shown].amax(0) - together[shown].amin(0)
+    if float(change.max()) > DRIFT:
+        channel = int(change.argmax())
+        values = torch.where(shown, together[:, channel], torch.nan)
+        first, last = (int(i) for i in (values.nan_to_num(2.0).argmin(), values.nan_to_num(-1.0).argmax()))
+        name = ("red", "green", "blue")[channel]
+        warnings.warn(f"{label}: the object's mean {name} over all cameras is {float(values[first]):.2f} in frame {first} and "
+                      f"{float(values[last]):.2f} in frame {last}: does the exposure, the white balance or the light change? "
+                      "expected one; colours are compared from frame to frame", stacklevel=3)
+
+
+def check_borders(scene: Scene, label: str) -> None:
+    """The first frame, which says where the object is, shows all of it to two learning cameras at least."""
+    covered = scene.mattes > 0.5
+    cut = torch.cat([covered[:, :, 0], covered[:, :, -1], covered[..., 0], covered[..., -1]], 2).any(2)
+    names = [scene.cameras.names[v] for v in scene.training_cameras if bool(cut[v, 0])]
+    if len(scene.training_cameras) - len(names) < 2:
+        raise DataError(f"{label}: the image's border cuts the object in frame 0 of the cameras {', '.join(names)}: expected two "
+                        "that see all of it; film from farther away, or start with another frame (scene.frames)")
+    if names:
+        warnings.warn(f"{label}: the image's border cuts the object in frame 0 of the cameras {', '.join(names)}; what is outside "
+                      "is known to the others alone", stacklevel=3)
+
+
+def fingerprint(scene: Scene) -> str:
+    """Hash of everything that learning can depend on: images, mattes, cameras, times, world, and what is held out."""
+    digest = hashlib.sha256()
+    for tensor in (
+        scene.images,
+        scene.mattes,
+        scene.cameras.K,
+        scene.cameras.w2c,
+        scene.times,
+        scene.gravity,
+        scene.up,
+        scene.box,
+        scene.background,
+    ):
+        digest.update(str(tuple(tensor.shape)).encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy())
+    facts = (
+        scene.cameras.width,
+        scene.cameras.height,
+        scene.ground,
+        scene.density,
+        scene.last_free_frame,
+        scene.holdout_cameras,
+        scene.holdout_frames,
+    )
+    digest.update(repr(facts).encode())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,183 @@
+"""A Scene from footage and the keys of conf/scene that say what world it shows: what every format's loader ends with."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from mosa.data.checks.validation import fingerprint
+from mosa.data.formats.footage import Footage
+from mosa.data.formats.particles import read_clouds
+from mosa.errors import ConfigError
+from mosa.schema import is_number
+from mosa.types import Ground, Scene, Truth
+
+DENSITIES = 0.1, 1e5
+"""[kg/m^3]: aerogel has 1, osmium 22,590."""
+LIGHT = 10.0
+"""[kg/m^3] below which a density is asked about: foams of polystyrene have 15."""
+STEEP = 3.0
+"""[degrees] of an incline that is said."""
+WIDEST = 1e5
+"""[m] of scene.box: with gravity and seconds, nothing that cameras film is larger."""
+
+
+def scene_from_footage(
+    footage: Footage,
+    *,
+    name: str,
+    gravity,
+    box,
+    ground: Ground | None,
+    up=(0.0, 1.0, 0.0),
+    density: float = 1000.0,
+    sequence: str = "train",
+    fps: float | None = None,
+    last_free_frame: int | None = None,
+    holdout_cameras=(),
+    holdout_frames=(),
+    particles: Path | None = None,
+    known_parameters: dict[str, float] | None = None,
+    truth: Truth | None = None,
+    synthetic: bool = False,
+) -> Scene:
+    """Scene from footage and the keys that say what world it shows.
+
+    gravity [m/s^2], up, box ((min), (max)) [m]: three numbers each; density [kg/m^3]; last_free_frame and holdout_frames: frame
+    numbers as in the files; holdout_cameras: names; particles: folder of PLY files, one per frame; fps overrides times.
+    Errors: ConfigError naming the key, DataError for particle files.
+    """
+    up = vector(up, "up")
+    if not up.norm() > 0:
+        raise ConfigError("scene.up: expected a direction, found zero")
+    pull = vector(gravity, "gravity")
+    if ground is not None and bool(pull.norm() > 0) and not float(pull @ up) < 0:
+        raise ConfigError(
+            f"scene.gravity: expected a pull towards the ground, against scene.up = {up.tolist()}, found {pull.tolist()}; set both"
+        )
+    try:
+        low, high = box
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"scene.box: expected [[x, y, z] min, [x, y, z] max], found {box!r}") from error
+    box = torch.stack([vector(low, "box"), vector(high, "box")])
+    if not bool((box[1] > box[0]).all()):
+        raise ConfigError(f"scene.box: expected min < max on every axis, found {box.tolist()}")
+    if float(box.abs().max()) > WIDEST:
+        raise ConfigError(f"scene.box: expected metres within {WIDEST:g}, found {box.tolist()}")
+    if not is_number(density) or not DENSITIES[0] <= density <= DENSITIES[1]:
+        raise ConfigError(f"scene.density: expected a positive number of {DENSITIES[0]:g} to {DENSITIES[1]:g} kg/m^3, "
+                          f"found {density!r}")
+    times = footage.times
+    if fps is not None:
+        check_fps(fps)
+        times = torch.tensor([(f - footage.frames[0]) / fps for f in footage.frames], dtype=torch.float32)
+    if last_free_frame is not None:
+        if isinstance(last_free_frame, bool) or last_free_frame not in footage.frames:
+            raise ConfigError(
+                f"scene.last_free_frame: no frame {last_free_frame}; the scene has {footage.frames[0]} to {footage.frames[-1]}"
+            )
+        last_free_frame = footage.frames.index(last_free_frame)
+    check_ground(ground, up / up.norm(), pull, box)
+    if density < LIGHT:
+        warnings.warn(f"scene.density: {density:g} kg/m^3 is lighter than nearly all solids; was it meant in g/cm^3? Moduli scale "
+                      "with it", stacklevel=4)
+    scene = Scene(
+        name=name, sequence=sequence, images=footage.images, mattes=footage.mattes, cameras=footage.cameras, times=times,
+        gravity=pull, up=up / up.norm(), ground=ground, box=box, density=float(density),
+        background=footage.background, synthetic=synthetic, last_free_frame=last_free_frame,
+        holdout_cameras=held_out_cameras(holdout_cameras, footage.cameras.names),
+        holdout_frames=held_out_frames(holdout_frames, footage.frames), truth=truth,
+        particles=read_clouds(particles, footage.frames) if particles is not None else None,
+        known_parameters=dict(known_parameters or {}),
+    )  # fmt: skip
+    return replace(scene, fingerprint=fingerprint(scene))
+
+
+def check_ground(ground: Ground | None, up: torch.Tensor, pull: torch.Tensor, box: torch.Tensor) -> None:
+    """The ground lies in the box, and what falls falls onto it: a warning where it is an incline. up: (3,) unit vector.
+
+    Errors: ConfigError naming scene.box."""
+    if ground is None:
+        return
+    corners = torch.stack(torch.meshgrid(*box.T, indexing="ij"), -1).reshape(-1, 3) @ up
+    low, high = float(corners.min()), float(corners.max())
+    if not low <= ground.height < high:
+        raise ConfigError(f"scene.box: expected one that the ground at scene.ground.height={ground.height:g} m lies in, found "
+                          f"{box.tolist()}, which reaches from {low:.4g} to {high:.4g} m along scene.up")
+    if float(pull.norm()) > 0:
+        angle = math.degrees(math.acos(min(1.0, float(-(pull.double() @ up.double()) / pull.double().norm()))))
+        if angle > STEEP:
+            warnings.warn(f"scene.gravity: pulls at {angle:.3g} degrees from scene.up, so that the ground is an incline: set "
+                          "scene.up along -scene.gravity where it is not", stacklevel=5)  # fmt: skip
+
+
+def vector(value, key: str) -> torch.Tensor:
+    """(3,) float32. Errors: ConfigError naming the key."""
+    if isinstance(value, (str, Mapping)) or (isinstance(value, (list, tuple)) and any(isinstance(v, (bool, str)) for v in value)):
+        raise ConfigError(f"scene.{key}: expected three numbers, found {value!r}")
+    try:
+        result = torch.tensor([float(v) for v in value], dtype=torch.float32)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"scene.{key}: expected three numbers, found {value!r}") from error
+    if result.shape != (3,) or not bool(torch.isfinite(result).all()):
+        raise ConfigError(f"scene.{key}: expected three finite numbers, found {value!r}")
+    return result
+
+
+def check_fps(fps) -> None:
+    """Errors: ConfigError where frames per second are none."""
+    if not is_number(fps) or not fps > 0:
+        raise ConfigError(f"scene.fps: expected a positive number, found {fps!r}")
+
+
+def held_out_cameras(names, footage_names: tuple[str, ...]) -> tuple[int, ...]:
+    """Indices of the cameras that are named. Errors: ConfigError for an unknown name, or where under two are left."""
+    if names is not None and not isinstance(names, (list, tuple)):
+        raise ConfigError(f"scene.holdout_cameras: expected a list of cameras like [3], found {names!r}")
+    indices = []
+    for name in names or ():
+        if str(name) not in footage_names:
+            raise ConfigError(f"scene.holdout_cameras: no camera {name!r}; the scene has {', '.join(footage_names)}")
+        indices.append(footage_names.index(str(name)))
+    if len(footage_names) < 2:
+        raise ConfigError(f"scene: expected at least two cameras, found {len(footage_names)}")
+    if len(footage_names) - len(set(indices)) < 2:
+        raise ConfigError(
+            f"scene.holdout_cameras: {len(set(indices))} of {len(footage_names)} held out; two must be left to learn from"
+        )
+    return tuple(sorted(set(indices)))
+
+
+def held_out_frames(numbers, frames: tuple[int, ...]) -> tuple[int, ...]:
+    """Indices of held-out frames: a list of frame numbers, or a count of last frames. They have to be the last ones.
+
+    Errors: ConfigError where a number is unknown, where they are not the end of the sequence, or under three are left.
+    """
+    if isinstance(numbers, bool) or not isinstance(numbers, (int, list, tuple, type(None))):
+        raise ConfigError(f"scene.holdout_frames: expected a list of frame numbers or how many are held out, found {numbers!r}")
+    if isinstance(numbers, int):
+        if numbers < 0:
+            raise ConfigError(f"scene.holdout_frames: expected a number >= 0, found {numbers}")
+        numbers = frames[len(frames) - numbers :] if 0 <= numbers <= len(frames) else frames
+    indices = set()
+    for number in numbers or ():
+        if number not in frames:
+            raise ConfigError(f"scene.holdout_frames: no frame {number}; the scene has {frames[0]} to {frames[-1]}")
+        indices.add(frames.index(number))
+    if indices and sorted(indices) != list(range(len(frames) - len(indices), len(frames))):
+        raise ConfigError(
+            f"scene.holdout_frames: expected the last frames of {frames[0]} to {frames[-1]}, found {sorted(numbers)}; "
+            "what comes after a gap cannot be learned from"
+        )
+    if len(frames) < 3:
+        raise ConfigError(f"scene.frames: expected at least three frames to learn from, found {len(frames)}")
+    if len(frames) - len(indices) < 3:
+        raise ConfigError(
+            f"scene.holdout_frames: {len(indices)} of {len(frames)} frames held out; three must be left to learn from"
+        )
+    return tuple(sorted(indices))

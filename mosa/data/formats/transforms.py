@@ -1,0 +1,302 @@
+"""transforms.json, as Blender scripts and Nerfstudio write it, with a time per frame: the way in for one's own capture."""
+
+from __future__ import annotations
+
+import math
+import re
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mosa.data.formats.footage import (
+    WHITE,
+    Footage,
+    even_times,
+    footage_of,
+    frame_range,
+    matrix,
+    number,
+    read_json,
+    same_camera,
+    scaled,
+    told_rate,
+    world_to_camera,
+)  # fmt: skip
+from mosa.data.formats.scene_from_footage import scene_from_footage
+from mosa.data.images.lens import COEFFICIENTS, FOREIGN, is_fisheye, lens_of
+from mosa.data.images.reading import (
+    check_amount,
+    composite,
+    expect_size,
+    faintless,
+    fill_holes,
+    matte_of,
+    read_image,
+    resize,
+    scaled_size,
+)
+from mosa.errors import DataError
+from mosa.types import Scene
+
+LONGEST = 1000
+"""Characters of a path: a file system takes 4096 bytes, of names of 255 each."""
+EXTENSIONS = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG")
+JITTER = 0.01
+"""By how much poses of a camera that stands still may differ: radians, and shares of the cameras' distance from their middle. Where
+each image's is solved for itself they differ by about a pixel, 0.002."""
+CUT = 1e-3
+"""Share of a matte that undoing a lens may cut off before it is said."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One entry: where it is written, image and mask file, time [s] or None, own intrinsics, pose w2c (4, 4), camera label,
+    whether its lens is a fisheye."""
+
+    where: str
+    image: Path
+    mask: Path | None
+    time: float | None
+    intrinsics: dict[str, float]
+    w2c: np.ndarray
+    camera: str | None
+    fisheye: bool = False
+
+
+def read_transforms(path: str | Path, *, frames=None, fps: float | None = None, scale: float = 1.0, fill: int = 0) -> Footage:
+    """Footage of a transforms.json (path: the file, or its folder).
+
+    Top level or per entry: fl_x, fl_y, cx, cy [px] or camera_angle_x [rad], w, h, the lens' k1 to k4, p1, p2, camera_model (see
+    `lens.py`: it is undone, images and mattes are then those of a pinhole). Per entry: file_path (extension may be left
+    out), transform_matrix (camera to world, OpenGL axes), time [s] (left out: the last number in the file names that differs
+    counts frames at fps; where all entries have one and fps is given, evenly spaced times take their place), mask_path (grey,
+    white = object; left out: the image's alpha), camera (left out: entries with one pose are one camera). fill: holes
+    of mattes up to this many pixels of the file are covered. Errors: DataError naming file and entry, ConfigError.
+    """
+    file = Path(path)
+    file = file / "transforms.json" if file.is_dir() or not file.suffix else file
+    document = read_json(file)
+    shots = read_shots(file, document, fps)
+    cameras, by_camera = group(shots, file)
+    times, table = synchronise(by_camera, fps)
+    wanted = frame_range(list(range(len(times))), frames, str(file))
+    if fps is not None and all(entry.get("time") is not None for entry in document["frames"]):
+        told_rate([times[f] for f in wanted], fps, str(file))
+        times = [i / fps for i in range(len(times))]
+    remedy = "correct them, restrict scene.frames, or set scene.fps where every entry has a time"
+    even_times([times[f] for f in wanted], wanted, str(file), remedy)
+    images, mattes, calibration = [], [], {}
+    for (name, shot), row in zip(cameras.items(), table):
+        pictures, lens, cut, full = [], None, 0.0, None
+        for frame in wanted:
+            color, matte = read_shot(row[frame])
+            matte = fill_holes(matte, fill)
+            if full is None:
+                full, first = color.shape[1::-1], row[frame].image.name
+                size = scaled_size(*full, scale)
+                check_amount(len(cameras) * len(wanted), *size)
+                K = camera_matrix(shot, *full)
+                lens = lens_of(K, shot.intrinsics, *full, fisheye=shot.fisheye, where=shot.where)
+                calibration[name] = scaled(K if lens is None else lens.K, full, size), shot.w2c
+            expect_size(row[frame].image, color, *full, reason=f"as {first} of the same camera")
+            picture = composite(color, matte, WHITE)
+            if lens is not None:
+                cut = max(cut, lens.lost(matte))
+                picture, matte = lens.straighten(picture, matte, WHITE)
+            pictures.append((resize(picture, *size), resize(matte, *size)))
+        if cut > CUT:
+            warnings.warn(f"{file}: camera {name}: undoing its lens distortion cuts off up to {cut:.1%} of the object, too close "
+                          "to the border of the image", stacklevel=2)
+        images.append(np.stack([p[0] for p in pictures]))
+        mattes.append(np.stack([p[1] for p in pictures]))
+    return footage_of(calibration, images, mattes, wanted, [times[f] for f in wanted], str(file))
+
+
+def read_shots(file: Path, document, fps: float | None) -> list[Shot]:
+    """The entries of a document. Errors: DataError naming entry and key."""
+    if not isinstance(document, dict) or not isinstance(document.get("frames"), list) or not document["frames"]:
+        raise DataError(f"{file}: expected an object with a list `frames`, one entry per image")
+    shared = {k: number(v, f"{file}, {k}") for k, v in document.items() if k in intrinsic_keys()}
+    shots = []
+    counting = counting_place([str(e.get("file_path")) for e in document["frames"] if isinstance(e, dict) and "time" not in e])
+    for i, entry in enumerate(document["frames"]):
+        where = f"{file}, frames[{i}]"
+        for key in ("file_path", "transform_matrix"):
+            if not isinstance(entry, dict) or key not in entry:
+                raise DataError(f"{where}: expected the key {key}")
+        if bent := [k for k in FOREIGN if entry.get(k, document.get(k))]:
+            raise DataError(f"{where}: {bent[0]}: expected a lens of k1, k2, k3, p1, p2 (or k1 to k4 of a fisheye), found a "
+                            "rational or thin prism model; undistort the images first")
+        intrinsics = shared | {k: number(v, f"{where}, {k}") for k, v in entry.items() if k in intrinsic_keys()}
+        fisheye = is_fisheye(entry.get("camera_model", document.get("camera_model")),
+                             entry.get("is_fisheye", document.get("is_fisheye")), where)
+        image = locate(file.parent, str(entry["file_path"]), where)
+        mask = locate(file.parent, str(entry["mask_path"]), where) if entry.get("mask_path") else None
+        pose = matrix(entry["transform_matrix"], (3, 4), f"{where}, transform_matrix")
+        time = number(entry["time"], f"{where}, time") if entry.get("time") is not None else None
+        if time is None:
+            time = counted_time(image, fps, where, counting)
+        camera = str(entry["camera"]) if entry.get("camera") is not None else None
+        shots.append(Shot(where, image, mask, time, intrinsics, world_to_camera(pose, where), camera, fisheye))
+    return shots
+
+
+def intrinsic_keys() -> tuple[str, ...]:
+    return ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", *COEFFICIENTS)
+
+
+def locate(folder: Path, name: str, where: str) -> Path:
+    """The file a path names, its extension left out or not. Errors: DataError where there is none."""
+    if len(name) > LONGEST or "\0" in name:
+        raise DataError(f"{where}: expected a path of at most {LONGEST} characters, found {len(name)}: {name[:60]!r} ...")
+    for extension in EXTENSIONS:
+        candidate = folder / (name + extension)
+        if candidate.is_file():
+            return candidate
+    raise DataError(f"{folder / name}: image not found ({where})")
+
+
+def counted_time(image: Path, fps: float | None, where: str, place: int) -> float:
+    """Time [s] from the number at that place of a file name."""
+    counter = re.findall(r"\d+", image.stem)
+    if fps is None or not counter:
+        raise DataError(f"{where}: expected a time in seconds, found none; add `time`, or number the files and set scene.fps")
+    return int(counter[place]) / fps
+
+
+def counting_place(names: list[str]) -> int:
+    """Which of the numbers in file names counts frames: the last that is not the same in all of them (`0_003_v2`: 003)."""
+    numbers = [re.findall(r"\d+", Path(name).stem) for name in names]
+    differ = [k for k, each in enumerate(zip(*numbers)) if len(set(each)) > 1]
+    return differ[-1] if differ and len({len(each) for each in numbers}) == 1 else -1
+
+
+def group(shots: list[Shot], file: Path) -> tuple[dict[str, Shot], dict[str, list[Shot]]]:
+    """Camera name -> the shot whose pose is nearest to the mean, and all its shots; by label, or by equal pose.
+
+    A warning where the poses of a label differ by a little. Errors: DataError where a camera has several intrinsics or moves, or
+    unlabelled ones all do.
+    """
+    members: dict[str, list[Shot]] = {}
+    for shot in shots:
+        same = (n for n, (s, *_) in members.items() if s.camera is None and same_camera((np.eye(3), s.w2c), np.eye(3), shot.w2c))
+        members.setdefault(next(same, str(len(members))) if shot.camera is None else shot.camera, []).append(shot)
+    places = np.array([-s.w2c[:3, :3].T @ s.w2c[:3, 3] for s in shots])
+    spread = float(np.linalg.norm(places - places.mean(0), axis=1).max()) or 1.0
+
+    def apart(a: Shot, b: Shot) -> float:
+        turn, way = a.w2c[:3, :3] - b.w2c[:3, :3], a.w2c[:3, :3].T @ a.w2c[:3, 3] - b.w2c[:3, :3].T @ b.w2c[:3, 3]
+        return max(float(np.abs(turn).max()), float(np.linalg.norm(way)) / spread)
+
+    if len(shots) > 2 and len(members) == len(shots):
+        close = sum(any(apart(a, b) < JITTER for b in shots if b is not a) for a in shots)
+        still = 2 * close > len(shots) >= 2 * len({shot.time for shot in shots})
+        cause = ("they seem to, with poses solved for each image: name the camera of each entry (`camera`)"
+                 if still else "a single moving camera cannot be used")
+        raise DataError(f"{file}: {len(shots)} entries with {len(members)} different poses: expected cameras that stand still and "
+                        f"see every frame; {cause}")
+    for name, (known, *others) in members.items():
+        for shot in others:
+            if key := next((k for k in intrinsic_keys() if known.intrinsics.get(k) != shot.intrinsics.get(k)), None):
+                raise DataError(f"{shot.where}: camera {name} has {key} = {shot.intrinsics.get(key)}, {known.intrinsics.get(key)} "
+                                f"in {known.where}: expected one lens, focus and zoom a camera; write one set in all its entries")
+        off, where = max(((apart(known, shot), shot.where) for shot in others), default=(0.0, ""))
+        found = (f"{where}: camera {name} has another pose than in {known.where}, {off:.2%} away (of a radian, or of the cameras' "
+                 "distance from their middle)")
+        if off > JITTER:
+            raise DataError(f"{found}; cameras must not move")
+        if off > 1e-5:
+            warnings.warn(f"{found}: solved for each image? The pose nearest to the mean is taken for all", stacklevel=4)
+    middle = {name: np.mean([shot.w2c for shot in own], 0) for name, own in members.items()}
+    return {name: min(own, key=lambda shot: float(np.abs(shot.w2c - middle[name]).sum())) for name, own in members.items()}, members
+
+
+def synchronise(by_camera: dict[str, list[Shot]], fps: float | None) -> tuple[list[float], list[list[Shot]]]:
+    """Times of the frames [s], and the shots [camera][frame]. DataError where one is missing or doubled."""
+    tolerance = 1e-6 if fps is None else 0.25 / fps
+    times: list[float] = []
+    for time in sorted(s.time for shots in by_camera.values() for s in shots):
+        if not times or time - times[-1] > tolerance:
+            times.append(time)
+    table = []
+    for name, shots in by_camera.items():
+        row: list[Shot | None] = [None] * len(times)
+        for shot in shots:
+            index = int(np.abs(np.array(times) - shot.time).argmin())
+            if row[index] is not None:
+                raise DataError(f"{shot.where}: camera {name} has two images at {shot.time:.6f} s, the other in {row[index].where}")
+            row[index] = shot
+        missing = [round(t, 6) for t, s in zip(times, row) if s is None]
+        if missing:
+            raise DataError(
+                f"{shots[0].where}: camera {name} has no image at {missing[:4]} s, where other cameras have one; "
+                f"cameras must be synchronous: {len(times)} frames expected, {len(shots)} found; {clocks(by_camera, fps)}"
+            )
+        table.append(row)
+    return times, table
+
+
+def clocks(by_camera: dict[str, list[Shot]], fps: float | None) -> str:
+    """What helps where the cameras' times do not meet: a frame rate, if their clocks are less than half a frame apart."""
+    rows = [sorted(shot.time for shot in shots) for shots in by_camera.values()]
+    count = len(rows[0])
+    if any(len(row) != count for row in rows) or count < 2:
+        return "add the missing images, or remove those of the other cameras at these times"
+    rate = (count - 1) / float(np.median([row[-1] - row[0] for row in rows]))
+    apart = max(max(moment) - min(moment) for moment in zip(*rows))
+    if fps is None and apart < 0.25 / rate:
+        return (f"their clocks are at most {1e3 * apart:.3g} ms apart: scene.fps={rate:.4g} takes images that belong together as "
+                "one frame, and evenly spaced times")
+    return f"their clocks are up to {1e3 * apart:.3g} ms apart, of a frame of {1e3 / rate:.3g} ms: shift the times of late cameras"
+
+
+def read_shot(shot: Shot) -> tuple[np.ndarray, np.ndarray]:
+    """Colour (H, W, 3) and matte (H, W). Errors: DataError where there is no matte."""
+    pixels = read_image(shot.image)
+    color = np.ascontiguousarray(np.broadcast_to(pixels[..., :3], (*pixels.shape[:2], 3)))
+    if shot.mask is not None:
+        mask = read_image(shot.mask)
+        expect_size(shot.mask, mask, *pixels.shape[1::-1], reason=f"as {shot.image.name}")
+        return color, matte_of(shot.mask, mask)
+    if pixels.shape[2] != 4:
+        raise DataError(
+            f"{shot.image}: no matte: expected an alpha channel, or a mask_path in {shot.where}, found {pixels.shape[2]} channels"
+        )
+    return color, faintless(shot.image, np.ascontiguousarray(pixels[..., 3]))
+
+
+def camera_matrix(shot: Shot, width: int, height: int) -> np.ndarray:
+    """K (3, 3) [px]. Errors: DataError where the focal length is missing, or intrinsics are of another image size."""
+    known = shot.intrinsics
+    for key, size in (("w", width), ("h", height)):
+        if key in known and known[key] != size:
+            raise DataError(
+                f"{shot.where}: intrinsics are for {key} = {known[key]:g} px, but {shot.image.name} is {width}x{height}"
+            )
+    if "fl_x" in known:
+        focal = known["fl_x"], known.get("fl_y", known["fl_x"])
+    elif "camera_angle_x" in known:
+        if not 0 < known["camera_angle_x"] < math.pi:
+            raise DataError(f"{shot.where}: camera_angle_x: expected radians between 0 and pi, found {known['camera_angle_x']:g}")
+        focal = (0.5 * width / math.tan(0.5 * known["camera_angle_x"]),) * 2
+    else:
+        raise DataError(f"{shot.where}: expected fl_x (and fl_y) in pixels or camera_angle_x in radians, found neither")
+    return np.array([[focal[0], 0, known.get("cx", width / 2)], [0, focal[1], known.get("cy", height / 2)], [0, 0, 1]])
+
+
+def load_transforms(
+    path: str | Path,
+    *,
+    frames=None,
+    fps: float | None = None,
+    scale: float = 1.0,
+    fill_holes: int = 0,
+    name: str | None = None,
+    **world,
+) -> Scene:
+    """Scene of a transforms.json. `world`: the keyword arguments of `scene_from_footage`."""
+    footage = read_transforms(path, frames=frames, fps=fps, scale=scale, fill=fill_holes)
+    folder = Path(path).resolve()
+    return scene_from_footage(footage, name=name or (folder.parent.name if folder.suffix else folder.name), **world)

@@ -1,0 +1,56 @@
+"""Pictures of fixed cameras, a file for each camera and frame, as images on white and mattes of one size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mosa.data.formats.footage import WHITE, scaled
+from mosa.data.images.reading import check_amount, composite, expect_size, faintless, fill_holes, read_image, resize, scaled_size
+from mosa.errors import DataError
+
+Calibration = Mapping[str, tuple[np.ndarray, np.ndarray]]
+"""Camera name -> K (3, 3) [px], w2c (4, 4) in OpenCV axes."""
+
+
+def read_views(
+    calibration: Calibration, frames: Sequence[int], file: Callable[[str, int], Path],
+    split: Callable[[str, Path, np.ndarray], tuple[np.ndarray, np.ndarray]], listing: str, *, scale: float = 1.0, fill: int = 0,
+) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], list[np.ndarray], list[np.ndarray]]:
+    """(calibration of the scaled images, (T, h, w, 3) images on white, (T, h, w) mattes), cameras in the order of `calibration`.
+
+    file: of a camera and frame; split: colour (H, W, 3) and matte (H, W) of a camera's file and its pixels; listing: name of the
+    file that lists the cameras; scale: of the images, in (0, 1]; fill: holes of mattes up to this many pixels are covered.
+    Errors: DataError naming a file that is missing, damaged or of another size, ConfigError for the scale."""
+    images, mattes, scaled_calibration = [], [], {}
+    for camera, (K, w2c) in calibration.items():
+        rows, full = [], None
+        for frame in frames:
+            path = file(camera, frame)
+            if not path.is_file():
+                raise DataError(
+                    f"{path}: image not found, though {listing} lists camera {camera} and other cameras have "
+                    f"frame {frame}; restore it or restrict scene.frames"
+                )
+            pixels = read_image(path)
+            if full is None:
+                full, first = pixels.shape[1::-1], path.name
+                size = scaled_size(*full, scale)
+                check_amount(len(calibration) * len(frames), *size)
+                scaled_calibration[camera] = scaled(K, full, size), w2c
+            expect_size(path, pixels, *full, reason=f"as {first} of the same camera")
+            color, matte = split(camera, path, pixels)
+            matte = fill_holes(matte, fill)
+            rows.append((resize(composite(color, matte, WHITE), *size), resize(matte, *size)))
+        images.append(np.stack([r[0] for r in rows]))
+        mattes.append(np.stack([r[1] for r in rows]))
+    return scaled_calibration, images, mattes
+
+
+def split_alpha(path: Path, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Colour (H, W, 3) and matte (H, W) of RGBA with the matte as alpha. Errors: DataError for other channels, a faint matte."""
+    if pixels.shape[2] != 4:
+        raise DataError(f"{path}: expected RGBA with the matte as alpha, found {pixels.shape[2]} channels")
+    return pixels[..., :3], faintless(path, np.ascontiguousarray(pixels[..., 3]))

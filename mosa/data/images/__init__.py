@@ -1,0 +1,1 @@
+"""Pictures read, undistorted, matted and brought to one size."""

@@ -1,0 +1,130 @@
+"""Gaussians in the PLY layout of 3D Gaussian Splatting (Kerbl et al. 2023), which its trainers write and its viewers open.
+
+Per vertex, float32: x y z, nx ny nz (unused), f_dc_0..2 and f_rest_* (spherical harmonics: the rest channel by channel),
+opacity (logit), scale_0..2 (log of the standard deviations), rot_0..3 (quaternion wxyz).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement, PlyParseError
+from torch import Tensor
+
+from mosa.errors import DataError
+from mosa.rendering.appearance.spherical_harmonics import DEGREES, constant_coefficients, degree_of, mean_colors
+from mosa.rendering.covariance import scales_and_rotations
+from mosa.system.ply import check_ply
+from mosa.system.whole_files import written_whole
+from mosa.types import Splats
+
+AXES = ("x", "y", "z")
+SCALES = tuple(f"scale_{i}" for i in range(3))
+ROTATIONS = tuple(f"rot_{i}" for i in range(4))
+CONSTANT = tuple(f"f_dc_{i}" for i in range(3))
+OPACITY_MARGIN = 1e-6
+"""Opacities are kept this far from 0 and 1, where the logit has no number."""
+SMALLEST = 1e-9
+"""Standard deviations [m] below are written as this: the logarithm of 0 has no number either."""
+
+
+def save_ply(path: str | Path, splats: Splats, coefficients: Tensor | None = None) -> Path:
+    """Write Gaussians as a binary 3DGS PLY; folders are made.
+
+    coefficients: spherical harmonics (N, K, 3), K = 1, 4, 9 or 16; None: the constant colours of `splats`.
+    Errors: DataError where a field holds a number that is not finite; ConfigError for another K.
+    """
+    path = Path(path)
+    if coefficients is None:
+        coefficients = constant_coefficients(splats.colors)
+    degree_of(coefficients)
+    rest = coefficients[:, 1:].transpose(1, 2).flatten(1)
+    columns = {
+        AXES: splats.means,
+        ("nx", "ny", "nz"): torch.zeros_like(splats.means),
+        CONSTANT: coefficients[:, 0],
+        tuple(f"f_rest_{i}" for i in range(rest.shape[1])): rest,
+        ("opacity",): torch.logit(splats.opacities.clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN))[:, None],
+        SCALES: splats.scales.clamp(min=SMALLEST).log(),
+        ROTATIONS: splats.rotations,
+    }
+    names = [name for fields in columns for name in fields]
+    vertices = np.empty(len(splats.means), dtype=[(name, "<f4") for name in names])
+    for fields, values in columns.items():
+        for name, column in zip(fields, values.detach().cpu().numpy().T):
+            vertices[name] = _finite(column, name, path, "to write")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(path) as partial, open(partial, "wb") as file:
+        PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(file)
+    return path
+
+
+def load_ply(path: str | Path) -> tuple[Splats, Tensor]:
+    """Gaussians of a 3DGS PLY and their spherical harmonics (N, K, 3), K = 1, 4, 9 or 16; float32.
+
+    `Splats.colors` are the colours averaged over directions, rotations have unit length.
+    Errors: DataError naming the file and the field: missing, of another number of harmonics, not finite.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DataError(f"{path}: file not found; expected a PLY file of 3D Gaussians")
+    check_ply(path)
+    try:
+        document = PlyData.read(path)
+        vertices = {p.name: document["vertex"][p.name] for p in document["vertex"].properties}
+    except (PlyParseError, KeyError, ValueError, OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: expected a PLY file with an element vertex, found a damaged or other one ({error})") from error
+    rest = [name for name in vertices if name.startswith("f_rest_")]
+    per_channel, left = divmod(len(rest), 3)
+    if left or per_channel + 1 not in DEGREES:
+        raise DataError(
+            f"{path}: expected 0, 9, 24 or 45 fields f_rest_* (spherical harmonics of degree 0 to 3), found {len(rest)}"
+        )
+
+    def read(fields: tuple[str, ...]) -> Tensor:
+        for name in fields:
+            if name not in vertices:
+                raise DataError(
+                    f"{path}: no field {name}, which 3D Gaussians have; found {', '.join(list(vertices)[:8])} ...: "
+                    "a point cloud or mesh cannot be used"
+                )
+        columns = [_finite(np.asarray(vertices[name], dtype=np.float32), name, path, "found") for name in fields]
+        return torch.from_numpy(np.stack(columns, -1)) if columns else torch.empty(len(vertices["x"]), 0)
+
+    means = read(AXES)
+    if len(means) == 0:
+        raise DataError(f"{path}: expected Gaussians, found none")
+    scales, opacity, rotations = read(SCALES).exp(), read(("opacity",))[:, 0], read(ROTATIONS)
+    if not bool(torch.isfinite(scales).all()):
+        raise DataError(f"{path}: field scale_*: expected logarithms of standard deviations, found some too large for exp")
+    length = rotations.norm(dim=1, keepdim=True)
+    if float(length.min()) == 0:
+        raise DataError(f"{path}: field rot_*: expected quaternions, found zero at vertex {int(length.argmin())}")
+    higher = read(tuple(f"f_rest_{i}" for i in range(len(rest)))).view(len(means), 3, per_channel).transpose(1, 2)
+    coefficients = torch.cat((read(CONSTANT)[:, None], higher), 1)
+    colors = mean_colors(coefficients)
+    return Splats(means, scales, rotations / length, torch.sigmoid(opacity), colors), coefficients
+
+
+def export_splats(splats: Splats, positions: Tensor, covariances: Tensor, folder: str | Path) -> Path:
+    """Write moving Gaussians as <frame>.ply, frame numbers of three digits.
+
+    positions: (T, N, 3) [m]; covariances: (T, N, 3, 3) [m^2], A_t = F_tot A_0 F_tot^T; opacities and colours of `splats`.
+    """
+    folder = Path(folder)
+    for t in range(len(positions)):
+        scales, rotations = scales_and_rotations(covariances[t])
+        save_ply(folder / f"{t:03d}.ply", Splats(positions[t], scales, rotations, splats.opacities, splats.colors))
+    return folder
+
+
+def _finite(column: np.ndarray, name: str, path: Path, verb: str) -> np.ndarray:
+    bad = np.flatnonzero(~np.isfinite(column))
+    if len(bad):
+        raise DataError(
+            f"{path}: field {name}: expected finite numbers, {verb} NaN or infinity in {len(bad)} of {len(column)}, "
+            f"first at vertex {bad[0]}"
+        )
+    return column

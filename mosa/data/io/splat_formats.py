@@ -1,0 +1,176 @@
+"""Moving splats as files: 3DGS PLY, `.splat`, `.spz` or a USD stage, for the viewers and editors that read them.
+
+Each frame is written in the world's axes and in its own light: covariances are taken apart into scales and rotations, harmonics are
+turned with the body, and a factor of the colours becomes part of the harmonics, which no format keeps apart.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mosa.data.io.gaussian_ply import save_ply
+from mosa.errors import ConfigError, DataError
+from mosa.rendering.appearance.carried_splats import Seen
+from mosa.rendering.appearance.spherical_harmonics import Y0, degree_of, mean_colors, rotated
+from mosa.rendering.covariance import scales_and_rotations
+from mosa.system.whole_files import written_whole
+from mosa.types import Appearance, Splats
+
+FORMATS = ("ply", "splat", "spz", "usd")
+SPLAT = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
+"""32 bytes of a Gaussian of a `.splat` file, as antimatter15's viewer has them: m, standard deviations in m, 8-bit RGBA, quaternion
+wxyz as 128 + 128 q."""
+
+
+SPZ_BITS = 16
+"""Of a position behind the point: 0.015 mm, within 128 m."""
+
+
+def splats_at(shown: Seen, frame: int) -> Appearance:
+    """The Gaussians of a frame in the world's axes and in that frame's light, on the CPU."""
+    harmonics = shown.harmonics if shown.rotations is None else rotated(shown.harmonics, shown.rotations[frame])
+    if shown.shades is not None:
+        shade = shown.shades[frame][:, None, None]
+        harmonics = harmonics * shade
+        harmonics[:, :1] += (shade - 1) * 0.5 / Y0  # the colour is 1/2 plus the harmonics
+    scales, rotations = scales_and_rotations(shown.covariances[frame])
+    splats = Splats(shown.means[frame], scales, rotations, shown.opacities, mean_colors(harmonics))
+    return Appearance(splats, harmonics).to("cpu")
+
+
+def save_splat(path: str | Path, splats: Splats) -> Path:
+    """Write a `.splat` file: no header, the largest and most opaque first, colours without their dependence on the direction.
+    Errors: DataError for a number that is not finite."""
+    path = Path(path)
+    numbers = torch.cat([splats.means, splats.scales, splats.rotations, splats.opacities[:, None], splats.colors], 1)
+    if not bool(torch.isfinite(numbers).all()):
+        raise DataError(f"{path}: expected finite numbers to write, found NaN or infinity")
+    order = (-splats.scales.prod(1) * splats.opacities).argsort().numpy()
+    rows = np.empty(len(order), SPLAT)
+    rows["position"], rows["scale"] = splats.means.numpy()[order], splats.scales.numpy()[order]
+    rgba = torch.cat([splats.colors, splats.opacities[:, None]], 1).numpy()[order]
+    rows["color"] = np.clip(255 * rgba + 0.5, 0, 255).astype(np.uint8)
+    unit = torch.nn.functional.normalize(splats.rotations, dim=-1).numpy()[order]
+    rows["rotation"] = np.clip(128 + 128 * unit + 0.5, 0, 255).astype(np.uint8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(path) as partial:
+        rows.tofile(partial)
+    return path
+
+
+def load_splat(path: str | Path) -> Splats:
+    """Gaussians of a `.splat` file, float32. Errors: DataError naming the file: not whole, or not of such numbers."""
+    path = Path(path)
+    if not path.is_file() or path.stat().st_size == 0 or path.stat().st_size % SPLAT.itemsize:
+        raise DataError(f"{path}: expected a .splat file of {SPLAT.itemsize} bytes a Gaussian, found "
+                        f"{f'{path.stat().st_size} bytes' if path.is_file() else 'no file'}")
+    rows = np.fromfile(path, SPLAT)
+    finite = np.isfinite(rows["position"]).all() and np.isfinite(rows["scale"]).all() and (rows["scale"] > 0).all()
+    rotation = (rows["rotation"].astype(np.float32) - 128) / 128
+    length = np.linalg.norm(rotation, axis=1, keepdims=True)
+    if not finite or not (length > 0.5).all():
+        raise DataError(f"{path}: expected finite positions, standard deviations above 0, unit quaternions; another format?")
+    color = torch.from_numpy(rows["color"].astype(np.float32) / 255)
+    return Splats(torch.from_numpy(rows["position"].copy()), torch.from_numpy(rows["scale"].copy()),
+                  torch.from_numpy(rotation / length), color[:, 3], color[:, :3])
+
+
+def save_spz(path: str | Path, appearance: Appearance) -> Path:
+    """Write a `.spz` file (Niantic's compressed Gaussians) with the package gsply. Errors: ConfigError without it."""
+    try:
+        from gsply import GSData
+        from gsply.spz import write_spz
+    except ImportError as error:
+        raise ConfigError("formats: spz needs the package gsply: pip install 'mosa[spz]', or gsply by itself") from error
+    splats, harmonics = appearance.splats, appearance.harmonics
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    logits = torch.logit(splats.opacities.clamp(1e-6, 1 - 1e-6))
+    higher = harmonics[:, 1:].contiguous().numpy() if harmonics.shape[1] > 1 else None
+    data = GSData.from_arrays(splats.means.numpy(), splats.scales.clamp(min=1e-9).log().numpy(), splats.rotations.numpy(),
+                              logits.numpy(), harmonics[:, 0].contiguous().numpy(), higher)  # fmt: skip
+    with written_whole(path) as partial:
+        write_spz(partial, data, fractional_bits=SPZ_BITS)
+    return path
+
+
+def save_usd(path: str | Path, frames: Sequence[Appearance], *, rate: float, up: Tensor) -> Path:
+    """Write a USD stage with one `ParticleField3DGaussianSplat`, all of its attributes sampled at every frame. rate: frames per
+    second; up: (3,), the stage's is the nearest of y and z. Errors: ConfigError without a usd-core that knows Gaussians."""
+    try:
+        from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
+
+        define = UsdVol.ParticleField3DGaussianSplat.Define
+    except (ImportError, AttributeError) as error:
+        raise ConfigError("formats: usd needs the package usd-core, 26.3 or newer: pip install 'mosa[usd]', or usd-core by "
+                          "itself") from error
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f"{path.stem}.{os.getpid()}.partial{path.suffix}")  # USD tells its format by the name
+    unfinished.unlink(missing_ok=True)
+    stage = Usd.Stage.CreateNew(str(unfinished))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z if int(up.abs().argmax()) == 2 else UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetTimeCodesPerSecond(rate)
+    stage.SetFramesPerSecond(rate)
+    stage.SetStartTimeCode(0)
+    stage.SetEndTimeCode(len(frames) - 1)
+    field = define(stage, "/body")
+    stage.SetDefaultPrim(field.GetPrim())
+    field.GetRadianceSphericalHarmonicsDegreeAttr().Set(degree_of(frames[0].harmonics))
+    field.GetOpacitiesAttr().Set(Vt.FloatArray.FromNumpy(frames[0].splats.opacities.contiguous().numpy()))
+    for t, frame in enumerate(frames):
+        splats, vectors = frame.splats, lambda values: Vt.Vec3fArray.FromNumpy(values.reshape(-1, 3).contiguous().numpy())
+        field.GetPositionsAttr().Set(vectors(splats.means), t)
+        field.GetScalesAttr().Set(vectors(splats.scales), t)
+        field.GetOrientationsAttr().Set(Vt.QuatfArray([Gf.Quatf(*q) for q in splats.rotations.tolist()]), t)
+        field.GetRadianceSphericalHarmonicsCoefficientsAttr().Set(vectors(frame.harmonics), t)
+        reach = 3 * splats.scales.amax()
+        field.GetExtentAttr().Set(vectors(torch.stack([splats.means.amin(0) - reach, splats.means.amax(0) + reach])), t)
+    stage.Save()
+    with written_whole(path) as partial:
+        os.replace(unfinished, partial)
+    return path
+
+
+def check_formats(formats: Sequence[str]) -> None:
+    """Errors: ConfigError for one that is not known."""
+    if unknown := [name for name in formats if name not in FORMATS]:
+        raise ConfigError(f"formats: expected some of {', '.join(FORMATS)}, found {unknown[0]!r}")
+
+
+def drop_later_frames(folder: Path, suffix: str, count: int) -> None:
+    """What a longer motion left in the folder before: a viewer would go on from this one into it."""
+    for old in folder.glob(f"*{suffix}"):
+        if old.stem.isdecimal() and int(old.stem) >= count:
+            old.unlink()
+
+
+def save_frames(shown: Seen, folder: str | Path, formats: Sequence[str], *, rate: float = 30.0, up: Tensor | None = None) -> Path:
+    """Write every frame of moving Gaussians: `<folder>/ply/000.ply`, `splat/000.splat`, `spz/000.spz`, and `splats.usdc` for all.
+
+    rate [1/s], up (3,): of the USD stage. Errors: ConfigError for another format, or where a package is missing; DataError.
+    """
+    check_formats(formats)
+    folder, frames = Path(folder), []
+    for kind in ("ply", "splat", "spz"):
+        drop_later_frames(folder / kind, f".{kind}", len(shown.means))
+    for t in range(len(shown.means)):
+        frame = splats_at(shown, t)
+        if "ply" in formats:
+            save_ply(folder / "ply" / f"{t:03d}.ply", frame.splats, frame.harmonics)
+        if "splat" in formats:
+            save_splat(folder / "splat" / f"{t:03d}.splat", frame.splats)
+        if "spz" in formats:
+            save_spz(folder / "spz" / f"{t:03d}.spz", frame)
+        if "usd" in formats:
+            frames.append(frame)
+    if frames:
+        save_usd(folder / "splats.usdc", frames, rate=rate, up=torch.tensor([0.0, 1, 0]) if up is None else up)
+    return folder

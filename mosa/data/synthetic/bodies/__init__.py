@@ -1,0 +1,1 @@
+"""Shapes of the built-in scenes."""

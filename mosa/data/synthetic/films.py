@@ -1,0 +1,187 @@
+"""Making a built-in sequence once: simulate, carry the surface along, film it, and keep the result on disk."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mosa.data.formats.footage import WHITE
+from mosa.data.images.reading import composite, resize
+from mosa.data.synthetic.bodies.objects import OBJECTS, BuiltinObject, drop_named, object_named
+from mosa.data.synthetic.bodies.shapes import SHAPES
+from mosa.data.synthetic.drop import simulate
+from mosa.data.synthetic.renderer import render_surface, ring_of_cameras
+from mosa.data.synthetic.surface import LEVEL, Skin, Surface, bind, extract_surface, fill, flowing_surface
+from mosa.errors import ConfigError, DataError
+from mosa.system.caches import cache_home
+from mosa.system.npz import read_npz
+from mosa.system.progress import tqdm
+from mosa.system.threads import threaded
+from mosa.system.whole_files import written_whole
+from mosa.types import Cameras
+
+log = logging.getLogger(__name__)
+
+# part of the key of a cached sequence: raise it whenever what is made changes
+VERSION = 1
+TRUTH_PARTICLES = 8000
+
+
+@dataclass(frozen=True)
+class Film:
+    """A filmed sequence. pictures: (V, T, H, W, 4) uint8, straight alpha; rest: (M, 3), positions: (T, M, 3) [m] of at most
+    8000 of the truth's particles; rotation: (3, 3); velocity: (3,) [m/s]."""
+
+    pictures: np.ndarray
+    rest: np.ndarray
+    positions: np.ndarray
+    rotation: np.ndarray
+    velocity: np.ndarray
+
+
+def default_cache() -> Path:
+    """$XDG_CACHE_HOME/mosa or ~/.cache/mosa."""
+    return Path(cache_home()) / "mosa"
+
+
+def cameras_of(body: BuiltinObject, seed: int) -> Cameras:
+    """The cameras of an object at its native image size; the seed turns the ring."""
+    film = body.footage
+    turn = float(np.random.default_rng([seed, 7]).uniform(0, 2 * np.pi / film.cameras))
+    return ring_of_cameras(
+        film.cameras, film.size, target=(0.0, film.target, 0.0), distance=film.distance, elevations=film.elevations,
+        field=film.field, turn=turn,
+    )  # fmt: skip
+
+
+def take_file(name: str, sequence: str, material: str, seed: int, cache: str | Path | None = None) -> Path:
+    """Where a take lies once it has been made."""
+    hidden = object_named(name).material.variant(material)
+    made_of: tuple = (VERSION, object_named(name), hidden, drop_named(name, sequence), seed)
+    if object_named(name).remesh:
+        made_of += (LEVEL,)
+    key = hashlib.sha256(repr(made_of).encode()).hexdigest()[:12]
+    folder = Path(cache) if cache is not None else default_cache()
+    return folder / "builtin" / f"{name}-{sequence}-{material}-{seed}-{key}.npz"
+
+
+def make(
+    name: str,
+    sequence: str,
+    *,
+    material: str = "anisotropic",
+    seed: int = 0,
+    cache: str | Path | None = None,
+    progress: bool = True,
+) -> Film:
+    """The take of a sequence, from the cache folder where it lies there. Equal arguments give equal bytes.
+
+    Errors: ConfigError for an unknown name, sequence or material, or a cache folder that cannot be written.
+    """
+    file = take_file(name, sequence, material, seed, cache)
+    kept = read_take(file)
+    if kept is not None:
+        return kept
+    take = film_drop(name, sequence, material, seed, progress)
+    try:
+        write_take(file, take)
+    except OSError as error:
+        raise ConfigError(
+            f"scene.cache: cannot write {file} ({error.strerror}); choose a folder with XDG_CACHE_HOME or scene.cache="
+        ) from error
+    return take
+
+
+@functools.lru_cache(maxsize=1)
+def built(shape_name: str, pitch: float, spacing: float, seed: int) -> tuple[Surface, np.ndarray, Skin]:
+    """Surface, particles (N, 3) [m] and skin of an object, the same in every sequence and material: not to be changed."""
+    shape = SHAPES[shape_name]
+    # one generator a purpose: the same texture, lattice and cameras in every sequence and material of a seed
+    surface = extract_surface(shape, pitch, np.random.default_rng([seed, 1]))
+    particles = fill(shape, spacing, np.random.default_rng([seed, 2]))
+    return surface, particles, bind(surface.vertices, particles, spacing)
+
+
+def film_drop(name: str, sequence: str, material: str, seed: int, progress: bool) -> Film:
+    """Simulate and film, without the cache."""
+    body, drop = OBJECTS[name], drop_named(name, sequence)
+    film = body.footage
+    surface, particles, skin = built(body.shape, body.pitch, body.spacing, seed)
+    label = f"{name}/{sequence} (synthetic, {material})"
+    with tqdm(
+        total=film.frames - 1, desc=f"{label}: simulate", unit="frame", disable=not progress, dynamic_ncols=True
+    ) as bar:
+        fall = simulate(
+            body, body.material.variant(material), particles, surface.vertices, drop, body.drops["train"],
+            progress=lambda frame: bar.update(),
+        )  # fmt: skip
+    cameras = cameras_of(body, seed)
+    paint = SHAPES[body.shape].color(particles, np.random.default_rng([seed, 1])) if body.remesh else None  # as the surface's
+
+    def film_at(x: np.ndarray) -> np.ndarray:
+        if not body.remesh:
+            return render_surface(surface, skin.follow(x), cameras)
+        found = flowing_surface(x, paint, body.spacing, body.pitch)
+        return render_surface(found, found.vertices, cameras)
+
+    film_frame = threaded(film_at, fall.positions)
+    with tqdm(total=film.frames, desc=f"{label}: film", unit="frame", disable=not progress, dynamic_ncols=True) as bar:
+        pictures = []
+        for picture in film_frame:
+            pictures.append(picture)
+            bar.update()
+    chosen = np.sort(np.random.default_rng([seed, 3]).permutation(len(particles))[:TRUTH_PARTICLES])
+    return Film(
+        np.stack(pictures, 1), fall.rest[chosen].astype(np.float32), fall.positions[:, chosen].astype(np.float32),
+        fall.rotation,
+        fall.velocity,
+    )  # fmt: skip
+
+
+def read_take(file: Path) -> Film | None:
+    """A cached take, or None where there is none or a damaged one, which is then made again."""
+    if not file.is_file():
+        return None
+    try:
+        stored = read_npz(file)
+        take = Film(*(stored[n] for n in ("pictures", "rest", "positions", "rotation", "velocity")))
+        shapes = take.pictures.shape[1:2] + take.rest.shape, take.positions.shape
+        if take.pictures.ndim != 5 or shapes[0] != shapes[1] or take.rotation.shape != (3, 3) or take.velocity.shape != (3,):
+            raise DataError(f"{file}: not a film of a built-in scene")
+        return take
+    except (DataError, KeyError) as error:
+        log.warning("%s: damaged cache file (%s); making it again", file, error)
+        return None
+
+
+def write_take(file: Path, take: Film) -> None:
+    """Write atomically: a process that is stopped leaves no half file, two that write at once leave one whole."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(file) as partial, open(partial, "wb") as stream:
+        np.savez_compressed(stream, **vars(take))
+
+
+def pictures_to_footage(pictures: np.ndarray, size: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Images (V, T, h, w, 3) on white and mattes (V, T, h, w), area averages of RGBA pictures (V, T, H, W, 4)."""
+    V, T, H, W = pictures.shape[:4]
+    images, mattes = np.empty((V, T, size[1], size[0], 3), np.float32), np.empty((V, T, size[1], size[0]), np.float32)
+
+    def convert(index: tuple[int, int]) -> None:
+        alpha = pictures[*index, ..., 3]
+        image, matte = np.ones((H, W, 3), np.float32), np.zeros((H, W), np.float32)
+        rows, columns = (np.flatnonzero(alpha.any(axis)) for axis in (1, 0))
+        if len(rows):  # around the object there is nothing but white
+            window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+            part = pictures[*index, *window].astype(np.float32) / 255
+            image[window], matte[window] = composite(part[..., :3], part[..., 3], WHITE), part[..., 3]
+        images[index], mattes[index] = resize(image, *size), resize(matte, *size)
+
+    for _ in threaded(convert, list(np.ndindex(V, T))):
+        pass
+    return torch.from_numpy(images), torch.from_numpy(mattes)

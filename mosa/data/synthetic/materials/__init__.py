@@ -1,0 +1,1 @@
+"""Hidden materials of the built-in scenes."""

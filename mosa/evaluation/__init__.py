@@ -1,0 +1,1 @@
+"""Figures of a fitted body, and what they are compared with."""

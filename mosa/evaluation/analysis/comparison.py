@@ -1,0 +1,178 @@
+"""Real, prior and adapted beside each other, on the ground they fall on, with the frame's time and what the models miss."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import matplotlib
+import numpy as np
+import torch
+from torch import Tensor
+
+from mosa.evaluation.analysis.figures import FONT, fitted, side_by_side, text_width, to_uint8, write_strip, write_video
+from mosa.evaluation.evaluate import Sequence, true_motion
+from mosa.modules.body.body import Body
+from mosa.physics.world import World
+from mosa.rendering.appearance.carried_splats import seen
+from mosa.rendering.cameras import crop_boxes, crop_cameras, crop_images
+from mosa.rendering.observer import deformed_covariances, observe
+from mosa.types import Cameras, Rollout, Scene
+
+TITLES = {"prior": "prior", "adapted": "adapted (MoSA)"}
+DIFFERENCE = 0.5
+"""Largest image difference that has a colour of its own."""
+NEAR_BACKGROUND = 12
+"""8-bit levels: ground lines are drawn where a pixel is as close to the background as that, so that they lie behind the object."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One camera's view of a sequence, cut to where the object goes and enlarged. images: by title, (T, H, W, 3) uint8: `real` and
+    the models; errors: of the models, as colours; label: what of, from 0 to `high`; colors: of matplotlib; times: (T,) [s]."""
+
+    images: dict[str, np.ndarray]
+    errors: dict[str, np.ndarray]
+    label: str
+    high: str
+    colors: str
+    times: list[float]
+
+    @property
+    def moments(self) -> list[str]:
+        """The caption of each frame."""
+        return [f"frame {t}, {time - self.times[0]:.3f} s" for t, time in enumerate(self.times)]
+
+
+@torch.no_grad()
+def compare(body: Body, shown: Sequence, variants: Mapping[str, Rollout], *, width: int = 320) -> Comparison:
+    """What the first camera sees of a sequence and of the models' rollouts (those that there are), about `width` px wide.
+
+    The error is each particle's distance to the true motion where that is known, else the difference of the images.
+    """
+    scene = shown.scene
+    camera = (scene.training_cameras or [0])[0]
+    x0, y0, w, h = crop_boxes(scene.mattes[[camera]], margin=16)
+    cameras = crop_cameras(scene.cameras.select([camera]), x0, y0, w, h)
+    times = max(1, round(width / max(w, h)))
+    lines = ground_lines(scene, cameras, body.size)
+    real = crop_images(scene.images[[camera]], x0, y0, w, h, axis=2)[0]
+    known = [variant for variant in TITLES if variant in variants]
+    seen = {variant: drawn(body, variants[variant], cameras, scene) for variant in known}
+
+    def finished(images: Tensor) -> np.ndarray:
+        return np.stack([on_ground(enlarge(to_uint8(image), times), lines, times, scene.background) for image in images])
+
+    target = true_motion(body, scene)
+    if target is None:
+        label, high, colors = "difference of the images", f"{DIFFERENCE:g}", "Reds"
+        errors = {v: paint((images - real).abs().mean(-1) / DIFFERENCE, colors) for v, images in seen.items()}
+    else:
+        far = {v: (variants[v].x.cpu() - target.cpu()).norm(dim=-1) for v in known}
+        limit = round_up(max(float(torch.quantile(d.flatten()[: 2**24], 0.99)) for d in far.values()))
+        label, high, colors = "distance to the true motion", f"{1e3 * limit:g} mm", "viridis"
+        errors = {v: drawn(body, variants[v], cameras, scene, paint(d / limit, colors)) for v, d in far.items()}
+    return Comparison({"real": finished(real)} | {TITLES[v]: finished(images) for v, images in seen.items()},
+                      {TITLES[v]: finished(images) for v, images in errors.items()}, label, high, colors, scene.times.tolist())
+
+
+def drawn(body: Body, rollout: Rollout, cameras: Cameras, scene: Scene, colors: Tensor | None = None) -> Tensor:
+    """(T, H, W, 3) images of a rollout from one camera, on the CPU. colors: (T, N, 3) of its particles in place of
+    the body's appearance."""
+    device = body.rest.device
+    cameras, background = cameras.to(device), scene.background.to(device)
+    if colors is None:
+        return seen(body, rollout.x, rollout.F_tot).images(cameras, background)[0].clamp(0, 1).cpu()
+    covariances = deformed_covariances(rollout.F_tot, body.covariances)
+    parts = [
+        observe(rollout.x[[t]], covariances[[t]], body.opacities, colors[t].to(body.colors), cameras, background).images[0]
+        for t in range(len(rollout.x))
+    ]
+    return torch.cat(parts).clamp(0, 1).cpu()
+
+
+def paint(share: Tensor, colors: str) -> Tensor:
+    """(..., 3) colours of values (...), of which 1 has the last colour and what is above too."""
+    return torch.from_numpy(matplotlib.colormaps[colors](share.clamp(0, 1).numpy())[..., :3]).float()
+
+
+def round_up(value: float) -> float:
+    """The next of 1, 2, 5, 10, 20, 50 ... times 1e-3 (at least that)."""
+    scale = 10.0 ** np.floor(np.log10(max(value, 1e-3)))
+    return float(next(step * scale for step in (1, 2, 5, 10) if step * scale >= value * (1 - 1e-9)))
+
+
+def ground_lines(scene: Scene | World, cameras: Cameras, size: float) -> list[np.ndarray]:
+    """Lines of a grid on the ground, half the object's size apart, as (n, 2) [px] in the images of one camera; none without
+    a ground. The grid lies under the middle of the image."""
+    if scene.ground is None:
+        return []
+    up, w2c, K = scene.up.double(), cameras.w2c[0].double(), cameras.K[0].double()
+    eye = -w2c[:3, :3].T @ w2c[:3, 3]
+    ray = w2c[:3, :3].T @ torch.linalg.solve(K, K.new_tensor([cameras.width / 2, cameras.height, 1.0]))
+    fall = float(ray @ up)
+    if fall >= -1e-3 * float(ray.norm()) or float(eye @ up) <= scene.ground.height:  # a camera below the ground, or looking up
+        return []
+    middle = eye + (scene.ground.height - float(eye @ up)) / fall * ray
+    across = torch.linalg.cross(up, torch.eye(3, dtype=torch.float64)[int(up.abs().argmin())])
+    across = across / across.norm()
+    along = torch.linalg.cross(up, across)
+    cell, count = 0.5 * size, 12
+    steps, places = torch.linspace(-count, count, 8 * count + 1).double() * cell, torch.arange(-count, count + 1) * cell
+    lines = []
+    for one, other in ((across, along), (along, across)):
+        for place in places.tolist():
+            points = middle + place * one + steps[:, None] * other
+            seen = points @ w2c[:3, :3].T + w2c[:3, 3]
+            pixel = (seen @ K.T)[seen[:, 2] > 0.1 * float((middle - eye).norm())]
+            if len(pixel) > 1:
+                lines.append((pixel[:, :2] / pixel[:, 2:]).numpy())
+    return lines
+
+
+def enlarge(image: np.ndarray, times: int) -> np.ndarray:
+    return image if times == 1 else cv2.resize(image, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC)
+
+
+def on_ground(image: np.ndarray, lines: list[np.ndarray], times: int, background: Tensor) -> np.ndarray:
+    """An image (H, W, 3) uint8, enlarged `times`, with ground lines [px before that] where it shows the background."""
+    if not lines:
+        return image
+    ink = np.zeros(image.shape[:2], np.uint8)
+    fixed = [np.round(line.clip(-1e4, 1e4) * times * 16).astype(np.int32) for line in lines]  # of 1/16 px
+    cv2.polylines(ink, fixed, False, 255, 1, cv2.LINE_AA, shift=4)
+    behind = np.abs(image - 255.0 * background.numpy()).max(-1) <= NEAR_BACKGROUND
+    share = 0.5 * (ink / 255 * behind)[..., None]
+    return (image * (1 - share) + 120 * share + 0.5).astype(np.uint8)
+
+
+def legend(shown: Comparison) -> np.ndarray:
+    """(H, W, 3) uint8: the colours of the errors, as large as an image."""
+    height, width = shown.images["real"].shape[1:3]
+    picture = np.full((height, width, 3), 255, np.uint8)
+    bar = to_uint8(paint(torch.linspace(0, 1, int(0.8 * width)), shown.colors)[None].expand(max(8, height // 20), -1, -1))
+    top, left = height // 2, int(0.1 * width)
+    picture[top : top + bar.shape[0], left : left + bar.shape[1]] = bar
+    text, scale = fitted(shown.label, width - left, 0.42)
+    write = lambda text, x, y: cv2.putText(picture, text, (x, y), FONT, scale, (30, 30, 30), 1, cv2.LINE_AA)  # noqa: E731
+    write(text, left, top - 10)
+    write("0", left, top + bar.shape[0] + 18)
+    write(shown.high, left + bar.shape[1] - text_width(shown.high, scale), top + bar.shape[0] + 18)
+    return picture
+
+
+def write_comparisons(folder: Path, shown: Mapping[str, Comparison]) -> None:
+    """video.mp4 of the last sequence and strip.png of all. shown: by the prefix of the sequence."""
+    prefix, last = list(shown.items())[-1]
+    below = {last.label: np.repeat(legend(last)[None], len(last.times), 0)}
+    below |= {f"{title}: {last.label}": images for title, images in last.errors.items()}
+    footer = [f"{prefix}   {moment}" for moment in last.moments]
+    write_video(folder / "video.mp4", side_by_side(last.images, below=below, footer=footer), fps=6)
+    rows, notes = {}, {}
+    for prefix, each in shown.items():
+        notes[f"{prefix}: real"] = each.moments
+        rows |= {f"{prefix}: {title}": images for title, images in each.images.items()}
+        rows |= {f"{prefix}: {title}, {each.label}, 0 to {each.high}": images for title, images in each.errors.items()}
+    write_strip(folder / "strip.png", rows, notes=notes)

@@ -1,0 +1,323 @@
+"""Figures of a fitted body: every model variant on every sequence, as docs/figures.md defines them."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+from warnings import warn
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mosa.data.sequences import load_sequences
+from mosa.errors import ConfigError, SimulationDiverged
+from mosa.evaluation import metrics
+from mosa.evaluation.analysis.anisotropy import stiffest_axis
+from mosa.evaluation.analysis.stiffness import angle_between, stiffest
+from mosa.evaluation.analysis.vibration import GROWTH_LIMIT, vibration_growth
+from mosa.evaluation.settings import EvaluationSettings
+from mosa.modules.body.body import VARIANTS, Body, Start, World
+from mosa.modules.body.material import material_states
+from mosa.reconstruction.pose.starts import first_contact
+from mosa.reconstruction.rest_shape import RestShape
+from mosa.rendering.appearance.carried_splats import seen
+from mosa.rendering.cameras import crop_boxes
+from mosa.system.progress import tqdm
+from mosa.system.threads import threaded
+from mosa.types import Rollout, Scene
+
+PREFIX = {"adapted": "", "prior": "prior/", "prior_eta": "prior_eta/"}
+NAMES = {"adapted": "the learned law", "prior": "the prior", "prior_eta": "the prior with eta"}
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """A sequence to evaluate on. prefix: `train`, `train/<name>` or `test/<name>`; start: where the body starts; contact: first
+    frame after first contact."""
+
+    prefix: str
+    scene: Scene
+    start: Start
+    contact: int
+
+
+def sequences(body: Body | RestShape, training: Scene, others: list[Scene], found: Mapping[str, Start]) -> list[Sequence]:
+    """found: start by prefix, in the order of the sequences."""
+    return [Sequence(p, s, start, first_contact(body, start, s)) for (p, start), s in zip(found.items(), [training, *others])]
+
+
+def run_sequences(config: Mapping[str, Any], body: Body) -> list[Sequence]:
+    """The sequences that the run of a checkpoint's `config` was evaluated on, read again. Errors: ConfigError, DataError."""
+    found = {prefix: Start.read(written, body.rest) for prefix, written in config["starts"].items()}
+    return sequences(body, *load_sequences(config["cfg"]["scene"]), found)
+
+
+@torch.no_grad()
+def rollouts(body: Body, sequence: Sequence, world: World) -> tuple[dict[str, Rollout], float | None, float]:
+    """Every variant's rollout over all frames of `sequence`, mean |C| of the adapted one (None without an adapter), and the
+    particle substeps per second of the last. A variant that cannot be simulated on it is left out, with a warning: on a training
+    sequence too, which the fit has simulated near the observed motion, and without its held-out frames."""
+    scene = sequence.scene
+    frame_dt = float(scene.times[1] - scene.times[0])
+    sizes: list[float] = []
+    result, rate = {}, 0.0
+    for v in VARIANTS:
+        began, counted = time.perf_counter(), len(sizes)
+        try:
+            result[v] = body.simulate(sequence.start, world, scene.frames, frame_dt, model=body.model(v),
+                                      collect=lambda found: sizes.append(float(found.mean_abs_C)))
+        except (SimulationDiverged, ConfigError) as error:
+            del sizes[counted:]
+            warn(f"{sequence.prefix}: {NAMES[v]} cannot be simulated there, its errors count as infinite ({error})", stacklevel=2)
+            continue
+        if body.rest.is_cuda:
+            torch.cuda.synchronize()
+        rate = len(body.rest) * sum(result[v].counts) / (time.perf_counter() - began)
+    return result, float(np.mean(sizes)) if sizes else None, rate
+
+
+@torch.no_grad()
+def render(body: Body, rollout: Rollout, scene: Scene, cameras: list[int]) -> Tensor:
+    """(V, T, H, W, 3) images of a rollout from the given cameras, on the body's device: of its splats where it has some."""
+    device = body.rest.device
+    shown = seen(body, rollout.x, rollout.F_tot)
+    return shown.images(scene.cameras.select(cameras).to(device), scene.background.to(device)).clamp_(0, 1)
+
+
+def image_metrics(images: Tensor, scene: Scene, cameras: list[int], frames: list[int]) -> dict[str, float]:
+    """PSNR and SSIM, in full and in one box per camera: that of the true mattes over all frames plus 10 px.
+
+    images: (V, T, H, W, 3), all frames; where they lie is where they are compared.
+    """
+    if not cameras or not frames:
+        return {}
+    x0, y0, width, height = crop_boxes(scene.mattes[cameras], margin=10)
+    found: dict[str, list[float]] = {f"{kind}_{name}": [] for name in ("crop", "full") for kind in ("psnr", "ssim")}
+    for v, (camera, x, y) in enumerate(zip(cameras, x0.tolist(), y0.tolist())):
+        seen, real = images[v][frames], scene.images[camera][frames].to(images.device)
+        crop = (slice(None), slice(y, y + height), slice(x, x + width))
+        for name, pair in (("crop", (seen[crop], real[crop])), ("full", (seen, real))):
+            found[f"psnr_{name}"].append(metrics.psnr(*pair))
+            found[f"ssim_{name}"].append(metrics.ssim(*pair))
+            for own, metric in metrics.IMAGE_METRICS.items():
+                found.setdefault(f"{own}_{name}", []).append(metric.function(*pair))
+    return {name: float(np.mean(values)) for name, values in found.items()}
+
+
+def motion_metrics(
+    x: Tensor, body: Body, sequence: Sequence, frames: list[int], settings: EvaluationSettings, target: Tensor | None = None
+) -> dict[str, float]:
+    """rms_m, chamfer and earth mover's distance after first contact, where the true motion is known.
+
+    target: `true_motion`, where it is at hand: it is the same for all models.
+    """
+    truth = sequence.scene.truth
+    after = [t for t in frames if t >= sequence.contact]
+    if not after:
+        return {}
+    if truth is None:
+        clouds = sequence.scene.particles
+        if clouds is None:
+            return {}
+        pairs = [(x[t], clouds[t]) for t in after]
+        result = {}
+    else:
+        target = true_motion(body, sequence.scene) if target is None else target
+        result = {"rms_m": metrics.rms(x[after], target[after])}
+        result |= {name: metric.function(x[after], target[after]) for name, metric in metrics.MOTION_METRICS.items()}
+        pairs = [(x[t], truth.positions[t]) for t in after]
+    each = list(threaded(lambda pair: metrics.chamfer_distances(*pair, samples=settings.samples), pairs))
+    result |= {name: float(np.mean([found[name] for found in each])) for name in each[0]}
+    last = pairs[:: max(1, len(pairs) // 3)]
+    result["emd_m"] = float(np.mean(list(threaded(lambda pair: metrics.emd(*pair, samples=settings.assignment), last))))
+    return result
+
+
+def true_motion(body: Body, scene: Scene) -> Tensor | None:
+    """(T, N, 3) [m] where the body's particles would truly be, None where that is not known."""
+    truth = scene.truth
+    return None if truth is None else metrics.interpolate_motion(truth.rest, truth.positions, body.rest.cpu())
+
+
+@torch.no_grad()
+def evaluate(
+    body: Body, sequences: list[Sequence], world: World, settings: EvaluationSettings
+) -> tuple[dict[str, float], dict[str, dict[str, Rollout]]]:
+    """All figures, flat, named as in docs/figures.md, and the rollouts that could be simulated: result[sequence prefix][variant].
+
+    Errors: SimulationDiverged where none of them could be."""
+    figures: dict[str, float] = {}
+    kept: dict[str, dict[str, Rollout]] = {}
+    bar = tqdm(total=len(sequences) * len(VARIANTS), desc="evaluate", unit="rollout", dynamic_ncols=True)
+    rates, measured, missing = [], set[str](), list[tuple[str, str]]()
+    for sequence in sequences:
+        kept[sequence.prefix] = {}
+        simulated, size, rate = rollouts(body, sequence, world)
+        rates.append(rate)
+        if size is not None:
+            figures[f"{sequence.prefix}/mean_abs_C"] = size
+        target = true_motion(body, sequence.scene)
+        for variant in VARIANTS:
+            model = PREFIX[variant]
+            if variant in simulated:
+                kept[sequence.prefix][variant] = simulated[variant]
+                figures |= sequence_metrics(body, sequence, simulated[variant], model, settings, target)
+                measured |= {key.rpartition("/")[2] for key in figures if key.startswith(f"{model}{sequence.prefix}/")}
+            else:
+                missing += [(model, part) for part in parts_of(sequence)]
+            bar.update()
+    bar.close()
+    if not measured:
+        raise SimulationDiverged("evaluation: neither the law nor its prior can be simulated on any of these sequences: "
+                                 f"{', '.join(s.prefix for s in sequences)}; the warnings above say why")
+    of_pictures = {name for name in measured if name.endswith(("_crop", "_full"))}  # all that held-out cameras tell
+    figures |= {f"{model}{part}/{name}": worst(name) for model, part in missing
+                for name in (of_pictures if part == "camera" else measured - {"mean_abs_C"})}  # fmt: skip
+    figures |= test_means(figures)
+    figures["time/particle_substeps_per_s"] = max(rates)  # the first rollouts also load kernels
+    return figures, kept
+
+
+def parts_of(sequence: Sequence) -> list[str]:
+    """What its figures are of: the sequence, and of the first training sequence its held-out frames and cameras."""
+    if sequence.prefix != "train":
+        return [sequence.prefix]
+    held = {"frames": sequence.scene.holdout_frames, "camera": sequence.scene.holdout_cameras}
+    return [sequence.prefix, *(part for part, indices in held.items() if indices)]
+
+
+def worst(name: str) -> float:
+    """The figure of a rollout that there is not: no error so large and no picture so bad; of pictures compared by a metric that was
+    registered, no number."""
+    kind = name.split("_")[0]
+    return -math.inf if kind in ("psnr", "ssim") else math.nan if name.rsplit("_", 1)[0] in metrics.IMAGE_METRICS else math.inf
+
+
+def sequence_metrics(
+    body, sequence: Sequence, rollout: Rollout, model: str, settings: EvaluationSettings, target: Tensor | None
+) -> dict[str, float]:
+    """The figures of one rollout: training views and frames, held-out frames, held-out cameras."""
+    scene, x, parts = sequence.scene, rollout.x.cpu(), parts_of(sequence)
+    training = sequence.prefix.startswith("train")
+    frames = scene.training_frames if training else list(range(scene.frames))
+    cameras = scene.training_cameras if training else list(range(len(scene.cameras)))
+    images = render(body, rollout, scene, cameras)
+    figures: Mapping[str, float] = {
+        **motion_metrics(x, body, sequence, frames, settings, target),
+        **image_metrics(images, scene, cameras, frames),
+    }
+    result = {f"{model}{sequence.prefix}/{k}": v for k, v in figures.items()}
+    if "frames" in parts:
+        held = list(scene.holdout_frames)
+        figures = {**motion_metrics(x, body, sequence, held, settings, target),
+                   **image_metrics(images, scene, cameras, held)}
+        result |= {f"{model}frames/{k}": v for k, v in figures.items()}
+    if "camera" in parts:
+        held = list(scene.holdout_cameras)
+        images = render(body, rollout, scene, held)
+        result |= {f"{model}camera/{k}": v for k, v in image_metrics(images, scene, held, frames).items()}
+        for t in frames:
+            per_frame = image_metrics(images, scene, held, [t])
+            result |= {f"{model}camera/frame_{t:02d}/{k}": per_frame[k] for k in ("psnr_crop", "ssim_crop")}
+    return result
+
+
+def test_means(figures: Mapping[str, float]) -> dict[str, float]:
+    """`test/<metric>`: mean over the held-out sequences, for each model."""
+    groups: dict[str, list[float]] = {}
+    for key, value in figures.items():
+        model, mark, rest = key.partition("test/")
+        if mark and "/" in rest:
+            groups.setdefault(f"{model}test/{rest.split('/', 1)[1]}", []).append(value)
+    return {key: float(np.mean(values)) for key, values in groups.items()}
+
+
+def floor_figures(body: Body, evaluated: list[Sequence], world: World, settings: EvaluationSettings) -> dict[str, float]:
+    """What no law can get below, to read the figures of a model against.
+
+    `floor/<part>/...`: the true law on the learner's own grid and particles, on synthetic scenes, over the same frames and with as
+    many points as the models. `floor/sampling/...`: two random samplings of the true shape, where true positions are known.
+    """
+    from mosa.evaluation.floor import floor_rollout
+
+    figures = {}
+    for sequence in evaluated:
+        scene = sequence.scene
+        if scene.truth is None:
+            continue
+        x = floor_rollout(body, scene, world)
+        frames = scene.training_frames if sequence.prefix.startswith("train") else list(range(scene.frames))
+        result = motion_metrics(x, body, sequence, frames, settings)
+        figures |= {f"floor/{sequence.prefix}/{k}": v for k, v in result.items()}
+    figures |= test_means(figures)
+    clouds = [scene.truth.rest if scene.truth is not None else scene.particles[0] for scene in (s.scene for s in evaluated)
+              if scene.truth is not None or scene.particles is not None]
+    if clouds:
+        floors = metrics.sampling_floors(clouds[0], len(body.rest), len(clouds[0]), samples=settings.samples,
+                                          assignment=settings.assignment)
+        figures |= {f"floor/sampling/{name}": value for name, value in floors.items()}
+    return figures
+
+
+def identification(body: Body, scene: Scene) -> dict[str, float]:
+    """Identified parameters after calibration (`id_prior/`) and after the joint stage (`id/`), with errors where truth is known."""
+    figures = {}
+    for prefix, variant in (("id_prior", "prior"), ("id", "adapted")):
+        model = body.model(variant)
+        material, mean = model.material, float(body.factor(model.heterogeneity).detach().mean())
+        for name, value in material.physical().items():
+            scale = mean if name in material.modulated else 1.0
+            figures[f"{prefix}/{name}"] = float(value.detach()) * scale
+            if name in scene.known_parameters:
+                errors = metrics.identification_errors(name, figures[f"{prefix}/{name}"], scene.known_parameters[name])
+                figures |= {f"{prefix}/{key}": value for key, value in errors.items()}
+        figures[f"{prefix}/contact_offset_m"] = float(model.contact.lift(scene.ground).detach())
+    return figures
+
+
+def hidden_figures(body: Body, scene: Scene, figures: Mapping[str, float]) -> dict[str, float]:
+    """What was learned beside the hidden material of a built-in scene: `id/fibre_angle_deg` between the stiffest direction found
+    (of `law_figures`) and the fibres, `id/stiffness_correlation` of the stiffness over the particles, each where the truth has
+    it."""
+    if scene.truth is None or not scene.synthetic:
+        return {}
+    from mosa.evaluation.floor import hidden_of
+
+    hidden, found = hidden_of(scene), {}
+    fibre, axis = getattr(hidden, "fibre", None), [figures.get(f"id/stiffest_{name}") for name in "xyz"]
+    if fibre is not None and getattr(hidden, "ratio", 1) > 1 and None not in axis:
+        found["id/fibre_angle_deg"] = float(angle_between(torch.tensor(axis), torch.tensor(fibre)))
+    learned, true = body.factor(body.model().heterogeneity).detach().cpu(), hidden.factor(body.rest.cpu().float())
+    if float(true.std()) > 1e-6 and float(learned.std()) > 1e-6:
+        found["id/stiffness_correlation"] = float(torch.corrcoef(torch.stack([true, learned.float()]))[0, 1])
+    return found
+
+
+def law_figures(body: Body) -> dict[str, float]:
+    """What the learned law is like by itself: its stiffest direction, and whether it makes energy (with a warning)."""
+    adapter, material = body.adapter, body.material
+    if adapter is None or not adapter.is_on or adapter.own_dynamics:  # which brings no law
+        return {}
+    figures = {}
+    adapter.follow(material.poisson())
+    growth = vibration_growth(material, adapter, density=body.density, stride=body.settings.stride, law_options=body.law_options)
+    figures["id/growth_per_period"] = growth
+    if growth > GROWTH_LIMIT:
+        warn(f"the learned law makes energy: a freely vibrating block grows by a factor of {growth:.3g} in a period; the law of "
+             "adapter=operator has an energy and cannot", stacklevel=2)
+    if (stiffness := adapter.stiffness()) is not None:
+        axis, ratio = stiffest(stiffness.detach().cpu())
+        figures["id/stiffness_ratio"] = float(ratio)
+        return figures | {f"id/stiffest_{name}": float(value) for name, value in zip("xyz", axis)}
+    if "E" in material.physical():
+        states = material_states(material.law, material.per_particle(), body.law_options)
+        try:
+            axis, figures["id/stiffness_ratio"] = stiffest_axis(states, adapter)
+        except SimulationDiverged:  # a law without a tensile modulus
+            return figures
+        figures |= {f"id/stiffest_{name}": float(value) for name, value in zip("xyz", axis)}
+    return figures

@@ -1,0 +1,190 @@
+"""How sure a learned law is: draws of its posterior rolled out, the spread of what they predict, and what the data determined."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from collections.abc import Sequence as Ordered
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from mosa.errors import MosaError
+from mosa.evaluation.analysis.stiffness import cone, stiffest
+from mosa.evaluation.evaluate import Sequence, true_motion
+from mosa.modules.body.body import Body, World
+from mosa.modules.body.material import FORMS as RANGES
+from mosa.modules.body.material import RELATIVE, Form, Material
+from mosa.modules.fitting.gauss_newton import Posterior
+from mosa.modules.fitting.parameters import as_rival, each_law, limits_of
+from mosa.system.progress import tqdm
+
+DRAWS = 12
+INFLATION = 1.75
+"""Factor of the standard deviation of the numbers that are said, and of predictions where a law has no rivals. Frames of a motion
+are less independent than the likelihood takes them to be; chosen on the held-out drops of rabbit, chick1, mandarin and peanut."""
+DRAWN = 0.3
+"""Factor of the draws' standard deviation in predictions where the law has rivals. What these predict otherwise is most of the
+error; chosen on the same drops under two backbones: 95 % of the errors lie within two standard deviations on average."""
+FORMS = 0.7
+"""Factor of the standard deviation among the forms of a law."""
+ELSEWHERE = 3.0
+"""By so much more than on the drops that it was learned from a law is wrong on another one, beside what draws and forms say. Both
+were chosen on the held-out drops of these four bodies under two backbones; those of other bodies, and films by other programs, hold
+what docs/identification.md#what-is-sure says."""
+LEAST_DRAWS = 4
+"""Of those that could be simulated: fewer say nothing about a spread."""
+QUANTILES = 400
+"""Of a normal distribution, where its image under a bounded map is asked for."""
+
+
+@torch.no_grad()
+def predicted_spread(
+    body: Body, posterior: Posterior, sequences: Ordered[Sequence], world: World, *, draws: int = DRAWS, seed: int = 0
+) -> tuple[dict[str, float], dict[str, Tensor]]:
+    """(figures, standard deviation (T, N) [m] of every particle's position by the sequence's prefix).
+
+    The variance of a position, summed over its three components, is that of the draws (times `DRAWN`^2), that among the forms of
+    the law (`Posterior.rivals`, times `FORMS`^2), and the square of what the model gets wrong on the training sequence itself
+    (`Posterior.model_error`), which is `ELSEWHERE` times as much on a sequence that was not learned from. Draws and rivals that
+    cannot be simulated are left out and counted; sequences on which the law itself cannot are left out. Figures: posterior/draws,
+    posterior/rivals, posterior/<prefix>/sd_m and, after first contact and where the true motion is known,
+    posterior/<prefix>/coverage: the share of the particles' errors within two standard deviations.
+    """
+    generator = torch.Generator().manual_seed(seed)
+
+    base: dict[str, Tensor] = {}
+    for s in sequences:
+        try:
+            base[s.prefix] = _positions(body, s, world)
+        except MosaError:  # `evaluate` has said so
+            continue
+    sequences = [s for s in sequences if s.prefix in base]
+    if not sequences:  # of no draw would anything be simulated
+        return {"posterior/draws": 0.0, "posterior/rivals": 0.0, "posterior/model_error_m": posterior.model_error}, {}
+
+    def positions() -> dict[str, Tensor]:
+        return {s.prefix: _positions(body, s, world) for s in sequences}
+
+    drawn = drawn_motions(body, posterior.draws(draws, generator), positions)
+    others = rival_motions(body, posterior, positions)
+    figures: dict[str, float] = {"posterior/draws": float(len(drawn)), "posterior/rivals": float(len(others)),
+                                 "posterior/model_error_m": posterior.model_error}
+    spreads: dict[str, Tensor] = {}
+    if figures["posterior/draws"] < LEAST_DRAWS:
+        return figures, spreads
+    for s in sequences:
+        sd = total_spread(torch.stack([each[s.prefix] for each in drawn]), posterior.model_error, among_forms(base[s.prefix],
+                          [each[s.prefix] for each in others]), seen=s.prefix.startswith("train"))  # fmt: skip
+        spreads[s.prefix] = sd.cpu()
+        figures[f"posterior/{s.prefix}/sd_m"] = float(sd[s.contact :].square().mean().sqrt())
+        target = true_motion(body, s.scene)
+        if target is not None:
+            error = (base[s.prefix].cpu() - target)[s.contact :].norm(dim=-1)
+            figures[f"posterior/{s.prefix}/coverage"] = float((error <= 2 * sd.cpu()[s.contact :]).double().mean())
+    return figures, spreads
+
+
+Predicted = TypeVar("Predicted")
+
+
+@torch.no_grad()
+def drawn_motions(body: Body, laws: Tensor, predict: Callable[[], Predicted], *, quiet: bool = False) -> list[Predicted]:
+    """What predict() says of `body` under each of the laws (D, numbers) in turn; those that cannot be simulated are left out."""
+    found = []
+    for _ in tqdm(each_law(body, laws), "draws of the posterior", total=len(laws), leave=False, disable=quiet):
+        try:
+            found.append(predict())
+        except MosaError:
+            continue
+    return found
+
+
+@torch.no_grad()
+def rival_motions(body: Body, posterior: Posterior, predict: Callable[[], Predicted]) -> list[Predicted]:
+    """What predict() says of `body` as each of the posterior's rivals in turn; those that cannot be simulated are left out."""
+    found = []
+    for law, numbers in posterior.rivals.items():
+        with as_rival(body, law, numbers):
+            try:
+                found.append(predict())
+            except MosaError:
+                continue
+    return found
+
+
+def among_forms(base: Tensor, others: Ordered[Tensor]) -> Tensor | None:
+    """(T, N) [m^2] mean square distance from positions `base` (T, N, 3) of those that a law and its rivals predict, each form as
+    likely as the others; None without rivals."""
+    if not others:
+        return None
+    return torch.stack([(x - base).square().sum(-1) for x in others]).sum(0) / (len(others) + 1)
+
+
+def total_spread(drawn: Tensor, model_error: float, forms: Tensor | None = None, *, seen: bool = False) -> Tensor:
+    """(T, N) standard deviation [m] of positions (D, T, N, 3) under drawn laws, of the law's form (`among_forms`, [m^2]), and of
+    what no law explains. seen: the law was learned from this very motion."""
+    own = drawn.var(0).sum(-1)
+    known = INFLATION**2 * own if forms is None else DRAWN**2 * own + FORMS**2 * forms
+    return (known + (model_error if seen else ELSEWHERE * model_error) ** 2).sqrt()
+
+
+def _positions(body: Body, s: Sequence, world: World) -> Tensor:
+    return body.simulate(s.start, world, s.scene.frames, float(s.scene.times[1] - s.scene.times[0])).x
+
+
+def physical_sd(name: str, raw: Tensor, sd: float) -> float:
+    """Standard deviation of a global parameter in its own unit, of its unconstrained number `raw` () and that one's.
+
+    By the slope of its map; where its range is bounded on both sides, the root mean square distance from what was found of a normal
+    distribution that is cut off at the limits of the fit. The slope vanishes at the bounds, and would say that a Poisson number of
+    0.02 is known to 0.05 where 0.3 explains the motion as well."""
+    raw = raw.detach().double().cpu().requires_grad_(True)
+    with torch.enable_grad():
+        value = Material.physical_of(name, raw)
+        slope = torch.autograd.grad(value, raw)[0]
+    if not isinstance(RANGES.get(name), Form) or math.isinf(RANGES[name].high):
+        return sd * float(slope.abs())
+    low, high = limits_of(name)
+    middle, sd = raw.detach().clamp(low, high), min(max(sd, 1e-9), 1e9)  # one that was extrapolated may lie beyond a limit
+    below, within = torch.special.ndtr((torch.tensor([low, high], dtype=torch.float64) - middle) / sd).tolist()
+    shares = below + (within - below) * (torch.arange(QUANTILES, dtype=torch.float64) + 0.5) / QUANTILES
+    drawn = (middle + sd * torch.special.ndtri(shares)).clamp(low, high)
+    return float((Material.physical_of(name, drawn) - value.detach()).square().mean().sqrt())
+
+
+@torch.no_grad()
+def determined(body: Body, posterior: Posterior, *, draws: int = 400, seed: int = 1) -> dict[str, float]:
+    """What the data say about the law: standard deviations of the global parameters (`posterior/<name>_sd`, relative for moduli),
+    how many of the operator's numbers and of the stiffness modes they determine, and the 95 % cone about the stiffest direction:
+    of draws about every form of the law that explains the data, each form as likely as the others."""
+    figures: dict[str, float] = {}
+    blocks: dict[str, list[int]] = {}
+    for i, name in enumerate(posterior.names):
+        blocks.setdefault(name.split("[")[0], []).append(i)
+    for name, index in blocks.items():
+        if name in body.material.raw:
+            raw, own = posterior.mean[index[0]], float(posterior.covariance[index[0], index[0]].sqrt()) * INFLATION
+            sd = physical_sd(name, raw, own)
+            if name in RELATIVE:
+                figures[f"posterior/{name}_relative_sd"] = sd / float(body.material.physical_of(name, raw))
+            else:
+                figures[f"posterior/{name}_sd"] = sd
+        elif name in ("operator", "stiffness"):
+            figures[f"posterior/{name}_numbers"] = float(len(index))
+            figures[f"posterior/{name}_determined"] = float(posterior.determined[index].sum())
+    if body.adapter is not None and body.adapter.is_on and body.adapter.stiffness() is not None:
+        generator = torch.Generator().manual_seed(seed)
+        axis, _ = stiffest(body.adapter.stiffness().cpu())
+        stiffnesses, forms = [], torch.stack([posterior.mean, *(n.to(posterior.mean) for n in posterior.rivals.values())])
+        # wider draws than the likelihood's own
+        away = INFLATION * (posterior.draws(draws, generator) - posterior.mean)
+        for _ in each_law(body, forms[torch.arange(draws) % len(forms)] + away):
+            body.adapter.follow(body.material.poisson())
+            stiffnesses.append(body.adapter.stiffness().cpu())
+        body.adapter.follow(body.material.poisson())
+        axes, ratios = stiffest(torch.stack(stiffnesses))
+        figures["posterior/stiffest_cone_deg"] = cone(axis, axes)
+        figures["posterior/stiffness_ratio_sd"] = float(ratios.std())
+    return figures

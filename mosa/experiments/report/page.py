@@ -1,0 +1,309 @@
+"""The page of results: for every experiment the paper's printed figures beside ours, and which of its claims hold.
+
+It is made from the files `<name>.json` that `write_results` leaves beside the tables; nothing on it is typed by hand."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mosa.errors import ConfigError, DataError
+from mosa.evaluation.analysis.tables import markdown
+from mosa.experiments.collecting import INSTEAD, Cell, said_below
+from mosa.experiments.commits import commits_since
+from mosa.experiments.report.printed import printed_table
+from mosa.experiments.specification import Claim, Experiment, Figure, load_experiment
+from mosa.system.whole_files import write_whole, written_whole
+
+Tables = Mapping[str, Mapping[str, Mapping[str, Cell | None]]]
+NOT_RUN, OURS = "not run", "ours"
+EMPTY: dict[str, Any] = {"extra": "", "provenance": [], "pictures": []}
+INTRODUCTION = """# The paper's tables, and what comes out here
+
+Made by `mosa-experiment --page` from `docs/results/`; [experiments.md](experiments.md) says how its tables are run, what of the
+paper is not among them and why. Under each title: how the data differ from the paper's, which have not been released; the
+figures made here; the paper's own; and what of the claims holds here.
+
+- **ours** is the default of this project (`adapter=operator`, [identified](identification.md) by Gauss-Newton). **four networks
+  (paper)** is the paper's adapter (`adapter=mosa`), with its bounds alpha of 0.1 (its text; its appendix chooses 0.15); other than
+  in the paper, what it adds to the stress is bounded (`adapter.l_max`) and vanishes at rest (`adapter.rest_free`), and it learns
+  for 40 steps. [The other rows](experiments.md#methods-it-compares).
+- **rms error** is the root mean square distance of the particles from where they truly are, after first contact, on drops that
+  were not learned from unless said otherwise. **PSNR** and **SSIM** are of the part of a picture about the body.
+  [All figures](figures.md), [all terms](glossary.md).
+- With seeds, a claim holds where it does by more than the spread of the two rows over them. *not run*: no job of that place is
+  complete."""
+
+
+def write_json(path: Path, tables: Tables, extra: str, lines: Sequence[str], pictures: Sequence[Path]) -> None:
+    """What the page needs of an experiment's results. extra: what its analysis says; lines: where the figures come from."""
+    cells = {label: {row: {c: None if cell is None else [cell.mean, cell.sd, cell.count] for c, cell in found.items()}
+                     for row, found in rows.items()} for label, rows in tables.items()}  # fmt: skip
+    found = {"cells": cells, "extra": extra, "provenance": list(lines), "pictures": [picture.name for picture in pictures]}
+    with written_whole(path) as partial:
+        partial.write_text(json.dumps(found, indent=1) + "\n")
+
+
+def read_tables(path: Path) -> tuple[Tables, dict[str, Any]] | None:
+    """Of `write_json`; None where there is no file. Errors: DataError naming a damaged one."""
+    if not path.is_file():
+        return None
+    try:
+        found = json.loads(path.read_text())
+        tables = {label: {row: {c: None if cell is None else Cell(*cell) for c, cell in cells.items()}
+                          for row, cells in rows.items()} for label, rows in found["cells"].items()}  # fmt: skip
+        return tables, {name: found[name] for name in EMPTY}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DataError(f"{path}: not the results of an experiment ({error}); write them again with --collect") from error
+
+
+def write_page(folder: Path, names: Sequence[str], results: Path) -> Path:
+    """results.md beside the folder of results. folder: of the experiments' files. Errors: ConfigError, DataError."""
+    if not results.is_dir():
+        raise ConfigError(f"--results: expected a folder with results, found none at {results}")
+    parts, lines = [], []
+    for name in sorted(names, key=lambda name: not name.startswith("table_")):
+        experiment = load_experiment(folder, name)
+        parts.append(f"## {experiment.title}\n\n{experiment.note.strip()}")
+        found = read_tables(results / f"{name}.json")
+        tables, about = found if found is not None else ({}, EMPTY)
+        known = {option.name for option in experiment.axes[experiment.rows]}  # results of before may have other rows
+        tables = {label: {row: cells for row, cells in rows.items() if row in known} for label, rows in tables.items()}
+        lines.append([experiment.title, *state_of(about["provenance"]), *claims_of(experiment, tables)])
+        parts += older(about["provenance"])
+        if any(cell for rows in tables.values() for cells in rows.values() for cell in cells.values()):
+            parts += [ours(experiment, tables)] if experiment.listed else []
+        else:
+            parts.append(f"Here: {NOT_RUN}. `mosa-experiment {name}`")
+        if about["extra"]:
+            parts.append(about["extra"])
+        parts += [f"![{experiment.title}]({results.name}/{picture})" for picture in about["pictures"]]
+        if experiment.printed is not None:
+            parts.append(printed_table(experiment.printed))
+        if experiment.claims:
+            parts.append("\n".join(f"- {claim.text}: **{verdict(experiment, claim, tables)}**" for claim in experiment.claims))
+        if about["provenance"]:
+            parts.append(f"All of it: [{name}.md]({results.name}/{name}.md). " + "; ".join(about["provenance"]) + ".")
+    beside = [f"[{read_title(page)}]({results.name}/{page.name})" for page in sorted(results.glob("*_from_motion.md"))]
+    if beside:
+        parts.append(f"## Without images\n\nLaws that were learned from the true motion of a body: {', '.join(beside)}.")
+    page = results.parent / "results.md"
+    header = ["", "jobs complete", "commit (changes of the program since)", "the paper's claims", "claims about ours"]
+    whole = [INTRODUCTION, markdown(header, lines), *parts]
+    write_whole(page, "\n\n".join(whole) + "\n")
+    return page
+
+
+def read_title(page: Path) -> str:
+    return page.read_text().partition("\n")[0].lstrip("# ")
+
+
+def state_of(lines: Sequence[str]) -> tuple[str, str]:
+    """(jobs complete of all, age) by the lines that say where figures come from."""
+    jobs = re.search(r"\b(\d+ of \d+) jobs complete\b", "; ".join(lines))
+    if jobs is None:
+        return NOT_RUN, ""
+    since, said = commits_since(lines), "; ".join(lines)
+    changed = ", with changes" if re.search(r"\bcommit [0-9a-f]+, with changes", said) else ""
+    return jobs[1], "" if since is None else f"{since[0]}{changed} ({since[1]})"
+
+
+OUTCOMES = {"holds against": ("holds against what was run", "hold against what was run"), "holds": ("holds", "hold"),
+            "within": ("within the spread", "within the spread"), "none is determined": ("not determined", "not determined"),
+            "does not": ("does not hold", "do not hold"), NOT_RUN: (NOT_RUN, NOT_RUN)}  # fmt: skip
+"""What a verdict begins with, the longer words first, and how one and several of them are said."""
+
+
+def claims_of(experiment: Experiment, tables: Tables) -> tuple[str, str]:
+    """How many of the claims hold, and how many not: of the paper's, which are about its own methods, and of those about ours."""
+    counts: tuple[Counter, Counter] = Counter(), Counter()
+    for claim in experiment.claims:
+        said = verdict(experiment, claim, tables)
+        counts[claim.most is not None or claim.row == OURS][next(begins for begins in OUTCOMES if said.startswith(begins))] += 1
+    of_paper, of_ours = (", ".join(f"{found[begins]} {words[found[begins] > 1]}" for begins, words in OUTCOMES.items()
+                                   if found[begins]) for found in counts)  # fmt: skip
+    return of_paper, of_ours
+
+
+def older(lines: Sequence[str]) -> list[str]:
+    """What is said of figures that an earlier state of the program made, by the lines that say where they come from."""
+    found = commits_since(lines)
+    if found is None or found[1] == 0:
+        return []
+    made, count = found
+    changed = "1 commit has" if count == 1 else f"{count} commits have"
+    return [f"**These figures are of an older commit, {made}:** {changed} changed the program (`mosa/`, `conf/`) since, up to when "
+            "this page was made. What it gives now was not run."]  # fmt: skip
+
+
+def ours(experiment: Experiment, tables: Tables) -> str:
+    """A table of all figures: a column for each figure where there is one column, else figures side by side in a cell."""
+    figures = [figure for figure in experiment.figures if figure.label in tables]
+    rows, columns = list(tables[figures[0].label]), list(next(iter(tables[figures[0].label].values())))
+
+    def text(figure: Figure, row: str, column: str) -> str:
+        found = tables[figure.label].get(row, {}).get(column)
+        return "" if found is None else found.text(figure.decimals)
+
+    if len(columns) == 1:
+        shown = [f for f in figures if any(text(f, row, columns[0]) for row in rows)]
+        lines = [[row, *(text(f, row, columns[0]) for f in shown)] for row in rows]
+        lines = [[row, *cells] if any(cells) else [row, NOT_RUN, *([""] * (len(shown) - 1))] for row, *cells in lines]
+        return f"Here ({columns[0]}):\n\n" + markdown([experiment.rows, *(f.label for f in shown)], lines)
+    lines = []
+    for row in rows:
+        cells = [[text(f, row, column) for f in figures] for column in columns]
+        lines.append([row, *(side_by_side(values, "-" if column == "mean" else NOT_RUN) for column, values in zip(columns, cells))])
+    said = said_below(tables)
+    header = [f"{experiment.rows} \\ {experiment.columns}" if experiment.plot == "map" else experiment.rows, *columns]
+    return f"Here ({' / '.join(f.label for f in figures)}):\n\n" + markdown(header, lines) + (f"\n\n{said}" if said else "")
+
+
+def side_by_side(values: Sequence[str], without: str) -> str:
+    """Figures of a cell; one word where all say it; without: where there are none."""
+    return values[0] if len(set(values)) == 1 and values[0] in INSTEAD else (
+        " / ".join(values) if any(values) else without)
+
+
+def verdict(experiment: Experiment, claim: Claim, tables: Tables) -> str:
+    """What the tables say of a claim, in words and figures."""
+    figure = next(f for f in experiment.figures if f.label == claim.figure)
+    rows = tables.get(claim.figure, {})
+    return within(experiment, claim, rows, tables) if claim.most is not None else ahead(figure, claim, rows)
+
+
+def place_of(cells: Mapping[str, Cell | None], column: str | None) -> Cell | None:
+    """The cell of a column; of none the mean, or the only one."""
+    if column is not None:
+        return cells.get(column)
+    return cells["mean"] if "mean" in cells else next(iter(cells.values())) if len(cells) == 1 else None
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Two rows over the columns in which both have finite figures. mine, other: means over them; without: the other columns;
+    better: in how many of those that were run of both the first is ahead, or the other one diverged or failed; of: their number."""
+
+    mine: Cell
+    other: Cell
+    without: tuple[str, ...]
+    better: int
+    of: int
+
+
+def compared(mine: Mapping[str, Cell | None], other: Mapping[str, Cell | None], column: str | None, sign: int) -> Compared | None:
+    """None where they share no column. sign: 1 where more is better, -1 where less is."""
+    names = [column] if column is not None else [each for each in mine if each != "mean"] or list(mine)
+    run = [each for each in names if mine.get(each) is not None and other.get(each) is not None]
+    shared = [each for each in run if math.isfinite(mine[each].mean) and math.isfinite(other[each].mean)]
+    if not shared:
+        return None
+    better = sum(1 for each in run if math.isfinite(mine[each].mean)
+                 and not (each in shared and sign * (mine[each].mean - other[each].mean) <= 0))  # fmt: skip
+    means = (mine.get("mean"), other.get("mean"))
+    if len(shared) < len(names) or column is not None or None in means:
+        means = (averaged([mine[each] for each in shared]), averaged([other[each] for each in shared]))
+    return Compared(means[0], means[1], tuple(each for each in names if each not in shared), better, len(run))
+
+
+def averaged(cells: Sequence[Cell]) -> Cell:
+    """Mean of means; their seeds differ independently."""
+    sds = [each.sd for each in cells]
+    sd = None if None in sds else math.sqrt(sum(each**2 for each in sds)) / len(sds)
+    return Cell(sum(each.mean for each in cells) / len(cells), sd, min(each.count for each in cells))
+
+
+def outcome(found: Compared, sign: int, spread: float) -> str:
+    """ahead | close | behind: by more than the spread over the seeds; of one seed, than what is given."""
+    gain = sign * (found.mine.mean - found.other.mean)
+    if found.mine.sd is not None and found.other.sd is not None:
+        spread = math.hypot(found.mine.sd, found.other.sd)
+    return "close" if abs(gain) <= spread and gain != 0 else "ahead" if gain > 0 else "behind"
+
+
+def ahead(figure: Figure, claim: Claim, rows: Mapping[str, Mapping[str, Cell | None]]) -> str:
+    """Whether a row is better than others, by more than the spread of the two over the seeds."""
+    mine, sign = rows.get(claim.row, {}), -1 if figure.best == "least" else 1
+    if claim.each:
+        return ahead_in_each(figure, claim, rows, sign)
+    found = {row: compared(mine, rows.get(row, {}), claim.column, sign) for row in claim.against}
+    known = {row: each for row, each in found.items() if each is not None}
+    if not known:
+        return NOT_RUN
+    said = {row: outcome(each, sign, claim.spread) for row, each in known.items()}
+    missing = [row for row in claim.against if row not in known]
+    word = ("does not hold" if "behind" in said.values() else "within the spread" if "close" in said.values()
+            else "holds" + bool(missing) * " against those that were run")  # fmt: skip
+    parts, last = [], None
+    for row, each in known.items():
+        own = each.mine.text(figure.decimals)
+        notes = [row] + ([f"better in {each.better} of {each.of}"] if each.of > 1 else [])
+        notes += [f"without {', '.join(each.without)}"] if each.without else []
+        parts.append(("" if own == last else f"{own} against ") + f"{each.other.text(figure.decimals)} ({'; '.join(notes)})")
+        last = own
+    text = f"{word}, " + ", ".join(parts)
+    one = any(each.mine.sd is None for each in known.values())
+    return text + (f"; {NOT_RUN}: {', '.join(missing)}" if missing else "") + ("; one seed" if one else "")
+
+
+def ahead_in_each(figure: Figure, claim: Claim, rows: Mapping[str, Mapping[str, Cell | None]], sign: int) -> str:
+    """Whether a row is better than all others in every column, with those in which it is not."""
+    mine = rows.get(claim.row, {})
+    known: dict[str, str] = {}
+    for column in mine:
+        others = {row: cell for row in claim.against if (cell := rows.get(row, {}).get(column)) is not None}
+        if column == "mean" or mine[column] is None or not others:
+            continue
+        if not math.isfinite(mine[column].mean):
+            known[column] = f"{column}: {mine[column].text(figure.decimals)}"
+            continue
+        found = {row: compared(mine, rows[row], column, sign) for row in others}  # None: the other one diverged
+        bad = [row for row, each in found.items() if each is not None and outcome(each, sign, claim.spread) != "ahead"]
+        known[column] = "" if not bad else f"{column}: {mine[column].text(figure.decimals)} against " + ", ".join(
+            f"{others[row].text(figure.decimals)} ({row})" for row in bad)
+    if not known:
+        return NOT_RUN
+    good = [column for column, said in known.items() if not said]
+    text = "holds" if len(good) == len(known) else "does not hold"
+    text += f", ahead in {len(good)} of {len(known)}" + (f" ({', '.join(good)})" if good and len(good) < len(known) else "")
+    text += "".join(f"; {said}" for said in known.values() if said)
+    return text + ("; one seed" if all(cell is None or cell.sd is None for cell in mine.values()) else "")
+
+
+def covered(off: float, sd: float, scale: float | None) -> bool:
+    """Whether twice the posterior's deviation covers an error. scale: of what 1 is written as, where the deviation is that of a
+    modulus, hence of its logarithm: an error of less than 1 may then be one downwards, which is the larger step (of what is off
+    upwards `parameters` knows more)."""
+    if scale is None:
+        return 2 * sd >= off
+    off, sd = off / scale, sd / scale
+    return 2 * sd >= (math.log1p(off) if off >= 1 else -math.log1p(-off))
+
+
+def within(experiment: Experiment, claim: Claim, rows: Mapping[str, Mapping[str, Cell | None]], tables: Tables) -> str:
+    """Of how many rows a figure is at most what is claimed; of the others, whether twice the posterior's deviation covers it."""
+    known = {row: cell for row in rows if (cell := place_of(rows[row], claim.column)) is not None}
+    if not known:
+        return NOT_RUN
+    above = {row: cell for row, cell in known.items() if not cell.mean <= claim.most}
+    scales = {f.label: f.scale for f in experiment.figures if f.figure.endswith("_relative_sd")}
+    unsure = [] if claim.unless is None else [
+        row for row, cell in above.items()
+        if (sd := place_of(tables.get(claim.unless, {}).get(row, {}), claim.column)) is not None
+        and covered(cell.mean, sd.mean, scales.get(claim.unless))]  # fmt: skip
+    wrong = {row: cell for row, cell in above.items() if row not in unsure}
+    undetermined = "none is determined" if len(unsure) == len(known) else "holds where it is determined"
+    text = f"{'holds' if not above else 'does not hold' if wrong else undetermined}, "
+    unit = match[1] if (match := re.search(r"\[(.+)\]$", claim.figure)) else ""
+    text += f"{len(known) - len(above)} of {len(known)} within {claim.most:g} {unit}".rstrip()
+    if unsure:
+        text += "; not determined, and the posterior says so: " + ", ".join(f"{row} ({above[row].text(1)})" for row in unsure)
+    if wrong:
+        text += "; beyond it: " + ", ".join(f"{row} ({cell.text(1)})" for row, cell in wrong.items())
+    return text

@@ -1,0 +1,156 @@
+"""Results of an experiment on disk: Markdown, CSV and LaTeX, with the paper's printed figures beside ours, and its picture."""
+
+from __future__ import annotations
+
+import csv
+import platform
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+import mosa
+from mosa.evaluation.analysis.tables import markdown
+from mosa.experiments.collecting import Cell, Record, best_of, records_of, said_below, table
+from mosa.experiments.commits import commit
+from mosa.experiments.report.drawing import draw, save
+from mosa.experiments.report.page import write_json
+from mosa.experiments.report.printed import printed_table
+from mosa.experiments.specification import Experiment, Figure, Job, commit_of, minutes_taken
+from mosa.system.whole_files import write_whole, written_whole
+
+
+def write_results(experiment: Experiment, jobs: Sequence[Job], folder: Path, command: str) -> Path:
+    """Tables and pictures of the jobs that are complete into `folder`; the Markdown page's path."""
+    from mosa.experiments.analyses import ANALYSES
+
+    folder.mkdir(parents=True, exist_ok=True)
+    records = records_of(jobs)
+    tables = {figure.label: table(experiment, records, figure) for figure in experiment.figures}
+    name = experiment.name + ("_quick" if experiment.quick else "")
+    write_csv(folder / f"{name}.csv", experiment, records)
+    write_whole(folder / f"{name}.tex", latex(experiment, tables))
+    pictures = []
+    if experiment.plot is not None and (figure := draw(experiment, tables)) is not None:
+        pictures.append(save(figure, folder / name))
+    extra = ""
+    if experiment.analysis is not None:
+        extra, more = ANALYSES[experiment.analysis](experiment, records, folder / name)
+        pictures += more
+    page = folder / f"{name}.md"
+    lines = provenance(experiment, jobs, records, command)
+    write_json(folder / f"{name}.json", tables, extra, lines, pictures)
+    write_whole(page, markdown_page(experiment, jobs, tables, pictures, extra, lines))
+    return page
+
+
+def markdown_page(
+    experiment: Experiment, jobs: Sequence[Job], tables: Mapping, pictures: Sequence[Path], extra: str, lines: Sequence[str],
+) -> str:  # fmt: skip
+    parts = [f"# {experiment.title}"]
+    if experiment.quick:
+        parts.append(
+            "Quick variant: small and short. It shows that the experiment runs; its figures say nothing about the methods."
+        )
+    if experiment.note:
+        parts.append(experiment.note.strip())
+    bold = "{}" if experiment.plot == "map" else "**{}**"  # of a map no column has a best row
+    for figure in experiment.figures:
+        rows = tables[figure.label]
+        header = [experiment.rows, *next(iter(rows.values()))]
+        body = [[row, *(cell_text(rows, row, column, figure, bold) for column in header[1:])] for row in rows]
+        parts.append(f"{figure.label}{arrow(figure)} (`{figure.figure}`)\n\n" + markdown(header, body))
+    parts += [said] if (said := said_below(tables)) else []
+    if extra:
+        parts.append(extra)
+    parts += [f"![{experiment.title}]({picture.name})" for picture in pictures]
+    if experiment.printed is not None:
+        parts.append(printed_table(experiment.printed))
+    missing = [f"{'failed' if job.failed else 'not run'}: {job.folder.name} ({' '.join(job.overrides)})"
+               + (f": {job.failed}" if job.failed else "") for job in jobs if not job.finished]
+    parts.append("\n".join(f"- {line}" for line in (*lines, *missing)))
+    return "\n\n".join(parts) + "\n"
+
+
+def arrow(figure: Figure) -> str:
+    return {"most": ", more is better", "least": ", less is better", None: ""}[figure.best]
+
+
+def cell_text(
+    rows: Mapping[str, Mapping[str, Cell | None]], row: str, column: str, figure: Figure, bold: str, plus: str = "±"
+) -> str:
+    found = rows[row].get(column)
+    if found is None:
+        return ""
+    text = found.text(figure.decimals, plus)
+    return bold.format(text) if best_of(rows, column, figure.best) == row else text
+
+
+def provenance(experiment: Experiment, jobs: Sequence[Job], records: Sequence[Record], command: str) -> list[str]:
+    """What the figures come from: commit, seeds, machine, time."""
+    complete = [job for job in jobs if job.finished]
+    devices = sorted(
+        {str(record.figures["time/device"]) for record in records if record.figures and "time/device" in record.figures}
+    )
+    minutes = [minutes_taken(job) or 0.0 for job in complete]
+    return [
+        f"command: `{command}`",
+        f"version {mosa.__version__}, {made_by(complete)}",
+        f"seeds: {', '.join(map(str, experiment.seeds))}; ± is the standard deviation over them, of one seed there is none",
+        f"machine: {', '.join(devices) or 'none'}; collected under Python {platform.python_version()}",
+        f"{len(complete)} of {len(jobs)} jobs complete, {sum(minutes):.1f} minutes of jobs, written "
+        f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+    ]
+
+
+def made_by(jobs: Sequence[Job]) -> str:
+    """The states of the program that complete jobs were run with, the commonest first; of those that do not say it the present
+    one."""
+    present = commit()
+    counts = Counter(commit_of(job) or present for job in jobs) or Counter([present])
+    (first, _), *others = counts.most_common()
+    more = ", ".join(f"{count} job{'s' * (count > 1)} of {other}" for other, count in others)
+    return f"commit {first}" + (f" ({more})" if more else "")
+
+
+def write_csv(path: Path, experiment: Experiment, records: Sequence[Record]) -> None:
+    """One line for each cell, seed and figure, in the unit of metrics.json times `scale`; empty where it is missing."""
+    with written_whole(path) as partial, open(partial, "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow([*experiment.axes, "seed", "label", "figure", "value", "run"])
+        for record in records:
+            for figure in experiment.figures:
+                found = record.value(figure)
+                places = [record.place[axis].name for axis in experiment.axes]
+                writer.writerow(
+                    [
+                        *places,
+                        record.seed,
+                        figure.label,
+                        figure.figure,
+                        "" if found is None else repr(found),
+                        record.job.folder.name,
+                    ]
+                )
+
+
+def latex(experiment: Experiment, tables: Mapping[str, Mapping[str, Mapping[str, Cell | None]]]) -> str:
+    """A tabular for each figure; needs booktabs."""
+    bold, parts = "{}" if experiment.plot == "map" else r"\textbf{{{}}}", []
+    for figure in experiment.figures:
+        rows = tables[figure.label]
+        columns = list(next(iter(rows.values())))
+        lines = [rf"% {experiment.title}: {figure.label} ({figure.figure})", rf"\begin{{tabular}}{{l{'c' * len(columns)}}}",
+                 r"\toprule",
+                 " & ".join([escaped(figure.label), *map(escaped, columns)]) + r" \\", r"\midrule"]  # fmt: skip
+        for row in rows:
+            cells = (cell_text(rows, row, column, figure, bold, r"$\pm$") for column in columns)
+            lines.append(" & ".join([escaped(row), *cells]) + r" \\")
+        parts.append("\n".join([*lines, r"\bottomrule", r"\end{tabular}"]))
+    return "\n\n".join(parts) + "\n"
+
+
+def escaped(text: str) -> str:
+    for sign in ("\\", "&", "%", "_", "#", "$"):
+        text = text.replace(sign, r"\textbackslash{}" if sign == "\\" else f"\\{sign}")
+    return text

@@ -1,0 +1,1 @@
+"""What corrects the stress of the prior law."""

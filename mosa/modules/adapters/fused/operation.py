@@ -1,0 +1,304 @@
+"""The fused networks as one torch operation: what `ProgressiveOperator` computes, with nothing stored but inputs and weights.
+
+Sources of the kernels: network_kernels.py and half_kernel.py (forward), assembly_kernels.py, adjoint_kernels.py, sum_kernels.py.
+Their torch twin is mosa/modules/adapters/progressive.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from mosa.modules.adapters.fused.adjoint_kernels import phi_backward, psi1_backward, psi2_backward, theta_backward
+from mosa.modules.adapters.fused.assembly_kernels import assemble, assemble_adjoint, finish, normals, normals_adjoint
+from mosa.modules.adapters.fused.half_kernel import operator_half
+from mosa.modules.adapters.fused.half_weights import packed
+from mosa.modules.adapters.fused.network_kernels import phi_forward, psi1_forward, psi2_forward, theta_forward
+from mosa.modules.adapters.fused.sum_kernels import weight_gradients
+from mosa.physics.adapters.network_evaluation import backward_at_hand, from_weights
+
+LANES = 128
+"""Particles a program of the assembly; rows are padded to a multiple, so that arrays stored by column need no mask."""
+BLOCK = 64
+"""Rows a program takes at once."""
+INTERPRETED_PROGRAMS = 2
+REGISTERS, PROGRAMS = 168, 3
+"""Of a thread in the forward kernels, and programs a multiprocessor, which that many registers leave room for."""
+HALF_PROGRAMS = 2
+"""The same of the kernel in float16, by its shared memory."""
+HALF_SHARED = 113 * 1024
+"""Bytes that it takes of it at most, with a hidden width of 64."""
+
+
+class Settings(NamedTuple):
+    """alpha, l_max, scale: as `ProgressiveOperator`; rest_free: as `StressAdapter`; precision: tf32x3 | tf32 | half."""
+
+    alpha: float
+    l_max: float | None
+    scale: float
+    rest_free: bool
+    precision: str = "tf32x3"
+
+
+class _Buffers(NamedTuple):
+    """What the kernels leave for one another, by column, M rows each. s1, pre, s2, moved = (I + G) pre: (6, M); l1 (H + 3, M), its
+    last rows the scaled normals; l2 (H + 12, M), with room for what else Theta reads; t (48, M): the bounded numbers of C_x, C_y,
+    C_z, C_xyz."""
+
+    pre: Tensor
+    s1: Tensor
+    l1: Tensor
+    t: Tensor
+    l2: Tensor
+    s2: Tensor
+    moved: Tensor
+
+
+def hopper(device: torch.device) -> bool:
+    return torch.cuda.get_device_capability(device)[0] == 9
+
+
+def _shared(device: torch.device) -> int:
+    return torch.cuda.get_device_properties(device).shared_memory_per_block_optin
+
+
+class _Launch:
+    """How the kernels of networks of one width are launched for one number of particles."""
+
+    def __init__(self, settings: Settings, n: int, hidden: int, device: torch.device) -> None:
+        self.n, self.hidden, self.device = n, hidden, device
+        self.rows = -(-(n + 1) // LANES) * LANES  # the particles, the state at rest, and as many more of these as fill the last one
+        self.lanes = (self.rows // LANES,)
+        precision = "tf32" if settings.precision == "half" else settings.precision  # half is of the forward kernel alone
+        # whether all weights of a network fit beside its activations in a multiprocessor's shared memory (200 of Hopper's 227 kB)
+        self.small = precision == "tf32" and hidden <= 64 and (device.type != "cuda" or hopper(device))
+        self.half = settings.precision == "half" and hidden <= 64 and (device.type != "cuda" or _shared(device) >= HALF_SHARED)
+        self.size = {"H": hidden, "P": precision}
+        self.warps = 8 if hidden > 64 else 4  # a warp group for 64 rows of 64 columns
+
+    def programs(self, block: int, per_multiprocessor: int) -> int:
+        """Programs that go through all tiles of `block` rows."""
+        tiles = self.rows // block
+        if self.device.type != "cuda":
+            return min(tiles, INTERPRETED_PROGRAMS)
+        return min(tiles, per_multiprocessor * torch.cuda.get_device_properties(self.device).multi_processor_count)
+
+    def forward(self) -> tuple[tuple[int], dict]:
+        tiles = self.programs(BLOCK, PROGRAMS) if self.small else self.rows // BLOCK
+        options = {"KEEP": self.small, "BLOCK": BLOCK, "num_warps": self.warps, "num_stages": 1}
+        return (tiles,), self.size | options | ({"maxnreg": REGISTERS} if self.hidden <= 64 else {})
+
+    def forward_half(self) -> tuple[tuple[int], dict]:
+        return (self.programs(BLOCK, HALF_PROGRAMS),), {"H": self.hidden, "BLOCK": BLOCK, "num_warps": 4, "num_stages": 1}
+
+    def backward(self, wanted: bool) -> tuple[tuple[int], dict]:
+        if not (self.small and wanted):
+            options = {"SUMS": "outside" if wanted else "none", "BLOCK": BLOCK, "num_warps": self.warps, "num_stages": 1}
+            return (self.rows // BLOCK,), self.size | options
+        options = {"SUMS": "inside", "BLOCK": 2 * BLOCK, "num_warps": 8, "num_stages": 1}
+        return (self.programs(2 * BLOCK, 1),), self.size | options
+
+
+def _evaluate(launch: _Launch, w: Tensor, s: Tensor, unit: Tensor, settings: Settings, weights: Sequence[Tensor], G: Tensor | None):
+    """Steps 1 to 4, and G (N, 6, 6) where it is given to be filled."""
+    n, m = launch.n, launch.rows
+    b = _Buffers(*(w.new_empty(k, m) for k in (6, 6, launch.hidden + 3, 48, launch.hidden + 12, 6, 6)))
+    phi, psi1, psi2 = weights[:6], weights[6:14], weights[14:20]
+    bound, scale, alpha = settings.l_max or 0.0, settings.scale, settings.alpha
+    grid, size = launch.forward()
+    phi_forward[grid](w, s, unit, *phi, b.pre, b.s1, n, m, scale, bound, BOUNDED=settings.l_max is not None, **size)
+    psi1_forward[grid](w, b.s1, *psi1, b.l1, b.t, n, m, scale, alpha, **size)
+    normals[launch.lanes](b.t, b.s1, b.l1[launch.hidden :], m, scale, BLOCK=LANES)
+    psi2_forward[grid](b.l1, *psi2, b.t, b.l2, n, m, alpha, **size)
+    operator = G is not None
+    assemble[launch.lanes](b.t, b.s1, b.pre, G if operator else b.t, b.s2, b.moved, n, m, OPERATOR=operator, BLOCK=LANES)
+    return b
+
+
+def _evaluate_all(
+    launch: _Launch, w: Tensor, s: Tensor, unit: Tensor, settings: Settings, weights: Sequence[Tensor], G: Tensor, h: Tensor
+) -> tuple[_Buffers, Tensor]:
+    """(buffers, post (6, M)); fills G (N, 6, 6) and h (N, 6)."""
+    n, m, bound = launch.n, launch.rows, settings.l_max or 0.0
+    b = _evaluate(launch, w, s, unit, settings, weights, G)
+    post, sums = torch.empty_like(b.pre), torch.empty_like(b.pre)
+    grid, size = launch.forward()
+    theta_forward[grid](
+        b.l2, w, b.s2, b.moved, *weights[20:], post, sums, n, m, settings.scale, bound, BOUNDED=settings.l_max is not None, **size
+    )
+    finish[launch.lanes](sums, w, s, unit, h, n, m, RESTED=settings.rest_free, BLOCK=LANES)
+    return b, post
+
+
+class _FromWeights(NamedTuple):
+    """packed: see half_weights.py; rest: (6,) b of the state at rest; known: False for zeros in place of it."""
+
+    packed: Tensor
+    rest: Tensor
+    known: bool
+
+
+def _from_weights(settings: Settings, weights: Sequence[Tensor], stored: bool) -> _FromWeights:
+    """For `_evaluate_half`. The rest is one more evaluation, of a particle in this state, by the same program."""
+
+    def make() -> _FromWeights:
+        zero = weights[0].new_zeros(1, 6)
+        made = _FromWeights(packed(weights), zero[0], False)
+        if not settings.rest_free:
+            return made
+        outputs = zero.new_empty(1, 6, 6), zero.new_empty(1, 6)
+        launch = _Launch(settings, 1, weights[0].shape[0], zero.device)
+        _evaluate_half(launch, zero, zero, zero.new_ones(1), settings, made, outputs, stored)
+        return made._replace(rest=outputs[1][0], known=True)
+
+    return from_weights(make, weights, settings, stored)
+
+
+def _evaluate_half(
+    launch: _Launch, w: Tensor, s: Tensor, unit: Tensor, settings: Settings, made: _FromWeights,
+    outputs: tuple[Tensor, Tensor] | None, stored: bool,
+) -> tuple[_Buffers, Tensor]:  # fmt: skip
+    """(buffers, post (6, M)) in float16. outputs: G (N, 6, 6) and h (N, 6) to be filled, None for steps 1 to 4 alone; stored: l1
+    and l2 too."""
+    m, hidden, operator = launch.rows, launch.hidden, outputs is not None
+    sizes = (6, 6, (hidden if stored else 0) + 3, 48, hidden + 12 if stored else 0, 6, 6 if operator else 0)
+    b = _Buffers(*(w.new_empty(k, m) for k in sizes))
+    post = w.new_empty(6 if operator else 0, m)
+    grid, size = launch.forward_half()
+    operator_half[grid](
+        w, s, unit, made.packed, made.rest, b.pre, b.s1, b.l1, b.l1[-3:], b.t, b.l2, b.s2, b.moved, post,
+        *(outputs or (b.t, b.t)), launch.n, m, int(made.known), settings.scale, settings.l_max or 0.0, settings.alpha,
+        BOUNDED=settings.l_max is not None, OPERATOR=operator, STORE=stored, **size,
+    )  # fmt: skip
+    return b, post
+
+
+class _FusedOperator(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, settings: Settings, unit: Tensor, w: Tensor, s: Tensor, *weights: Tensor):
+        w, s = w.contiguous(), s.contiguous()
+        given, weights = weights, tuple(weight.contiguous() for weight in weights)
+        n = len(w)
+        launch = _Launch(settings, n, weights[0].shape[0], w.device)
+        G, h = w.new_empty(n, 6, 6), w.new_empty(n, 6)
+        stored, made = backward_at_hand(), None
+        with torch.cuda.device_of(w):
+            if launch.half:  # from the weights as given: another copy of them each time would not be known again
+                made = _from_weights(settings, given, stored)
+                buffers, post = _evaluate_half(launch, w, s, unit, settings, made, (G, h), stored)
+            else:
+                buffers, post = _evaluate_all(launch, w, s, unit, settings, weights, G, h)
+        ctx.settings, ctx.launch, ctx.made = settings, launch, made
+        ctx.buffers = buffers if stored else None
+        ctx.save_for_backward(unit, w, s, post, *weights)
+        ctx.set_materialize_grads(False)
+        return G, h, buffers.t.T[:n], buffers.pre.T[:n], post.T[:n]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, gG, gh, gt, gpre, gpost):
+        unit, w, s, post, *weights = ctx.saved_tensors
+        n = len(w)
+        extra = any(g is not None for g in (gt, gpre, gpost))
+        shapes = {"G": (n, 36), "h": (n, 6), "t": (n, 48), "pre": (n, 6), "post": (n, 6)}
+        seeds = {}
+        for (name, shape), seed in zip(shapes.items(), (gG, gh, gt, gpre, gpost)):
+            if seed is None and (extra or name in "Gh"):
+                seed = w.new_zeros(shape)
+            seeds[name] = w if seed is None else seed.contiguous()  # w: never read
+        needs = ctx.needs_input_grad[4:]
+        with torch.cuda.device_of(w):
+            buffers, inputs = ctx.buffers, (ctx.launch, w, s, unit, ctx.settings)
+            if buffers is None:
+                buffers = _evaluate_half(*inputs, ctx.made, None, True)[0] if ctx.launch.half else _evaluate(*inputs, weights, None)
+            gw, gs, gradients = _backward(*inputs, weights, post, seeds, extra, any(needs), buffers)
+        gradients = [g if need else None for g, need in zip(gradients, needs, strict=True)]
+        return None, None, gw, gs, *gradients
+
+
+def _backward(
+    launch: _Launch, w: Tensor, s: Tensor, unit: Tensor, settings: Settings, weights: Sequence[Tensor], post: Tensor,
+    seeds: dict[str, Tensor], extra: bool, wanted: bool, b: _Buffers,
+) -> tuple[Tensor, Tensor, Sequence[Tensor | None]]:  # fmt: skip
+    """Adjoints of w, s (N, 6) and, where wanted, of the weights. post (6, M), b: of the forward pass; seeds: adjoints of the
+    outputs; extra: of the last three too."""
+    n, m, hidden = launch.n, launch.rows, launch.hidden
+    grid, size = launch.backward(wanted)
+    inside = size["SUMS"] == "inside"
+    h1, h2, g1, g2 = (w.new_empty(hidden if wanted and not inside else 0, m) for _ in range(4))  # of one network after the other
+    scale, bound, alpha = settings.scale, settings.l_max or 0.0, settings.alpha
+    flags = {"BOUNDED": settings.l_max is not None, "EXTRA": extra}
+    programs = grid[0] if inside else launch.programs(BLOCK, 1)
+    partial = w.new_empty(programs, sum(p.numel() for p in weights) if wanted else 0)
+    first = [sum(p.numel() for p in weights[:k]) for k in range(len(weights))]
+
+    def empty(rows: int) -> Tensor:
+        return w.new_empty(rows, m)
+
+    def sums(layer: int, inputs: Tensor, outputs: Tensor, more: tuple[Tensor, Tensor] | None = None, jobs: int = 5) -> None:
+        """Gradients of the network whose first weight is weights[layer]; jobs=2: of its last layer."""
+        g4, x4 = more or (outputs, inputs)
+        weight_gradients[(programs, jobs)](
+            g1, inputs, g2, h1, outputs, h2, g4, x4, partial, first[layer], partial.shape[1], m, IN1=weights[layer].shape[1],
+            OUT3=weights[layer + 4].shape[0], OUT4=len(g4) if more else 0, H=hidden, TILE=max(64, hidden), BLOCK=BLOCK // 2,
+            P=size["P"], num_warps=launch.warps,
+        )  # fmt: skip
+
+    outside = wanted and not inside
+    rest = seeds["h"].sum(0) if settings.rest_free else seeds["h"]
+    gl2, gw_theta, gs2, out = empty(hidden), empty(6), empty(6), empty(6)
+    theta_backward[grid](
+        b.l2, w, b.s2, post, seeds["h"], rest, unit, seeds["post"], *weights[20:], h1, h2, g1, g2, out, partial, gl2, gw_theta, gs2,
+        first[20], partial.shape[1], n, m, scale, bound, RESTED=settings.rest_free, **flags, **size,
+    )  # fmt: skip
+    if outside:
+        sums(20, b.l2, out)
+    gt, gs1, gmoved = torch.empty_like(b.t), empty(6), empty(6)
+    assemble_adjoint[launch.lanes](
+        b.t, b.s1, b.pre, seeds["G"], seeds["h"], rest, unit, gs2, seeds["t"], gt, gs1, gmoved, n, m, RESTED=settings.rest_free,
+        EXTRA=extra, BLOCK=LANES,
+    )  # fmt: skip
+    gl1, out = empty(hidden + 3), empty(12 + hidden)
+    h2 = empty(hidden) if inside else h2
+    psi2_backward[grid](
+        b.l1, b.t, b.l2, gt, gl2, *weights[14:20], h1, h2, g1, g2, out, partial, gl1, first[14], partial.shape[1], n, m, alpha,
+        **size,
+    )  # fmt: skip
+    if wanted:
+        sums(14, b.l1, out, jobs=2 if inside else 5)
+    del gl2  # what the rest needs goes where this was
+    normals_adjoint[launch.lanes](b.t, b.s1, gl1[hidden:], gt, gs1, m, scale, BLOCK=LANES)
+    x, gplanes, out = (empty(rows if outside else 0) for rows in (12, 36, hidden))
+    gw_psi, gs_psi = empty(6), empty(6)
+    psi1_backward[grid](
+        w, b.s1, b.t, gt, gl1, b.l1, *weights[6:14], h1, h2, g1, g2, x, gplanes, out, partial, gw_psi, gs_psi, first[6],
+        partial.shape[1], n, m, scale, alpha, **size,
+    )  # fmt: skip
+    if outside:
+        sums(6, x, out, (gplanes, b.l1))
+    gw, gs, out = torch.empty_like(w), torch.empty_like(s), empty(6)
+    phi_backward[grid](
+        w, s, unit, b.pre, gmoved, seeds["pre"], gs1, gs_psi, gw_psi, gw_theta, *weights[:6], h1, h2, g1, g2, x, out, partial, gw,
+        gs, first[0], partial.shape[1], n, m, scale, bound, **flags, **size,
+    )  # fmt: skip
+    if outside:
+        sums(0, x, out)
+    if not wanted:
+        return gw, gs, [None] * len(weights)
+    parts = partial.sum(0).split([p.numel() for p in weights])
+    return gw, gs, [part.view_as(p) for part, p in zip(parts, weights, strict=True)]
+
+
+def fused_operator(w: Tensor, s: Tensor, unit: Tensor, settings: Settings, weights: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    """(G (N, 6, 6), h (N, 6), numbers (N, 48), pre (N, 6), post (N, 6)) of w and s, each (N, 6) float32.
+
+    s and h are in multiples of unit (1,), which gets no gradient: h = unit (b - b at rest), without the second where not rest_free,
+    b = (I + G) L_pre + L_post of s / unit. numbers: what `microplane.correction` takes, 12 for each of C_x, C_y, C_z, C_xyz.
+    weights: weight and bias of the layers of Phi, Psi1, the planes, Psi2 and Theta (26 tensors), all of one hidden width, a power
+    of two from 16.
+    """
+    return _FusedOperator.apply(settings, unit, w, s, *weights)

@@ -1,0 +1,138 @@
+"""Steps 1 to 5 of the progressive stress adaptation (paper, section 3.1): the four networks on one symmetric tensor.
+
+1: L_pre (eq. 4). 2: C_x, C_y, C_z (eq. 7). 3: what they make of the stress on each plane, shears averaged (eq. 5).
+4: C_xyz on the normal components (eq. 7). 5: L_post (eq. 8).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from mosa.modules.adapters import microplane
+from mosa.modules.adapters.networks import TwoHiddenLayers, zero_outputs
+
+
+class Correction(NamedTuple):
+    """What corrects s (N, 6): s3 = (I + G)(s + pre) + post. G: (N, 6, 6); pre, post: (N, 6);
+    C: (N, 4, 3, 3), the corrections C_x, C_y, C_z, C_xyz."""
+
+    G: Tensor
+    pre: Tensor
+    post: Tensor
+    C: Tensor
+
+
+class ProgressiveOperator(nn.Module):
+    """Four networks on a dimensionless symmetric tensor s (N, 6) and the stretch w = vech(W - I) (N, 6).
+
+    alpha: bound of the entries of the LU factors; alpha_normal: of those of C_xyz and of l2, None: alpha;
+    l_max: of L_pre and L_post, None leaves them linear (the paper's form);
+    state_dependence: full | constant (the four matrices are learned numbers, not functions of the state);
+    major_symmetry: (A + C0 A^T C0^-1)/2 in place of A, needs `poisson` of C0;
+    no_prior_stress: s1 = L_pre instead of s + L_pre. The output is exactly 0 at initialisation.
+    """
+
+    def __init__(
+        self, *, alpha: float, l_max: float | None, input_scale: float, hidden: int, no_C: bool, no_pre: bool, no_post: bool,
+        state_dependence: str = "full", major_symmetry: bool = False, no_prior_stress: bool = False,
+        alpha_normal: float | None = None,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        self.alpha, self.l_max, self.scale = alpha, l_max, input_scale
+        self.alpha_normal = alpha if alpha_normal is None else alpha_normal
+        self.no_C, self.no_pre, self.no_post, self.no_prior_stress = no_C, no_pre, no_post, no_prior_stress
+        self.constant, self.major_symmetry = state_dependence == "constant", major_symmetry
+        self.phi = TwoHiddenLayers(12, 6, hidden)
+        self.psi1 = TwoHiddenLayers(12, hidden, hidden)
+        self.planes = nn.Linear(hidden, 36)
+        self.psi2 = TwoHiddenLayers(hidden + 3, 12 + hidden, hidden)
+        self.theta = TwoHiddenLayers(hidden + 12, 6, hidden)
+        for layer, rows in ((self.phi[-1], None), (self.planes, None), (self.psi2[-1], 12), (self.theta[-1], None)):
+            zero_outputs(layer, rows)
+        self.free = nn.Parameter(torch.zeros(4, 12)) if self.constant and not no_C else None
+        self.adaptive = not (no_C or self.constant)
+        for module, used in (
+            (self.phi, not no_pre), (self.psi1, self.adaptive or not no_post), (self.planes, self.adaptive),
+            (self.psi2, self.adaptive or not no_post), (self.theta, not no_post),
+        ):  # fmt: skip
+            module.requires_grad_(used)
+
+    def residual(self, network: nn.Module, *inputs: Tensor) -> Tensor:
+        """L_pre, L_post: (N, 6), within l_max."""
+        raw = network(torch.cat(inputs, -1))
+        return raw if self.l_max is None else self.l_max * torch.tanh(raw)
+
+    def first(self, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Step 1: (L_pre, s1, scaled w), each (N, 6)."""
+        k = self.scale
+        pre = torch.zeros_like(s) if self.no_pre else self.residual(self.phi, k * w, k * s)
+        return pre, pre if self.no_prior_stress else s + pre, k * w
+
+    def plane_corrections(self, kw: Tensor, s1: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Step 2: (C_x, C_y, C_z (N, 3, 3, 3), l1 (N, hidden) or None where nothing reads it)."""
+        n = len(s1)
+        l1 = None
+        if self.adaptive or not self.no_post:
+            l1 = self.psi1(torch.cat([kw, self.scale * s1], -1))
+        if self.no_C:
+            return s1.new_zeros(n, 3, 3, 3), l1
+        if self.constant:
+            return self.constant_corrections(s1)[:3].expand(n, 3, 3, 3), l1
+        return microplane.correction(self.alpha * torch.tanh(self.planes(l1)).unflatten(-1, (3, 12))), l1
+
+    def constant_corrections(self, like: Tensor) -> Tensor:
+        """(4, 3, 3). The numbers are learned in units of 1/input_scale: the networks' learning rate then fits them too."""
+        # filled where they are used: a copy from the host would wait for all that a GPU has still to do
+        bounds = ((3, self.alpha), (1, self.alpha_normal))
+        bound = torch.cat([torch.full((rows, 1), value, device=like.device) for rows, value in bounds]).to(like)
+        return microplane.correction(bound * torch.tanh(self.scale * self.free).to(like))
+
+    def constant_operator(self) -> Tensor:
+        """(6, 6) A - I of the constant matrices, before the projection to major symmetry."""
+        C = self.constant_corrections(self.free)
+        return microplane.redistribution(C[:3], C[3])
+
+    def normal_correction(self, l1: Tensor | None, n: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Step 4: (C_xyz (N, 3, 3), l2 (N, hidden) or None where nothing reads it); n: (N, 3) normals after the planes."""
+        numbers = l2 = None
+        if l1 is not None:
+            bounded = self.alpha_normal * torch.tanh(self.psi2(torch.cat([l1, self.scale * n], -1)))
+            numbers, l2 = bounded[:, :12], bounded[:, 12:]
+        if self.no_C:
+            return n.new_zeros(len(n), 3, 3), l2
+        if self.constant:
+            return self.constant_corrections(n)[3].expand(len(n), 3, 3), l2
+        return microplane.correction(numbers), l2
+
+    def last(self, l2: Tensor | None, kw: Tensor, s2: Tensor) -> Tensor:
+        """Step 5: L_post (N, 6)."""
+        return torch.zeros_like(s2) if self.no_post else self.residual(self.theta, l2, kw, self.scale * s2)
+
+    def forward(self, w: Tensor, s: Tensor, poisson: Tensor | None = None) -> Correction:
+        """The assembled form. w, s: (N, 6); poisson: () of the prior, for major_symmetry."""
+        pre, s1, kw = self.first(w, s)
+        planes, l1 = self.plane_corrections(kw, s1)
+        T = microplane.plane_operator(planes)
+        normal, l2 = self.normal_correction(l1, s1[:, :3] + apply(T[:, :3], s1))
+        G = microplane.with_normal(T, normal)
+        if self.major_symmetry:
+            G = microplane.major_symmetric(G, poisson)
+        post = self.last(l2, kw, s1 + apply(G, s1)) if not self.no_post else torch.zeros_like(s)
+        return Correction(G, pre, post, torch.cat([planes, normal[:, None]], 1))
+
+    def stepwise(self, w: Tensor, s: Tensor) -> Tensor:
+        """s3 (N, 6) in the paper's order, nothing assembled; without major_symmetry, which is one of the 6x6 operator."""
+        _, s1, kw = self.first(w, s)
+        planes, l1 = self.plane_corrections(kw, s1)
+        n, shears = microplane.stepwise_planes(s1, planes)
+        normal, l2 = self.normal_correction(l1, n)
+        s2 = torch.cat([n + (normal @ n[..., None])[..., 0], shears], -1)
+        return s2 + self.last(l2, kw, s2)
+
+
+def apply(G: Tensor, s: Tensor) -> Tensor:
+    """G s per particle: (N, k) from (N, k, 6) and (N, 6)."""
+    return (G @ s[..., None])[..., 0]

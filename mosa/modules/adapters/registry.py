@@ -1,0 +1,56 @@
+"""The adapters that a configuration may name: a name is looked up here, nothing else is ever imported or called for it."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from typing import Any
+
+from torch import nn
+
+from mosa.errors import ConfigError
+
+ADAPTERS = {
+    "hyperelastic": "mosa.modules.adapters.hyperelastic:HyperelasticAdapter",
+    "stress": "mosa.modules.adapters.stress:StressAdapter",
+    "direct": "mosa.baselines.direct:DirectAdapter",
+    "nclaw": "mosa.baselines.nclaw:NeuralLaw",
+    "neuma": "mosa.baselines.neuma:LowRankLaw",
+    "interaction": "mosa.baselines.interaction:InteractionNetwork",
+}
+"""adapter.name -> module:class. A new adapter is one class whose keyword arguments are the keys of its YAML, and one line here, or
+a call of `register_adapter` from another package."""
+
+
+def register_adapter(name: str, place: str) -> None:
+    """Make an adapter known by the name in its YAML. place: module:class, imported when a configuration asks for it.
+
+    Errors: ConfigError if another adapter has the name."""
+    if ADAPTERS.setdefault(name, place) != place:
+        raise ConfigError(f"adapter.name: there is an adapter {name!r} already; choose another name")
+
+
+def adapter_class(config: Mapping[str, Any]) -> type[nn.Module] | None:
+    """The class that `name` names, None where there is none. `_target_` of older files and checkpoints means the same where it is
+    the class of a known adapter. Errors: ConfigError naming the key."""
+    older = {place.replace(":", "."): name for name, place in ADAPTERS.items()}
+    name, target = config.get("name"), config.get("_target_")
+    if target is not None:
+        if not isinstance(target, str) or target not in older:
+            raise ConfigError(f"adapter._target_: expected a known adapter ({', '.join(older)}), found {target!r}; "
+                              "nothing else is imported or called")
+        if name is not None and name != older[target]:
+            raise ConfigError(f"adapter: expected name or the older _target_, found both, {name!r} and {target!r}")
+        name = older[target]
+    if name is None:
+        return None
+    if not isinstance(name, str) or name not in ADAPTERS:
+        raise ConfigError(f"adapter.name: expected {', '.join(ADAPTERS)} or null, found {name!r}; one of another package is known "
+                          "once that is imported (extensions)")
+    module, _, found = ADAPTERS[name].partition(":")
+    try:
+        adapter: type[nn.Module] = getattr(importlib.import_module(module), found)
+        return adapter
+    except (ImportError, AttributeError) as error:  # of another package's registration
+        raise ConfigError(f"adapter.name: {name!r} is registered as {ADAPTERS[name]}, which cannot be imported "
+                          f"({error})") from error

@@ -1,0 +1,1 @@
+"""The body that is learned: particles with a law and its parameters."""

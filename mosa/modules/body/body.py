@@ -1,0 +1,263 @@
+"""The learned body: rest particles with appearance, a prior law with its parameters, heterogeneity, and the stress adapter.
+
+One module for fitting, evaluation and later use, so that what is learned is what is simulated.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from mosa.errors import ConfigError
+from mosa.modules.adapters.base import Adapter
+from mosa.modules.body.contact import ContactOffset
+from mosa.modules.body.heterogeneity import StiffnessField
+from mosa.modules.body.material import Material
+from mosa.modules.body.model import Model
+from mosa.modules.body.ready import Ready
+from mosa.modules.body.simulation_settings import SimulationSettings
+from mosa.physics.engine.axes import PERIOD
+from mosa.physics.engine.law_options import AS_USUAL, LawOptions
+from mosa.physics.engine.simulator import Simulator
+from mosa.physics.rotations import skew
+from mosa.physics.time.adaptive_steps import StepControl
+from mosa.physics.time.clock import Adaptive, Replay
+from mosa.physics.time.time_step import required_substeps
+from mosa.physics.world import Start, World
+from mosa.rendering.appearance.carried_splats import CarriedSplats
+from mosa.types import ParticleState, Rollout
+
+VARIANTS = ("prior", "prior_eta", "adapted")
+
+
+EVEN = 4
+"""Substeps of a frame are a multiple of this at least: each count has buffers and captured graphs of its own, and one that followed
+every change of the modulus would need new ones in nearly every step of a fit."""
+
+
+class Body(nn.Module):
+    """N particles with a law. Buffers: rest (N, 3) [m], volume (N,) [m^3], colors (N, 3), opacities (N,), covariances (N, 3, 3).
+    splats: what its images show, None where that is the particles; a fit to images looks at the particles.
+    """
+
+    rest: Tensor
+    volume: Tensor
+    colors: Tensor
+    opacities: Tensor
+    covariances: Tensor
+
+    def __init__(
+        self,
+        *,
+        rest: Tensor,
+        volume: Tensor,
+        colors: Tensor,
+        opacities: Tensor,
+        covariances: Tensor,
+        density: float,
+        material: Material,
+        heterogeneity: StiffnessField | None,
+        adapter: Adapter | None,
+        settings: SimulationSettings,
+        law_options: LawOptions = AS_USUAL,
+    ) -> None:
+        super().__init__()
+        for name, value in (
+            ("rest", rest), ("volume", volume), ("colors", colors), ("opacities", opacities), ("covariances", covariances),
+        ):
+            self.register_buffer(name, value.detach().clone())
+        self.splats: CarriedSplats | None = None
+        self.density, self.settings, self.law_options = float(density), settings, law_options
+        self.material, self.heterogeneity, self.adapter = material, heterogeneity, adapter
+        if heterogeneity is not None:
+            heterogeneity.settle(self.rest)
+        if adapter is not None:
+            adapter.settle(self.rest, self.volume)
+        # the calibrated backbones that every later figure is compared with; filled when their stage ends
+        self.contact = ContactOffset(settings.dx, settings.contact_offset)
+        backbone = nn.ModuleDict({"material": material, "contact": self.contact})
+        self.frozen = nn.ModuleDict({"prior": copy.deepcopy(backbone), "prior_eta": copy.deepcopy(backbone)})
+        if heterogeneity is not None:  # the prior's is what a stage that starts from it goes back to; it is never simulated
+            for variant in self.frozen.values():
+                variant["heterogeneity"] = copy.deepcopy(heterogeneity)
+        self.frozen.requires_grad_(False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the simulator, whose buffers are no part of a body: a copy makes its own."""
+        return {k: v for k, v in self.__dict__.items() if not k.startswith("_simulator")}
+
+    @property
+    def center(self) -> Tensor:
+        """(3,) centre of mass of the rest shape [m]."""
+        return (self.rest * self.volume[:, None]).sum(0) / self.volume.sum()
+
+    @property
+    def size(self) -> float:
+        """Largest extent of the rest shape [m]."""
+        return float((self.rest.amax(0) - self.rest.amin(0)).max())
+
+    def factor(self, heterogeneity: StiffnessField | None) -> Tensor:
+        """(N,) stiffness factor 1 + amplitude tanh eta(X)."""
+        if heterogeneity is None:
+            return torch.ones_like(self.volume)
+        return heterogeneity.factor(self.rest)
+
+    def model(self, variant: str = "adapted") -> Model:
+        """What is simulated as `variant`: the live modules (adapted), or those of an ended stage. An adapter that was not switched
+        on yet is no part of it: before its stage it is the prior."""
+        if variant == "adapted":
+            adapter = self.adapter if self.adapter is not None and self.adapter.is_on else None
+            return Model(self.material, self.contact, self.heterogeneity, adapter)
+        if variant not in self.frozen:
+            raise ConfigError(f"variant: expected one of {', '.join(VARIANTS)}, found {variant!r}")
+        frozen = self.frozen[variant]
+        heterogeneity = frozen["heterogeneity"] if variant == "prior_eta" and "heterogeneity" in frozen else None
+        return Model(frozen["material"], frozen["contact"], heterogeneity)
+
+    def freeze(self, variant: str) -> None:
+        """Keep the live parameters as the calibrated backbone `variant` (prior | prior_eta)."""
+        for name, module in self.frozen[variant].items():
+            module.load_state_dict(getattr(self, name).state_dict())
+
+    def thaw(self, variant: str) -> None:
+        """Set the live parameters back to those of the backbone `variant`."""
+        for name, module in self.frozen[variant].items():
+            getattr(self, name).load_state_dict(module.state_dict())
+
+    def initial_state(self, start: Start, dt: float, gravity: Tensor) -> ParticleState:
+        """Particles at `start`: x = Q (X - X_c) + x_c, F = F_tot = Q, C_affine = [omega]_x.
+
+        The velocity is taken half a substep of gravity early: symplectic Euler then follows the parabola exactly at any dt.
+        """
+        Q = start.rotation.to(self.rest)
+        arm = (self.rest - self.center) @ Q.T
+        velocity = start.velocity - 0.5 * dt * gravity
+        v = velocity + torch.linalg.cross(start.angular_velocity.expand_as(arm), arm)
+        n = len(arm)
+        F = Q.expand(n, 3, 3).contiguous()
+        far = float(start.center.detach().abs().max()) > PERIOD * self.settings.dx  # where float32 has few digits for a particle
+        center = start.center.double() if far else start.center
+        return ParticleState(arm + center, v, skew(start.angular_velocity).expand(n, 3, 3).contiguous(), F, F)
+
+    def stiffening(self, adapted: bool) -> float:
+        """Modulus over the prior's that the time step allows for."""
+        return self.adapter.stiffening(self.material.poisson()) if adapted else 1.0
+
+    def substeps(self, parameters_modulus: float, frame_dt: float, speed: float, adapted: bool, viscosity: float = 0.0) -> int:
+        """Substeps per frame that the time step bound asks for, rounded up to whole strides of the adapter and to `EVEN`."""
+        settings = self.settings
+        count = required_substeps(
+            modulus_max=parameters_modulus, density=self.density, frame_dt=frame_dt, dx=settings.dx, v_max=speed,
+            factor=self.stiffening(adapted), courant=settings.courant, limit=settings.max_substeps,
+            viscosity=viscosity,
+        )
+        multiple = settings.strides(EVEN)
+        return -(-count // multiple) * multiple
+
+    def step_control(self, adapted: bool) -> StepControl:
+        """Bounds of adaptive substeps. Errors: ConfigError naming the field."""
+        settings = self.settings
+        return StepControl(
+            courant=settings.courant, factor=self.stiffening(adapted), minimum=settings.min_substeps,
+            maximum=settings.max_substeps, multiple=settings.strides(8),
+        )  # fmt: skip
+
+    def simulate(
+        self,
+        start: Start,
+        world: World,
+        frames: int,
+        frame_dt: float,
+        *,
+        model: Model | None = None,
+        collect: Callable | None = None,
+        progress: Callable[[int], None] | None = None,
+        counts: Sequence[int] | None = None,
+        observed: Tensor | None = None,
+        gain: float = 0.0,
+        unseen: Callable[[Tensor, int], Tensor] | None = None,
+        substeps: int | None = None,
+    ) -> Rollout:
+        """Roll `frames` frames out (frame 0 is the start). Differentiable in every parameter and in `start`.
+
+        model: what is simulated, None for all that was learned. collect: called with the statistics of every evaluation of the
+        adapter (penalties, mean |C|). counts: of substeps, to replay those of an adaptive rollout. observed, gain: (T, N, 3) [m]
+        and a number; at every frame the velocities are corrected towards what was seen, but for what was `unseen` of the positions
+        in a frame (`criteria.corrected_rollout`). substeps: of
+        every frame, where differences hold them fixed; None: as many as the time step bound asks for.
+        Errors: SimulationDiverged, ConfigError (time step).
+        """
+        ready = self.ready(start, world, frames, frame_dt, model=model, counts=counts, substeps=substeps)
+        rollout = ready.simulate(frames, world.colliders, collect=collect, progress=progress, observed=observed, gain=gain,
+                                 unseen=unseen)
+        taken = rollout.counts
+        self.last_substeps = -(-sum(taken) // len(taken)) if taken else ready.simulator.substeps
+        return rollout
+
+    def ready(
+        self, start: Start, world: World, frames: int, frame_dt: float, *, model: Model | None = None,
+        counts: Sequence[int] | None = None, substeps: int | None = None,
+    ) -> Ready:  # fmt: skip
+        """The body at `start`, ready to be simulated; arguments and errors as `simulate`."""
+        model = self.model() if model is None else model
+        material, adapter = model.material, model.adapter
+        if adapter is not None:
+            adapter.follow(material.poisson(live=True))
+        dtype = torch.float64 if self.settings.precision == 64 else torch.float32
+        factor = self.factor(model.heterogeneity)
+        parameters = material.per_particle(factor)
+        gravity, up = world.gravity.to(self.rest), world.up.to(self.rest)
+        timing = None
+        if self.settings.adaptive or counts is not None:
+            # every variant takes the substeps its own states ask for; velocities at frame 0 itself: the rollout starts with half a
+            # kick, whatever its first substep
+            control = self.step_control(self.adapter is not None)
+            timing = Adaptive(control, lag=0.0) if counts is None else Replay(counts, lag=0.0)
+            substeps = self.settings.max_substeps
+            state = self.initial_state(start, 0.0, gravity)
+        elif substeps is not None:
+            state = self.initial_state(start, frame_dt / substeps, gravity)
+        else:
+            speed = world.fastest(start, self.size, frames * frame_dt)
+            # one time step for all variants of a body: their difference is then the law's, not the integrator's
+            substeps = self.substeps(
+                float(material.max_modulus(factor.detach())), frame_dt, speed, self.adapter is not None,
+                float(material.max_viscosity(factor.detach())),
+            )  # fmt: skip
+            state = self.initial_state(start, frame_dt / substeps, gravity)
+        lift = model.contact.lift(world.ground) * up
+        simulator = None if adapter is None else adapter.simulator(self.density, world, frame_dt)
+        if simulator is not None:  # no law on a grid: the adapter brings its dynamics
+            lift, timing = torch.zeros_like(lift), None
+            state = self.initial_state(start, frame_dt / simulator.substeps, gravity)
+        else:
+            simulator = self.simulator(material.law, substeps, frame_dt, world, adapter.strain if adapter is not None else None)
+        state = replace(state, x=state.x + lift)
+        state = state.to(dtype)
+        arguments = {
+            "parameters": {k: p.to(dtype) for k, p in parameters.items()}, "volume": self.volume.to(dtype),
+            "density": self.density, "adapter": adapter,
+            "stride": None if adapter is not None and adapter.steady else self.settings.stride,
+        }  # fmt: skip
+        return Ready(simulator, state, lift, arguments, timing)
+
+    def simulator(self, law: str, substeps: int, frame_dt: float, world: World, strain: str | None = None) -> Simulator:
+        """The simulator of `law` in `world`, one per time step (kernels are compiled once per law and precision).
+
+        strain: of an adapter whose operator is a stiffness (`Simulator`)."""
+        key = (law, substeps, frame_dt, str(self.rest.device), strain, self.settings.dx)
+        if getattr(self, "_simulator_key", None) != key or self._simulator_world is not world:
+            dtype = torch.float64 if self.settings.precision == 64 else torch.float32
+            self._simulator = Simulator(
+                law, dx=self.settings.dx, substeps=substeps, frame_dt=frame_dt, gravity=world.gravity, up=world.up,
+                ground=world.ground, planes=world.planes, colliders=world.colliders, box=world.box,
+                dtype=dtype, device=self.rest.device, strain=strain, options=self.law_options,
+            )
+            self._simulator_key, self._simulator_world = key, world
+        return self._simulator
+

@@ -1,0 +1,292 @@
+"""Global parameters of a prior law in unconstrained form: `FORMS` says each one's range. A parameter may be a direction."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from mosa.errors import ConfigError
+from mosa.physics.adapters.interface import MaterialState
+from mosa.physics.constitutive.elasticity import lame, wave_modulus
+from mosa.physics.constitutive.laws import law_named
+from mosa.physics.constitutive.plasticity import friction_alpha
+from mosa.physics.engine.law_options import AS_USUAL, LawOptions
+from mosa.physics.engine.simulator import Simulator
+from mosa.schema import LARGEST, is_number
+
+NU_MAX, ANGLE_MAX = 0.49, 89.0
+AUTO = "auto"
+"""prior.law: the calibration chooses among prior.candidates."""
+
+RIVALS = ("neo_hookean", "corotated", "stvk")
+"""Laws of E and nu that agree at small strain: one drop hardly tells them apart, and they predict others differently."""
+
+
+class Form(NamedTuple):
+    """An open range and the map onto it. low, high: its bounds; held: bounds a parameter may be held at."""
+
+    low: float
+    high: float
+    held: tuple[float, ...]
+    inverse: Callable[[float], float]
+    physical: Callable[[Tensor], Tensor]
+
+
+def _logit(p: float) -> float:
+    return math.log(p) - math.log1p(-p)
+
+
+def _scaled_sigmoid(high: float, held: tuple[float, ...]) -> Form:
+    return Form(0.0, high, held, lambda v: _logit(v / high), lambda u: high * torch.sigmoid(u))
+
+
+class Direction:
+    """A unit vector, learned as two angles [rad] about the direction that the fit starts from: `<name>_1` and `<name>_2` turn it
+    along great circles towards two directions across it. Its sign means nothing in a law of fibres, and within 90 degrees of the
+    start lie all lines, so that no line is out of reach."""
+
+    AXES = ("x", "y", "z")
+
+    @staticmethod
+    def coordinates(name: str) -> tuple[str, str]:
+        return f"{name}_1", f"{name}_2"
+
+    @staticmethod
+    def frame(value: Sequence[float]) -> Tensor:
+        """(3, 3) float64: the direction of `value`, (3,), and two unit vectors across it."""
+        axis = torch.tensor([float(v) for v in value], dtype=torch.float64)
+        axis = axis / axis.norm()
+        across = torch.linalg.cross(axis, torch.eye(3, dtype=torch.float64)[int(axis.abs().argmin())])
+        across = across / across.norm()
+        return torch.stack([axis, across, torch.linalg.cross(axis, across)])
+
+    @staticmethod
+    def physical(frame: Tensor, angles: Tensor) -> Tensor:
+        """(3,) unit vector at `angles` (2,) [rad] from frame[0]; smooth at 0."""
+        square = angles.square().sum()
+        small = square < 1e-8  # below, the series is exact to rounding, and the root has no slope
+        safe = torch.where(small, torch.ones_like(square), square).sqrt()
+        sine = torch.where(small, 1 - square / 6, torch.sin(safe) / safe)
+        cosine = torch.where(small, 1 - square / 2, torch.cos(safe))
+        return cosine * frame[0] + sine * (angles @ frame[1:])
+
+
+LOG = Form(0.0, math.inf, (), math.log, torch.exp)
+LOG_OR_ZERO = LOG._replace(held=(0.0,))
+SOFTPLUS = Form(0.0, math.inf, (0.0,), lambda v: v + math.log(-math.expm1(-v)), nn.functional.softplus)
+FORMS: dict[str, Form | Direction] = {
+    "E": LOG, "mu": LOG, "kappa": LOG, "yield_stress": LOG, "viscosity": LOG_OR_ZERO, "cohesion": SOFTPLUS,
+    "nu": _scaled_sigmoid(NU_MAX, (0.0, NU_MAX)), "friction_angle": _scaled_sigmoid(ANGLE_MAX, (0.0, ANGLE_MAX)),
+}  # fmt: skip
+"""Every parameter a prior may name, SI units; friction_angle in degrees, cohesion a strain."""
+UNITS = {"E": "Pa", "mu": "Pa", "kappa": "Pa", "yield_stress": "Pa", "viscosity": "Pa s", "friction_angle": "degrees"}
+"""Of the parameters that have one; what is a viscosity in place of it, the law says (`unit_of`)."""
+RELATIVE = ("E", "mu", "kappa", "yield_stress", "viscosity")
+"""Parameters whose standard deviation is said relative: it is one of their logarithm."""
+GIVES = {"E": ("mu", "lam"), "nu": (), "friction_angle": ("friction_alpha",)}
+"""What the simulator takes in place of a parameter; others are taken by their own name."""
+STIFFNESS = ("E", "mu", "kappa")
+
+
+def register_form(name: str, form: Form | Direction, unit: str = "") -> None:
+    """Give a parameter of a law with a new name its range: `LOG` (positive, in its logarithm), `SOFTPLUS` (positive or held at 0),
+    a `Form` of one's own, or `Direction()`; and the unit that reports write beside it. Errors: ConfigError if the name has another
+    range already."""
+    if FORMS.setdefault(name, form) != form and not isinstance(form, Direction):
+        raise ConfigError(f"parameter {name!r} has a range already; choose another name")
+    if unit:
+        UNITS[name] = unit
+
+
+def unit_of(law: str, name: str) -> str:
+    """Unit of a law's parameter, empty for one without (nu, cohesion) and where `register_form` was told none. A parameter that the
+    law's explicit viscosity depends on is a viscosity [Pa s], whatever the same name is in other laws. Errors: ConfigError for an
+    unknown law."""
+    known = law_named(law)
+    if name in known.parameters and known.viscosity is not None:
+        ones = {each: torch.ones(()) for each in known.parameters}
+        if not torch.equal(known.explicit_viscosity(ones), known.explicit_viscosity(ones | {name: torch.full((), 2.0)})):
+            return "Pa s"
+    return UNITS.get(name, "")
+
+
+class Material(nn.Module):
+    """Parameters of one prior law.
+
+    law: name in `mosa.physics`; parameters: initial physical values (SI, friction_angle in degrees; of a direction three numbers of
+    any length); frozen: names that are not
+    learned; modulated: names the heterogeneity factor multiplies, by default the stiffness (E, or mu and kappa together).
+    candidates: laws among which a calibration chooses, with law=auto; until then it is the first.
+    A parameter that starts on a bound of its range is held there.
+    Errors: ConfigError naming the parameter, what was expected and what was found.
+    """
+
+    def __init__(
+        self, law: str, parameters: Mapping[str, float | Sequence[float]], frozen: Sequence[str] = (),
+        modulated: Sequence[str] | None = None, candidates: Sequence[str] = (),
+    ) -> None:
+        super().__init__()
+        if (law == AUTO) != bool(candidates):
+            raise ConfigError(f"prior.candidates: expected a list of laws with prior.law=auto and none otherwise, found "
+                              f"{list(candidates)} with law {law!r}")
+        for each in candidates or (law,):
+            self._check_names(each, parameters, frozen, modulated)
+        self.candidates = tuple(candidates)
+        self.law, self.names = candidates[0] if candidates else law, tuple(parameters)
+        self.stiffness = "E" if "E" in parameters else "kappa"
+        self.modulated = tuple(modulated) if modulated is not None else tuple(n for n in STIFFNESS if n in parameters)
+        self.raw = nn.ParameterDict()
+        self.begins: dict[str, float] = {}
+        """Unconstrained values that the parameters start from, whatever is loaded later."""
+        self.held: list[str] = []
+        self.directions = tuple(name for name in parameters if isinstance(FORMS[name], Direction))
+        for name, value in parameters.items():
+            self._add(name, value, name not in frozen)
+        if "viscosity" in self.raw:
+            self.register_buffer("viscosity_is_a_logarithm", torch.tensor(True))
+
+    def _load_from_state_dict(self, state_dict, prefix: str, *rest) -> None:
+        """Of checkpoints without the mark, the viscosity is the inverse of a softplus."""
+        name, mark = f"{prefix}raw.viscosity", f"{prefix}viscosity_is_a_logarithm"
+        if "viscosity" in self.raw and name in state_dict and mark not in state_dict:
+            state_dict[name], state_dict[mark] = SOFTPLUS.physical(state_dict[name]).log(), torch.tensor(True)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+    def _check_names(self, law: str, parameters, frozen, modulated) -> None:
+        known = law_named(law)
+        if unknown := sorted(set(parameters) - set(FORMS)):
+            own = [name for name in unknown if name in known.parameters]
+            hint = f" (law {law} takes {', '.join(own)}: give it a range with register_form)" if own else ""
+            raise ConfigError(f"prior.parameters: expected names among {', '.join(FORMS)}, found {', '.join(unknown)}{hint}")
+        for key, names in (("frozen", frozen), ("modulated", modulated or ())):
+            if strange := sorted(set(names) - set(parameters)):
+                raise ConfigError(f"prior.{key}: expected names among {', '.join(parameters)}, found {', '.join(strange)}")
+        if ("E" in parameters) != ("nu" in parameters):
+            raise ConfigError(f"prior.parameters: E and nu go together, found {', '.join(parameters)}")
+        if "E" not in parameters and "kappa" not in parameters:
+            raise ConfigError(f"prior.parameters: expected E with nu, or kappa with mu, found {', '.join(parameters)}")
+        takes = {name for name in known.parameters if name != known.reference}
+        gives = {taken for name in parameters for taken in GIVES.get(name, (name,))}
+        listed = [taken for name in parameters for taken in GIVES.get(name, (name,))]
+        if twice := sorted({name for name in listed if listed.count(name) > 1}):
+            raise ConfigError(f"prior.parameters: expected each of {', '.join(sorted(takes))} once, found {', '.join(twice)} twice "
+                              f"by {', '.join(parameters)} (mu, lam come from E, nu)")
+        if takes != gives:
+            raise ConfigError(
+                f"prior.parameters: law {law} takes {', '.join(sorted(takes))}; {', '.join(parameters)} give "
+                f"{', '.join(sorted(gives))} (mu, lam come from E, nu; friction_alpha from friction_angle)"
+            )
+
+    def _add(self, name: str, value: float | Sequence[float], learned: bool) -> None:
+        form = FORMS[name]
+        if isinstance(form, Direction):
+            self._add_direction(name, value, learned)
+            return
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise ConfigError(f"prior.parameters.{name}: expected a number, found {value!r}")
+        value = float(value)
+        if value in form.held:
+            self.held.append(name)
+            self.register_buffer(f"held_{name}", torch.tensor(value))
+        elif form.low < value < min(form.high, LARGEST):
+            self.begins[name] = form.inverse(value)
+            self.raw[name] = nn.Parameter(torch.tensor(self.begins[name]), requires_grad=learned)
+        else:
+            raise ConfigError(
+                f"prior.parameters.{name}: expected a number between {form.low:g} and {min(form.high, LARGEST):g}, found {value:g}"
+            )
+
+    def _add_direction(self, name: str, value: Sequence[float], learned: bool) -> None:
+        numbers = list(value) if isinstance(value, (list, tuple)) else []
+        if len(numbers) != 3 or not all(map(is_number, numbers)) or not any(numbers):
+            raise ConfigError(f"prior.parameters.{name}: expected a direction [x, y, z], found {value!r}")
+        # where the angles begin is the configuration's, as `begins` of the numbers is: no part of what is learned
+        self.register_buffer(f"frame_{name}", Direction.frame(numbers).float(), persistent=False)
+        for coordinate in Direction.coordinates(name):
+            self.begins[coordinate] = 0.0
+            self.raw[coordinate] = nn.Parameter(torch.tensor(0.0), requires_grad=learned)
+
+    @property
+    def learned(self) -> list[str]:
+        """Names of the unconstrained numbers that are learned, of a direction its two angles."""
+        return [name for name, raw in self.raw.items() if raw.requires_grad]
+
+    def direction(self, name: str) -> Tensor:
+        """(3,) unit vector of a parameter that is one, in the rest shape."""
+        angles = torch.stack([self.raw[coordinate] for coordinate in Direction.coordinates(name)])
+        vector = Direction.physical(getattr(self, f"frame_{name}").to(angles), angles)
+        return vector / vector.norm()
+
+    def choose(self, law: str) -> None:
+        """Settle on one of the candidates."""
+        self.law, self.candidates = law, ()
+
+    def physical(self) -> dict[str, Tensor]:
+        """Constrained global values, scalars, in SI units (friction_angle in degrees); of a direction its components, as
+        `<name>_x`, `<name>_y` and `<name>_z`."""
+        found: dict[str, Tensor] = {}
+        for n in self.names:
+            if n in self.directions:
+                found |= {f"{n}_{axis}": part for axis, part in zip(Direction.AXES, self.direction(n))}
+            else:
+                found[n] = getattr(self, f"held_{n}") if n in self.held else FORMS[n].physical(self.raw[n])
+        return found
+
+    @staticmethod
+    def physical_of(name: str, raw: Tensor) -> Tensor:
+        """The constrained value of one parameter, from its unconstrained one; the angles of a direction [rad] are themselves."""
+        return FORMS[name].physical(raw) if name in FORMS else raw * 1.0
+
+    def per_particle(self, factor: Tensor | float = 1.0) -> dict[str, Tensor]:
+        """Values the simulator takes, by the law's own names; factor: (N,) heterogeneity of the modulated parameters, or 1.
+
+        Modulated values are (N,), directions (3,), the others ().
+        """
+        parts = {f"{name}_{axis}" for name in self.directions for axis in Direction.AXES}
+        values = {n: v * factor if n in self.modulated else v for n, v in self.physical().items()}
+        result = {n: v for n, v in values.items() if n not in GIVES and n not in parts}
+        result |= {name: self.direction(name) for name in self.directions}
+        if "E" in values:
+            result["mu"], result["lam"] = lame(values["E"], values["nu"])
+        if "friction_angle" in values:
+            result["friction_alpha"] = friction_alpha(values["friction_angle"])
+        return result
+
+    def max_modulus(self, factor: Tensor | float = 1.0) -> Tensor:
+        """Largest P wave modulus over the particles [Pa], (), as the law says. For the time step; no gradient."""
+        factor = factor.detach() if isinstance(factor, Tensor) else factor
+        return wave_modulus(self.law, {n: v.detach() for n, v in self.per_particle(factor).items()})
+
+    def max_viscosity(self, factor: Tensor | float = 1.0) -> Tensor:
+        """Largest viscosity [Pa s] that bounds the time step, (), 0 where a law's flow is implicit; no gradient."""
+        factor = factor.detach() if isinstance(factor, Tensor) else factor
+        values = {n: v.detach() for n, v in self.per_particle(factor).items()}
+        return law_named(self.law).explicit_viscosity(values).max()
+
+    def poisson(self, live: bool = False) -> Tensor:
+        """Poisson number of the small-strain response, (): nu, or that of mu and kappa, at most 0.49. live: with its graph."""
+        p = {n: v if live else v.detach() for n, v in self.physical().items()}
+        if "nu" in p:
+            return p["nu"]
+        mu = p.get("mu", torch.zeros_like(p["kappa"]))
+        return ((3 * p["kappa"] - 2 * mu) / (2 * (3 * p["kappa"] + mu))).clamp(max=NU_MAX)
+
+    def reference_modulus(self) -> Tensor:
+        """E, or kappa where the law has no E [Pa], (), without gradient: the unit the adapter measures stress in."""
+        return self.physical()[self.stiffness].detach()
+
+
+def material_states(
+    law: str, parameters: Mapping[str, Tensor | float], options: LawOptions = AS_USUAL
+) -> Callable[[Tensor], MaterialState]:
+    """Function of F (M, 3, 3) float64 to what an adapter reads there (in float64), under `law` with scalar `parameters`.
+
+    parameters: physical values by the law's own names (`Material.per_particle()`).
+    """
+    simulator = Simulator(law, dx=1.0, substeps=1, frame_dt=1.0, dtype=torch.float64, options=options)
+    values = {name: torch.as_tensor(value).detach().double().cpu() for name, value in parameters.items()}
+    return lambda F: simulator.material_state(F, torch.zeros_like(F), values)

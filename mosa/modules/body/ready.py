@@ -1,0 +1,94 @@
+"""A body at its start, ready to be simulated: by itself, or stacked with others as so many worlds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from mosa.errors import ConfigError
+from mosa.modules.fitting.criteria import corrected_rollout
+from mosa.physics.adapters.interface import AdapterOperator
+from mosa.physics.contact.colliders import Collider
+from mosa.physics.engine.simulator import Simulator
+from mosa.physics.time.clock import Adaptive, Replay
+from mosa.types import ParticleState, Rollout
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A body at its start, and what a simulation of it takes; or, by `stack`, the same in B worlds.
+
+    state: in the simulator's type, higher by `lift` (3,) [m], the contact's offset, than where the body is seen; arguments: of
+    `Simulator.rollout`; timing: of substeps that vary, None where they are fixed.
+    """
+
+    simulator: Simulator
+    state: ParticleState
+    lift: Tensor
+    arguments: dict
+    timing: Adaptive | Replay | None
+
+    def simulate(
+        self, frames: int, colliders: Sequence[Collider] = (), *, collect: Callable | None = None,
+        progress: Callable[[int], None] | None = None, observed: Tensor | None = None, gain: float = 0.0,
+        unseen: Callable[[Tensor, int], Tensor] | None = None,
+    ) -> Rollout:  # fmt: skip
+        """As `Body.simulate`, from here on; of a stack, the worlds at once."""
+        simulator, stacked = self.simulator, self.state.x.ndim == 3
+        roll = partial(simulator.rollout, **self.arguments, collect=collect, motions=self.motions(colliders))
+        lift = self.lift[:, None] if stacked else self.lift
+        if observed is None:
+            timing = {} if self.timing is None else {"timing": self.timing}
+            rollout = roll(self.state, frames=frames, progress=progress, **timing)
+        else:
+            if self.timing:
+                raise ConfigError("simulation.adaptive: expected false where a criterion corrects the prediction frame by frame")
+            seen = (observed[:frames, None] if stacked else observed[:frames]) + lift.detach()
+            hidden = None if unseen is None else lambda x, frame: unseen(x - lift.detach().to(x), frame)
+            rollout = corrected_rollout(roll, self.state, seen.to(self.state.x.dtype), gain, simulator.frame_dt, hidden)
+        fields = {name: getattr(rollout, name).to(self.lift.dtype) for name in ("x", "v", "F", "F_tot")}
+        return replace(rollout, **{**fields, "x": fields["x"] - lift})
+
+    def motions(self, colliders: Sequence[Collider]) -> list:
+        """Of the colliders, where the simulator sees them: the offset is the ground's, they keep their place. Of a stack, a list
+        for each world."""
+        if self.lift.ndim > 1:
+            return [[collider.motion.shifted(lift) for collider in colliders] for lift in self.lift]
+        return [collider.motion.shifted(self.lift) for collider in colliders]
+
+    def answered(self) -> Ready:
+        """With the adapter's answer now in place of the adapter, which may become another one. Errors: ConfigError where the
+        operator depends on the state."""
+        adapter = self.arguments["adapter"]
+        if adapter is None:
+            return self
+        if self.arguments["stride"] is not None:
+            raise ConfigError(f"adapter: expected one whose operator is the same in every state, found {type(adapter).__name__}")
+        state, parameters = self.state, self.arguments["parameters"]
+        held = AdapterOperator(*adapter(self.simulator.material_state(state.F, state.C_affine, parameters)))
+        return replace(self, arguments={**self.arguments, "adapter": lambda _: held})
+
+    @classmethod
+    def stack(cls, parts: Sequence[Ready]) -> Ready:
+        """B bodies of the same particles and law, each with its own numbers, `answered`, and start, as so many worlds: state
+        (B, N, ...), lift (B, 3), and arguments of `Simulator.rollout`. Errors: ConfigError where the time steps differ."""
+        first, n = parts[0], len(parts[0].arguments["volume"])
+        counts = sorted({part.simulator.substeps for part in parts})
+        if len(counts) > 1 or any(part.timing for part in parts):
+            raise ConfigError(f"worlds: expected the same fixed substeps in all, found {counts}; give substeps")
+        each = [part.arguments for part in parts]
+        sizes = first.simulator.law.parameters
+        parameters = {
+            name: torch.stack([value.expand(n) if sizes[name] == 1 else value.reshape(-1, sizes[name]).expand(n, -1)
+                               for value in (own["parameters"][name] for own in each)])
+            for name in each[0]["parameters"]
+        }  # fmt: skip
+        adapters = None if each[0]["adapter"] is None else [own["adapter"] for own in each]
+        return replace(
+            first, state=ParticleState.stack([part.state for part in parts]), lift=torch.stack([part.lift for part in parts]),
+            arguments={**each[0], "parameters": parameters, "adapter": adapters},
+        )  # fmt: skip

@@ -1,0 +1,1 @@
+"""How the numbers of a body are found: stages, optimisers, residuals, losses."""

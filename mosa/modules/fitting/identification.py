@@ -1,0 +1,359 @@
+"""Identification of a body's few numbers by Gauss-Newton: what is compared, and what was found.
+
+The numbers are those of `learned_numbers`; what is compared are the motion cues (`residuals`), in the rollouts that the criterion
+asks for (`criteria`).
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from mosa.errors import ConfigError, MosaError, SimulationDiverged
+from mosa.modules.body.body import Body, Ready, World
+from mosa.modules.body.material import RIVALS
+from mosa.modules.fitting import residuals
+from mosa.modules.fitting.criteria import Criterion
+from mosa.modules.fitting.gauss_newton import Block, GaussNewton, Posterior, Seat
+from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.parameters import blocks_of, is_learned, tensors_of
+from mosa.modules.fitting.search.backbone import search
+from mosa.modules.fitting.stages import Stage
+from mosa.reconstruction.motion.response import Response
+
+COUNTED_AT_FIRST = 100 / 30
+"""Of a calibration's data over a later stage's, frame by frame: it has few numbers, and no model of its own error in its noise."""
+NOISE_ITERATIONS = 3
+"""Iterations in which the noise is found again; later its scale stays, so that costs can be compared."""
+EVIDENCE_ITERATIONS = 5
+"""Iterations in which the sizes of the blocks are found again, later they stay. Two sizes of the stiffness modes can each bear
+themselves out: a large one saturates the field, and what is saturated says nothing against it. On two drops of the rabbit the size
+fell to a twentieth in the ninth iteration, where the fit was done, and began again from a cost 20 times as large."""
+SOFTLY = (0.05, 0.1, 0.25, 0.5)
+"""Shares of the data that the first iterations on several drops count. Counted in full from the start, a few drops are explained by
+sizes that later ones do not bear out, and the fit is half done when its iterations are over: see docs/identification.md."""
+FLAT = 0.5
+"""Of minus the logarithm of the posterior: an iteration of the joint stage that lowers it by less, with the sizes settled, is the
+last. Numbers that still move then lie on a floor that the data do not tell apart."""
+COARSER = 1.25
+"""Spacing of the second grid, on which the same numbers are rolled out to see what the first one gets wrong."""
+MOST_THREADS = 8
+PARTICLES_TOGETHER = 400_000
+"""Of all worlds in one launch: more no longer make a GPU's substep cheaper for each."""
+ROUNDED = 8
+"""Substeps are held fixed within an iteration, at a multiple of this above what the time step bound asks for at its start."""
+RIVAL_STEPS = 2
+"""With the fitted law's Jacobian, from its numbers on: then their costs are within a tenth of the fitted law's mostly."""
+IMPLAUSIBLE = 3.0
+"""A rival whose cost is more than so many times the fitted law's does not explain the data."""
+
+
+class Identification:
+    """One stage's. takes: with start, cues, frame_dt; kinds: which of position, rotation, stretch are compared.
+
+    The stage `prior` learns the backbone alone from positions in free rollouts, `prior_eta` also the stiffness modes, `joint` the
+    adapter too; both under the criterion.
+
+    What the grid gets wrong must not be taken for the law's. The two stages roll the same numbers out on a grid `COARSER` times as
+    coarse too. The difference, frame by frame, is noise that no frame is trusted beyond, and its direction is free: a multiple of
+    it, known to within `grid_error`, is identified beside the numbers and then dropped (a nuisance, marginalised out).
+
+    progress: called after every column of a Jacobian. seats: rollouts side by side; None: as many as the machine has room for.
+    """
+
+    def __init__(
+        self, body: Body, takes: Sequence, world: World, stage: Stage, criterion: Criterion, settings: IdentificationSettings,
+        kinds: tuple[bool, bool, bool] = (True, True, True), progress: Callable[[], None] | None = None,
+        seats: int | None = None,
+    ) -> None:  # fmt: skip
+        self.body, self.takes, self.world, self.settings = body, list(takes), world, settings
+        self.calibrating, self.iterations = stage.calibrates, stage.iterations
+        self.adapter = stage.learns_adapter and is_learned(body.adapter)
+        self.heterogeneity = not self.calibrating and is_learned(body.heterogeneity)
+        self.gains = (0.0,) if self.calibrating else criterion.gains
+        self.kinds = (True, False, False) if self.calibrating and kinds[0] else kinds
+        if not any(self.kinds):
+            raise ConfigError("losses: identification compares motion cues, and the weights of position, rotation and stretch are "
+                              "all 0; use fit=adam, which learns from images too")
+        self.chosen = residuals.sampled(len(body.rest), body.rest.device)
+        blocks = blocks_of(body, adapter=self.adapter, heterogeneity=self.heterogeneity, settings=settings,
+                           calibrating=self.calibrating)
+        seats = self.threads(sum(b.size for b in blocks)) if seats is None else seats
+        bodies = [body][:seats] + [copy.deepcopy(body) for _ in range(seats - 1)]
+        self.iteration, self.noise, self.substeps = 0, None, None
+        self.grid: list[residuals.Fields] | None = None  # differences between the two grids, of every pair
+        if self.knows_grid:
+            blocks.append(Block("grid", torch.zeros(1), torch.full((1,), float(settings.grid_error)), 0.2, nuisance=True))
+        self.newton = GaussNewton(blocks, [self._seat(each) for each in bodies], progress=progress,
+                                  many=self._many if body.rest.is_cuda and not body.settings.adaptive else None)
+        self.converged = False
+        self.report: dict[str, float] = {}
+        self._residuals: Tensor | None = None  # at the numbers as they stand, between `prepare` and `iterate`
+
+    def threads(self, numbers: int) -> int:
+        """Rollouts side by side, of as many numbers."""
+        if self.body.rest.is_cuda:
+            return 1
+        affinity = getattr(os, "sched_getaffinity", None)  # not on every system
+        cores = len(affinity(0)) if affinity is not None else os.cpu_count() or 1
+        return max(1, min(self.settings.threads or min(cores, MOST_THREADS), numbers))
+
+    def _seat(self, body: Body) -> Seat:
+        multiple = torch.zeros(1, dtype=torch.float64)
+        tensors = tensors_of(body, adapter=self.adapter, heterogeneity=self.heterogeneity)
+        if self.knows_grid:
+            tensors.append(multiple)
+        return Seat(tensors, lambda: self._whitened(body, float(multiple)), lambda: self._possible(body))
+
+    def _possible(self, body: Body) -> None:
+        """Errors: ConfigError where the numbers ask for more substeps than `max_substeps`. An iteration holds those of its
+        beginning and would not see it; the next one, and whoever simulates the law, could not go on."""
+        if not body.settings.adaptive:
+            for i in range(len(self.takes)):
+                self.ready(body, i)
+
+    @property
+    def knows_grid(self) -> bool:
+        """Whether there is a second grid, and with it a last number: the multiple of the difference."""
+        return self.settings.grid_error > 0 and not self.calibrating
+
+    @property
+    def softly(self) -> tuple[float, ...]:
+        """Shares of the data that the first iterations count, all of it afterwards. A calibration, one drop, and a stage too short
+        for it count in full."""
+        return SOFTLY if len(self.takes) > 1 and not self.calibrating and self.iterations >= 2 * len(SOFTLY) else ()
+
+    @property
+    def pairs(self) -> list[tuple[int, float]]:
+        """(take, gain) of every rollout that is compared."""
+        return [(i, gain) for i in range(len(self.takes)) for gain in self.gains]
+
+    @torch.no_grad()
+    def ready(self, body: Body, index: int, substeps: int | None = None) -> Ready:
+        """The body at the start of a take, with what is learned here."""
+        take = self.takes[index]
+        model = body.model().only(heterogeneity=self.heterogeneity, adapter=self.adapter)
+        return body.ready(take.start, self.world, len(take.cues.positions), take.frame_dt, model=model, substeps=substeps)
+
+    @torch.no_grad()
+    def rollout(self, body: Body, index: int, gain: float = 0.0, substeps: int | None = None):
+        take = self.takes[index]
+        cues = take.cues
+        return body.simulate(
+            take.start, self.world, len(cues.positions), take.frame_dt,
+            model=body.model().only(heterogeneity=self.heterogeneity, adapter=self.adapter),
+            observed=cues.positions if gain else None, gain=gain, unseen=self.unseen(take), substeps=substeps,
+        )  # fmt: skip
+
+    def response(self, take) -> Response | None:
+        """What the take's cues keep of the calibrated backbone's prediction, which is not what a calibration shall find again."""
+        return None if self.calibrating else take.response
+
+    def unseen(self, take) -> Callable[[Tensor, int], Tensor] | None:
+        response = self.response(take)
+        return None if response is None else response.unseen
+
+    @torch.no_grad()
+    def _many(self, rows: Tensor) -> Tensor:
+        """(K, R) whitened residuals of numbers (K, D): rolled out side by side, as so many worlds."""
+        seat, together = self.newton.seats[0], max(1, PARTICLES_TOGETHER // len(self.body.rest))
+        found: list[list[residuals.Fields]] = [[] for _ in rows]
+        for first in range(0, len(rows), together):
+            some = rows[first : first + together]
+            for i, gain in self.pairs:
+                take, parts = self.takes[i], []
+                for row in some:
+                    seat.write(row)
+                    parts.append(self.ready(self.body, i, self.substeps[i]).answered())
+                rollout = Ready.stack(parts).simulate(
+                    len(take.cues.positions), self.world.colliders, observed=take.cues.positions if gain else None, gain=gain,
+                    unseen=self.unseen(take))
+                for k, own in enumerate(rollout.worlds()):
+                    found[first + k].append(residuals.fields(own, take.cues, take.start.rotation, self.chosen, self.response(take)))
+        multiples = rows[:, -1].tolist() if self.knows_grid else [0.0] * len(rows)
+        return torch.stack([self._compared(own, multiple) for own, multiple in zip(found, multiples)])
+
+    def _fields(self, body: Body) -> list[residuals.Fields]:
+        return [
+            residuals.fields(self.rollout(body, i, gain, self.substeps[i]), self.takes[i].cues, self.takes[i].start.rotation,
+                             self.chosen, self.response(self.takes[i]))
+            for i, gain in self.pairs
+        ]
+
+    def _whitened(self, body: Body, multiple: float) -> Tensor:
+        # torch's switch is a thread's own, and these may be other threads than the one that switched it
+        with torch.no_grad():
+            return self._compared(self._fields(body), multiple)
+
+    def _compared(self, found: list[residuals.Fields], multiple: float) -> Tensor:
+        share = self.settings.count / len(self.gains) * (COUNTED_AT_FIRST if self.calibrating else 1)
+        if self.iteration < len(self.softly):
+            share *= self.softly[self.iteration]
+        counts = tuple(share * on for on in self.kinds)
+        return residuals.whitened(self._along(found, multiple), self.noise, [counts] * len(self.pairs))
+
+    def _along(self, found: list[residuals.Fields], multiple: float) -> list[residuals.Fields]:
+        return found if self.grid is None else residuals.along(found, self.grid, multiple)
+
+    def multiple(self) -> float:
+        """Of the difference between the two grids that is identified beside the numbers; 0 where none is."""
+        return float(self.newton.seats[0].tensors[-1]) if self.knows_grid else 0.0
+
+    def _coarser(self) -> list[residuals.Fields] | None:
+        """What the numbers predict on a coarser grid; None where it cannot simulate them."""
+        body = copy.deepcopy(self.body)
+        body.settings = replace(body.settings, dx=COARSER * body.settings.dx)
+        body.contact.dx *= COARSER
+        try:
+            return self._fields(body)
+        except SimulationDiverged:
+            return None
+
+    @torch.no_grad()
+    def _measure_noise(self) -> None:
+        """Noise and what the grid gets wrong, at the numbers in use."""
+        found = self._fields(self.body)
+        if self.knows_grid:
+            coarser = self._coarser()
+            if coarser is not None:
+                self.grid = residuals.difference(found, coarser)
+        least = residuals.floors(self.body.settings.dx, 0.0 if self.calibrating else self.settings.model_error)
+        wrong = None if self.grid is None else [
+            residuals.Fields(*(self.settings.grid_error * field for field in each)) for each in self.grid]
+        self.noise = residuals.spread(self._along(found, self.multiple()), least, wrong)
+
+    def search(self) -> float:
+        """Start a calibration near its end (`backbone_search`); the mean distance [m] there. Errors: SimulationDiverged."""
+        return search(self)
+
+    def distance(self) -> float:
+        """Mean distance [m] of free rollouts from the cues after frame 0."""
+        found = [self.rollout(self.body, i).x - take.cues.positions for i, take in enumerate(self.takes)]
+        return sum(float(d[1:].norm(dim=-1).mean()) for d in found) / len(found)
+
+    def _hold_substeps(self) -> None:
+        """Substeps are a step function of the numbers: held fixed, differences are those of a smooth function."""
+        self.substeps = []
+        for i in range(len(self.takes)):
+            self.rollout(self.body, i)
+            self.substeps.append(-(-int(1.05 * self.body.last_substeps) // ROUNDED) * ROUNDED)
+
+    @torch.no_grad()
+    def prepare(self) -> float:
+        """What the next iteration holds fixed (substeps, noise), and the cost at the numbers as they stand."""
+        self._hold_substeps()
+        if self.iteration < NOISE_ITERATIONS or self.noise is None:
+            self._measure_noise()
+        seat = self.newton.seats[0]
+        self._residuals = seat.residuals()
+        return self.newton.cost(seat.read(), self._residuals)
+
+    def iterate(self) -> dict[str, float]:
+        """One iteration of Gauss-Newton, see `GaussNewton.iterate`; `prepare` comes before it, or is done here."""
+        if self._residuals is None:
+            self.prepare()
+        r, self._residuals = self._residuals, None
+        report = self.newton.iterate(learn=1 <= self.iteration < EVIDENCE_ITERATIONS, r=r,
+                                     settled=self.iteration >= NOISE_ITERATIONS and not self.calibrating)
+        self.report = report
+        self.iteration += 1
+        small = self.iteration > NOISE_ITERATIONS and report["length"] * report["share"] < self.settings.tolerance
+        gained = report["before"] - report["after"]
+        flat = self.iteration > EVIDENCE_ITERATIONS and not self.calibrating and gained < FLAT
+        whole = not self.softly or self.iteration > len(self.softly) + 1
+        self.converged = whole and (small or flat or report["share"] == 0)
+        return report
+
+    def state(self) -> dict:
+        """Plain containers and tensors: what going on from a checkpoint needs beside the body."""
+        return {"iteration": self.iteration, "factors": [b.factor for b in self.newton.blocks],
+                "noise": None if self.noise is None else [[t.cpu() for t in each] for each in self.noise],
+                "multiple": self.multiple(),
+                "grid": None if self.grid is None else [[t.cpu() for t in each] for each in self.grid]}
+
+    def restore(self, state: dict) -> None:
+        """As after the iterations that `state` was taken from, but for whether the last of them ended it."""
+        self.iteration, self.converged = int(state["iteration"]), False
+        for block, factor in zip(self.newton.blocks, state["factors"], strict=True):
+            block.factor = float(factor)
+        device = self.body.rest.device
+        self.noise = None if state["noise"] is None else [tuple(t.to(device) for t in each) for each in state["noise"]]
+        if state.get("grid") is not None:
+            self.grid = [residuals.Fields(*(t.to(device) for t in each)) for each in state["grid"]]
+        if self.knows_grid:
+            self.newton.seats[0].tensors[-1].fill_(float(state.get("multiple", 0.0)))
+
+    @torch.no_grad()
+    def posterior(self) -> Posterior:
+        """Laplace's approximation at what was found, with the root mean square distance of free rollouts from the cues after first
+        contact as the model's error.
+
+        Of a calibration the data count for no more than its residuals say (see `independent`). What the grid gets wrong moves what
+        it finds, as its search leaves that out: how far, the coarser grid says."""
+        found = []
+        for i, take in enumerate(self.takes):
+            away = self.rollout(self.body, i).x - take.cues.positions
+            found.append(float(away[take.first_contact :].square().sum(-1).mean()))
+        share, wrong = 1.0, None
+        if self.calibrating and self.noise is not None:
+            there = self._fields(self.body)
+            share, wrong = self.independent(there), self._grids_part(there)
+        posterior = self.newton.posterior(share, wrong)
+        return replace(posterior, model_error=(sum(found) / len(found)) ** 0.5, rivals=self.rivals())
+
+    def _grids_part(self, there: list[residuals.Fields]) -> Tensor | None:
+        """Of a calibration: `grid_error` times the difference of `there`, its residuals where it stands, from those on the coarser
+        grid, whitened as these are. None without a second grid."""
+        coarser = self._coarser() if self.settings.grid_error > 0 else None
+        if coarser is None:
+            return None
+        return self.settings.grid_error * self._compared(residuals.difference(there, coarser), 0.0)
+
+    @torch.no_grad()
+    def rivals(self) -> dict[str, Tensor]:
+        """Numbers (D,) of the laws of another form that explain the data about as well, by name: two steps from what was found,
+        with the same Jacobian. None beside laws that are not of `RIVALS`, and none of a calibration."""
+        own, newton = self.body.material.law, self.newton
+        if self.calibrating or own not in RIVALS:
+            return {}
+        kept, found = len(newton.seats[0].read()) - self.knows_grid, {}  # the grid's multiple is last
+        own_cost = self.cost()
+        for law in RIVALS:
+            if law == own:
+                continue
+            self.body.material.law = law
+            try:
+                numbers, cost = newton.transferred(RIVAL_STEPS)
+            except MosaError:  # it cannot be simulated there
+                continue
+            finally:
+                self.body.material.law = own
+            if cost < IMPLAUSIBLE * own_cost:
+                found[law] = numbers[:kept]
+        return found
+
+    def cost(self) -> float:
+        """Minus the logarithm of the posterior at the numbers in use, but for a constant, under the noise in use."""
+        seat = self.newton.seats[0]
+        return self.newton.cost(seat.read(), seat.residuals())
+
+    def independent(self, there: list[residuals.Fields] | None = None) -> float:
+        """Share of the data that a calibration counts which its residuals bear out, in (0, 1]. there: these residuals, where they
+        are known.
+
+        What a free rollout leaves beyond the cues' own noise is what grid, contact and the law's form get wrong: a few smooth
+        patterns in all the frames together (`residuals.patterns`), and not `count` independent errors in every one of them."""
+        each, cues = COUNTED_AT_FIRST * self.settings.count, 3 * residuals.floors(self.body.settings.dx, 0.0)[0] ** 2
+        counted, wrong, late = 0.0, 0.0, []
+        for take, scales, found in zip(self.takes, self.noise, there or self._fields(self.body)):
+            frames = slice(min(take.first_contact, len(scales[0])) - 1, None)
+            wrong += (1 - cues / float(scales[0][frames].square().mean())) / len(self.takes)
+            counted += each * len(scales[0][frames])
+            late.append(residuals.Fields(*(field[frames] for field in found)))
+        borne = len(late) * max(1.0, residuals.patterns(late))
+        return 1 / (1 + max(0.0, wrong) * max(0.0, counted / borne - 1))

@@ -1,0 +1,181 @@
+"""Iterations of Gauss-Newton on the distance between motion cues and rollouts, of all numbers of a stage at once."""
+
+from __future__ import annotations
+
+import copy
+import logging
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mosa.errors import DataError, SimulationDiverged
+from mosa.modules.fitting.identification import EVIDENCE_ITERATIONS, Identification
+from mosa.modules.fitting.residuals import SAMPLES
+from mosa.modules.fitting.search.backbone import choose_law
+from mosa.modules.fitting.search.ground import RIVAL_ITERATIONS, better_friction, choose_ground
+from mosa.modules.fitting.search.ground_choice import EXPLAINED, alike, learned_on, named, rivals_of
+from mosa.modules.fitting.stages import Stage
+from mosa.system.progress import tqdm
+from mosa.types import RUBBING, Ground
+
+log = logging.getLogger(__name__)
+
+
+class NewtonSteps:
+    """The part of `LitMosa` that runs stages by Gauss-Newton, under a trainer or, by `identify`, without one."""
+
+    def newton_loss(self, stage: Stage, iteration: int) -> Tensor:
+        """Minus the logarithm of the posterior at the numbers as they stand; the optimiser goes on from there."""
+        if self.identification is None:
+            saved = self.saved_identification if iteration > 0 else None
+            self.identification = self.begun(stage, saved)
+        return torch.tensor(self.identification.prepare())
+
+    def after_newton_step(self) -> None:
+        """Bookkeeping after the optimiser's step."""
+        found = self.identification.report
+        self.losses.append(found["after"])
+        self.report_newton(found)
+
+    def begun(self, stage: Stage, saved: Mapping[str, Any] | None = None) -> Identification:
+        """A stage's identification, ready for its first iteration, or for the next one where `saved` is what a checkpoint kept."""
+        searched = False  # else the best of the candidates is where its calibration left it
+        if self.ground_is_sought and stage.calibrates:
+            self.find_ground(stage)
+            searched = True
+        if self.body.material.candidates:
+            searched = True
+            self.compared = choose_law(self.body, self.body.material.candidates, lambda: self.identifying(stage))
+            self.settle_law()
+        identification = self.identifying(stage)
+        if saved is not None:
+            self.go_on(identification, saved)
+        elif stage.calibrates and not searched and not stage.looks_again:
+            identification.search()
+        return identification
+
+    def find_ground(self, stage: Stage) -> None:
+        """How the body touches the ground, by a calibration on each that may be."""
+        ground, self.grounds = choose_ground(self.body, self.world.ground.height, lambda each: self.identifying(stage, each))
+        self.settle_ground(ground)
+
+    def better_ground(self, stage: Stage) -> Ground | None:
+        """Where the ground was sought and a law has been learned on what was found: another contact that explains the motion
+        better, about that law. None where there is none, and once the fit has begun again. Of frictions that differ by less than
+        that the fit takes the best, and stays where it was fitted to it."""
+        if not stage.learns_adapter or not self.grounds or self.ground_gains:
+            return None
+        found = self.world.ground
+        slides, rivals = found.mode in RUBBING, rivals_of(self.grounds)
+        if not slides and not rivals:
+            return None
+        # gone on for as long, as a fit gains by that wherever it goes on; as it stands where it cannot go on
+        own = min(self.identification.cost(), self.fitted_on(found, stage)[0])
+        gains: dict[Ground, float] = {}
+        fits: dict[Ground, Identification] = {}
+
+        def gain(mode: str, friction: float) -> float:
+            ground = replace(found, mode=mode, friction=friction)
+            cost, fit = self.fitted_on(ground, stage)
+            better = own - cost
+            if better > max(gains.values(), default=-math.inf):  # of equals the first, as max() has it below
+                fits.clear()
+                fits[ground] = fit  # one is kept, as each has a body
+            gains[ground] = better
+            return better
+
+        if slides:
+            friction, most = better_friction(found.friction, partial(gain, found.mode))
+            for mode in RUBBING:
+                if mode != found.mode and alike(self.grounds, mode):
+                    gain(mode, friction if most > 0 else found.friction)
+        else:
+            for mode, friction in rivals:
+                gain(mode, friction)
+        self.ground_gains = {named(ground): each for ground, each in gains.items()}
+        best = max(gains, key=gains.get)
+        begins_again = gains[best] > EXPLAINED
+        moves = not begins_again and learned_on(named(found), self.ground_gains) == named(best)
+        log.info("ground: %s explains the motion %s than %s (by %.1f of the logarithm of the likelihood)%s", named(best),
+                 "better" if gains[best] > 0 else "worse", named(found), abs(gains[best]),
+                 "; the fit begins again" if begins_again else "; the fit goes there" if moves else "")  # fmt: skip
+        if moves:
+            self.go_to(best, fits[best])
+        return best if begins_again else None
+
+    def go_to(self, ground: Ground, fit: Identification) -> None:
+        """From now on the fit is another one, which was made on this ground; `body` has its numbers."""
+        self.settle_ground(ground)
+        self.body.load_state_dict(fit.body.state_dict())
+        self.identification = fit
+
+    def fitted_on(self, ground: Ground, stage: Stage) -> tuple[float, Identification]:
+        """(cost, fit) of the running identification on a ground after `RIVAL_ITERATIONS`, from the same numbers and under the same
+        noise; infinite where the body cannot be simulated there. The fit itself stays where it stands."""
+        own = self.identification
+        other = Identification(copy.deepcopy(self.body), self.takes, replace(self.world, ground=ground), stage, self.criterion,
+                               self.settings, own.kinds)
+        state = own.state()
+        other.restore(state | {"iteration": max(state["iteration"], EVIDENCE_ITERATIONS)})
+        try:
+            for _ in range(RIVAL_ITERATIONS):
+                cost = other.iterate()["after"]
+                if other.converged:
+                    break
+        except SimulationDiverged:
+            return math.inf, other
+        return cost, other
+
+    def keep_posterior(self, stage: Stage) -> None:
+        """Of the running identification, where it is the last one."""
+        alone = self.body.adapter is None and self.body.heterogeneity is None  # then the calibration is all there is
+        if stage.learns_adapter or (stage.calibrates and alone):
+            self.posterior = self.identification.posterior()
+
+    def identify(self) -> None:
+        """All stages by Gauss-Newton without a trainer: nothing is logged or kept. Errors: those of an iteration."""
+        while (stage := self.stage) is not None:
+            self.begin(stage)
+            self.identification = self.begun(stage)
+            for _ in tqdm(range(stage.iterations), f"stage {stage.name}", leave=False):
+                self.identification.iterate()
+                if self.identification.converged:
+                    break
+            if (ground := self.better_ground(stage)) is not None:
+                self.begin_again(ground)
+                continue
+            self.keep_posterior(stage)
+            self.end(stage)
+
+    def identifying(self, stage: Stage, ground: Ground | None = None) -> Identification:
+        """A stage's identification on the takes, from where the body stands. ground: another one than the world's."""
+        world = self.world if ground is None else replace(self.world, ground=ground)
+        kinds = tuple(self.weights.get(name, 0.0) != 0 for name in ("position", "rotation", "stretch"))
+        return Identification(self.body, self.takes, world, stage, self.criterion, self.settings, kinds)
+
+    def go_on(self, identification: Identification, saved: Mapping[str, Any]) -> None:
+        """The identification as a checkpoint has it, whose containers were checked. Errors: DataError where it is another fit's."""
+        expected = [len(self.takes[i].cues.positions) - 1 for i, _ in identification.pairs]
+        samples = min(len(self.body.rest), SAMPLES)
+        for name, size in (("noise", ()), ("grid", (samples, 3))):
+            found = saved.get(name)
+            if found is not None and [[tuple(t.shape) for t in each] for each in found] != [[(T, *size)] * 3 for T in expected]:
+                raise DataError(f"ckpt_path: mosa.identification.{name}: expected tensors of {expected} frames after the "
+                                "first, found others: the checkpoint belongs to another configuration")
+        if len(saved["factors"]) != (count := len(identification.newton.blocks)):
+            raise DataError(f"ckpt_path: mosa.identification.factors: expected {count} numbers, found {len(saved['factors'])}: "
+                            "the checkpoint belongs to another configuration")
+        identification.restore(dict(saved))
+
+    def report_newton(self, found: dict[str, float]) -> None:
+        """Scalars of one iteration: cost, step, what the evidence found, parameters."""
+        values = {"loss/total": found["after"], "fit/stage": float(self.stage_index), "newton/share": found["share"],
+                  "newton/length": found["length"]}
+        values |= {f"newton/{name}": value for name, value in found.items() if name.startswith("sd/")}
+        values["fit/distance_m"] = self.identification.distance()
+        self.log_values(values)

@@ -1,0 +1,116 @@
+"""Distances between a rollout and the motion cues as least squares wants them, with a noise that is found from them.
+
+Three fields per rollout, over frames and particles: position [m], rotation [rad] (vector of R_cue^T R) and singular values [-].
+Each
+frame of each field is divided by its own root mean square, floored at what the cues can be trusted to. Particles near each other
+move alike, and so do frames: a frame counts as `count` independent data, not as many as it has particles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mosa.physics.constitutive.singular_values import singular_value_decomposition
+from mosa.reconstruction.motion.response import Response
+from mosa.types import MotionCues, Rollout
+
+CUE_ERRORS = (0.5e-3, 0.01, 0.015)
+"""Per component: positions [m], rotations [rad], singular values. Cues that a simulation informed are 0.5 to 0.7 mm off after
+contact, 0.3 to 0.4 in a component (rabbit, chick1, mandarin, peanut); what they get wrong beyond is measured from the residuals."""
+MODEL_ERRORS = (1.0, 0.3, 0.15)
+"""Rotations and singular values that a grid gets wrong where it gets positions wrong by a cell."""
+SAMPLES = 2000
+"""Particles compared at most: far more than a frame has independent data."""
+
+
+@dataclass(frozen=True)
+class Fields:
+    """position, rotation, stretch: (T - 1, M, 3) each, frames after the first of M particles."""
+
+    position: Tensor
+    rotation: Tensor
+    stretch: Tensor
+
+    def __iter__(self):
+        return iter((self.position, self.rotation, self.stretch))
+
+
+def sampled(particles: int, device: torch.device) -> Tensor:
+    """(M,) evenly spread indices of at most `SAMPLES` particles (they are stored along a lattice)."""
+    count = min(particles, SAMPLES)
+    return (torch.arange(count, device=device) * particles) // count
+
+
+@torch.no_grad()
+def fields(
+    rollout: Rollout, cues: MotionCues, start_rotation: Tensor, chosen: Tensor, response: Response | None = None
+) -> Fields:
+    """rollout: of T frames; cues: of at least as many, relative to the rest pose; start_rotation: (3, 3) Q of the sequence;
+    response: what the cues keep of the prediction that they were found about."""
+    frames, x, F = len(rollout.x), rollout.x, rollout.F_tot
+    if response is not None:
+        x, F = response.seen(x, F, start_rotation)
+    U, S, V = singular_value_decomposition(F[1:, chosen])
+    relative = cues.rotation[1:frames, chosen].mT @ (U @ V.mT @ start_rotation.T.to(U))
+    vector = 0.5 * torch.stack([relative[..., 2, 1] - relative[..., 1, 2], relative[..., 0, 2] - relative[..., 2, 0],
+                                relative[..., 1, 0] - relative[..., 0, 1]], -1)
+    weight = cues.weight[1:frames, chosen, None]
+    return Fields(x[1:, chosen] - cues.positions[1:frames, chosen], vector * weight,
+                  (S - cues.stretch[1:frames, chosen]) * weight)
+
+
+def floors(dx: float, cells: float) -> tuple[float, float, float]:
+    """Noise per component that no frame gets below: that of the cues, and what a simulation on a grid of dx [m] gets wrong whatever
+    its law is, `cells` of it in positions."""
+    return tuple((cue**2 + (model * cells * (dx if i == 0 else 1.0)) ** 2) ** 0.5
+                 for i, (cue, model) in enumerate(zip(CUE_ERRORS, MODEL_ERRORS)))
+
+
+def patterns(found: list[Fields]) -> float:
+    """How many independent patterns the positions' residuals consist of: (sum l)^2 / sum l^2 over the eigenvalues l of their
+    covariance, at most the number of frames; of several rollouts the mean."""
+    counts = []
+    for each in found:
+        field = each.position.flatten(1).double()
+        field = field / field.norm(dim=1, keepdim=True).clamp(min=1e-12)  # as the noise weighs the frames
+        gram = field @ field.T
+        counts.append(float(gram.trace() ** 2 / gram.square().sum()))
+    return sum(counts) / len(counts)
+
+
+def difference(one: list[Fields], other: list[Fields]) -> list[Fields]:
+    """Field by field."""
+    return [Fields(*(x - y for x, y in zip(a, b))) for a, b in zip(one, other)]
+
+
+def along(found: list[Fields], direction: list[Fields], amount: float) -> list[Fields]:
+    """found + amount direction."""
+    return [Fields(*(x + amount * y for x, y in zip(a, b))) for a, b in zip(found, direction)]
+
+
+def spread(
+    found: list[Fields], least: tuple[float, float, float], model: list[Fields] | None = None
+) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """Root mean square (T - 1,) over particles of each frame's vectors: the noise of the three kinds, at least as `floors` says and
+    no less than what the model gets wrong there, of which `model` is a sample."""
+    def squares(field: Tensor) -> Tensor:
+        return field.square().sum(-1).mean(-1)
+
+    noise = []
+    for i, each in enumerate(found):
+        wrong = [squares(field) for field in model[i]] if model is not None else [0.0, 0.0, 0.0]
+        noise.append(tuple(torch.maximum(squares(field), 3 * floor**2 + m + 0 * squares(field)).sqrt()
+                           for field, floor, m in zip(each, least, wrong)))
+    return noise
+
+
+def whitened(found: list[Fields], noise: list[tuple[Tensor, Tensor, Tensor]], counts: list[tuple[float, float, float]]) -> Tensor:
+    """One vector whose squared length is minus twice the log likelihood, up to a constant."""
+    parts = []
+    for each, scales, numbers in zip(found, noise, counts):
+        for field, scale, count in zip(each, scales, numbers):
+            parts.append((field * ((count / field.shape[1]) ** 0.5 / scale)[:, None, None]).flatten())
+    return torch.cat(parts)

@@ -1,0 +1,1 @@
+"""Where a calibration begins, and how the ground is touched."""

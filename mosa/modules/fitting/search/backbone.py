@@ -1,0 +1,229 @@
+"""Where a calibration begins: the best of a coarse grid, a compass search for laws of more numbers; which law is the backbone."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol
+
+import torch
+
+from mosa.errors import ConfigError, SimulationDiverged
+from mosa.modules.body.body import Body
+from mosa.modules.body.material import FORMS, STIFFNESS
+from mosa.system.progress import tqdm
+
+STIFFNESS_STEPS = (0.3, 0.6, 1.0, 1.5, 2.2, 3.2, 4.5, 7.0)
+POISSON_STEPS = (0.2, 0.32, 0.42)
+"""Where a calibration looks first: multiples of the stiffness that the configuration starts from, and Poisson numbers."""
+FURTHER, FURTHEST = 1.5, 100.0
+"""Where the best lies at an end of the multiples, these go on by such a factor, up to so much of the configuration's stiffness."""
+STRIDES = {"E": 1.1, "mu": 1.1, "kappa": 1.1, "yield_stress": 1.1, "viscosity": 1.6, "cohesion": 0.5, "nu": 0.8,
+           "friction_angle": 0.8}
+"""First steps of a compass search in unconstrained parameters: a factor of 3 (of 5 in a viscosity), or 0.1 in the middle of nu's
+range and 17 degrees in that of the angle's."""
+FINEST = 0.2
+"""Of the first steps: there a compass search ends, and Gauss-Newton goes on."""
+COMPASS = 40
+"""About how many rollouts it takes in three or four numbers."""
+MANY = 4
+"""Learned numbers from which a law has several valleys (a stiff and viscous one beside a soft one that yields early): there
+Gauss-Newton is begun at several starts, as a search in one number after the other goes down the wrong one."""
+WIDE = (0.3, 1.0, 3.2)
+"""Multiples of the stiffness among these starts, each with the numbers that are no stiffness `moved`."""
+BEGUN, FIRST, KEPT, LAST = 6, 2, 3, 3
+"""Of these starts the nearest, beside the end of the compass search; iterations of each; how many go on, and for how many more."""
+
+
+class Calibration(Protocol):
+    """What is asked of the identification (`identification.py`) whose start is sought."""
+
+    body: Body
+
+    def search(self) -> float:
+        """`search` of it."""
+
+    def iterate(self) -> dict[str, float]:
+        """One iteration of Gauss-Newton."""
+
+    def distance(self) -> float:
+        """Mean distance [m] of free rollouts from the cues."""
+
+    def state(self) -> dict:
+        """Beside the body's numbers."""
+
+    def restore(self, state: dict) -> None:
+        """As when `state` was taken."""
+
+
+def compass(at: Callable[[dict[str, float]], float], row: dict[str, float], strides: dict[str, float]) -> dict[str, float]:
+    """The place that a compass search of at() ends at, begun at `row`: a step up or down in one number at a time, where it
+    improves, and smaller steps where none does."""
+    best, share = at(row), 1.0
+    while share > FINEST:
+        moved = False
+        for name, stride in strides.items():
+            for sign in (1.0, -1.0):
+                step = row | {name: row[name] + sign * share * stride}
+                found = at(step)
+                if found < best:
+                    best, row, moved = found, step, True
+                    break
+        if not moved:
+            share *= 0.5
+    return row
+
+
+def rollouts_of_search(learned: Sequence[str], each: float) -> float:
+    """About how many rollouts `search` takes for a law with these learned numbers; each: of an iteration."""
+    count = len(STIFFNESS_STEPS) * (len(POISSON_STEPS) if "nu" in learned else 1)
+    count += COMPASS * bool(set(learned) - {"E", "nu"})
+    if len(learned) < MANY:
+        return count
+    return count + len(WIDE) * len(moved(learned)) + ((BEGUN + 1) * FIRST + KEPT * LAST) * each
+
+
+def moved(learned: Sequence[str]) -> list[dict[str, float]]:
+    """Steps of the numbers that are no stiffness and no Poisson number: none, or a first step of the compass up or down in one or
+    in two of them. All combinations of many numbers were too many."""
+    others = [name for name in learned if name not in STIFFNESS and name != "nu"]
+    return [{name: sign * STRIDES.get(name, 1.0) for name, sign in zip(some, signs)} for count in range(3)
+            for some in itertools.combinations(others, count) for signs in itertools.product((-1, 1), repeat=count)]  # fmt: skip
+
+
+def search(calibration: Calibration) -> float:
+    """Start a calibration near the smallest mean distance [m] of free rollouts from the cues, which is returned.
+
+    The best of a coarse grid of stiffness and Poisson number, which goes on where its best is at an end of the stiffness; then,
+    for laws with parameters beside these, a compass search in all of them (Kolda, Lewis, Torczon, SIAM Review 45, 2003); of laws
+    of `MANY` numbers, Gauss-Newton from its end and from other starts (`nearest_end`).
+    Errors: SimulationDiverged where no start of the grid can be simulated; those of `nearest_end`."""
+    material = calibration.body.material
+    starts, learned = material.begins, material.learned
+    modulated = [n for n in STIFFNESS if n in learned and n in material.modulated]
+    tried: dict[tuple[float, ...], float] = {}
+
+    @torch.no_grad()
+    def start_at(row: dict[str, float]) -> None:
+        for name, value in row.items():
+            material.raw[name].fill_(value)
+
+    def at(row: dict[str, float]) -> float:
+        """Of these unconstrained parameters, infinite where they cannot be simulated."""
+        key = tuple(row.values())
+        if key not in tried:
+            start_at(row)
+            try:
+                tried[key] = calibration.distance()
+            except (SimulationDiverged, ConfigError):
+                tried[key] = math.inf
+        return tried[key]
+
+    def row_of(multiple: float, nu: float | None) -> dict[str, float]:
+        row = {n: starts[n] + math.log(multiple) * (n in modulated) for n in learned}
+        return row if nu is None else row | {"nu": FORMS["nu"].inverse(nu)}
+
+    numbers: tuple[float | None, ...] = POISSON_STEPS if "nu" in learned else (None,)
+    multiples = list(STIFFNESS_STEPS) if modulated else [1.0]
+    best = min(((at(row_of(m, nu)), m, nu) for m in multiples for nu in numbers), key=lambda found: found[0])
+    for end, factor in ((multiples[0], 1 / FURTHER), (multiples[-1], FURTHER)):
+        multiple = end
+        while modulated and best[1] == multiple and math.isfinite(best[0]) and 1 / FURTHEST < multiple * factor < FURTHEST:
+            multiple *= factor
+            found = min(((at(row_of(multiple, nu)), multiple, nu) for nu in numbers), key=lambda found: found[0])
+            best = min(best, found, key=lambda found: found[0])
+    if not math.isfinite(best[0]):
+        raise SimulationDiverged("fit.prior: none of the starts of the coarse grid can be simulated; set prior.parameters "
+                                 "nearer to the body's, or raise simulation.max_substeps")
+    row = row_of(*best[1:])
+    if set(learned) - {"E", "nu"}:
+        row = compass(at, row, {n: STRIDES.get(n, 1.0) for n in learned})
+    if len(learned) >= MANY:
+        stiffnesses = [row_of(m, None) for m in (WIDE if modulated else (1.0,))]
+        wide = [each | {n: each[n] + step for n, step in steps.items()} for each in stiffnesses for steps in moved(learned)]
+        return nearest_end(calibration, start_at, [row, *sorted(wide, key=at)[:BEGUN]])
+    start_at(row)
+    return at(row)
+
+
+def nearest_end(calibration: Calibration, start_at: Callable[[dict[str, float]], None], rows: Sequence[dict[str, float]]) -> float:
+    """Gauss-Newton from several starts, the nearest of which after a few iterations go on; the calibration is left at the nearest
+    end, as if it had not begun, and its mean distance [m] is returned. Starts that cannot be simulated are left out, but the first,
+    whose error is raised where none of them can."""
+    body = calibration.body
+    begun, here = calibration.state(), calibrated(body)
+    ends: list[tuple[float, dict[str, dict], dict]] = []
+    failed: SimulationDiverged | ConfigError | None = None
+    for row in tqdm(rows, "starts of the calibration", leave=False):
+        calibrate_as(body, here)  # the contact too
+        start_at(row)
+        try:
+            ends.append(went_on(calibration, begun, FIRST))
+        except (SimulationDiverged, ConfigError) as error:
+            failed = failed or error
+    if not ends and failed is not None:
+        raise failed
+    ends.sort(key=lambda end: end[0])
+    for end in tqdm(ends[:KEPT], "the nearest of them", leave=False):
+        calibrate_as(body, end[1])
+        try:
+            ends.append(went_on(calibration, end[2], LAST))
+        except (SimulationDiverged, ConfigError):
+            continue  # it stays where it was
+    distance, numbers, _ = min(ends, key=lambda end: end[0])
+    calibrate_as(body, numbers)
+    calibration.restore(begun)
+    return distance
+
+
+def went_on(calibration: Calibration, state: dict, iterations: int) -> tuple[float, dict[str, dict], dict]:
+    """(mean distance [m], numbers of the body, state) after further iterations. Errors: those of an iteration."""
+    calibration.restore(state)
+    for _ in range(iterations):
+        calibration.iterate()
+    return calibration.distance(), calibrated(calibration.body), calibration.state()
+
+
+def calibrated(body: Body) -> dict[str, dict]:
+    """What a calibration learns of a body, as it is now."""
+    return {part: copy.deepcopy(getattr(body, part).state_dict()) for part in ("material", "contact")}
+
+
+def calibrate_as(body: Body, numbers: Mapping[str, dict]) -> None:
+    """Set the body to `calibrated` numbers."""
+    for part, state in numbers.items():
+        getattr(body, part).load_state_dict(state)
+
+
+TRIED = 4
+"""Iterations after which candidates for the backbone are compared: from the best start of the grid they hardly move later."""
+
+
+def choose_law(body: Body, candidates: Sequence[str], build: Callable[[], Calibration]) -> dict[str, float]:
+    """Calibrate every candidate and leave `body` at the one with the smallest mean distance from the cues, which is returned for
+    each [m], infinite where a law cannot be simulated. build: a calibration of `body`. Errors: SimulationDiverged where none can.
+    """
+    found: dict[str, float] = {}
+    best: tuple[float, dict, str] | None = None
+    for law in candidates:
+        body.material.law = law
+        calibration = build()
+        try:
+            calibration.search()
+            for _ in range(TRIED):
+                calibration.iterate()
+            found[law] = calibration.distance()
+        except SimulationDiverged:
+            found[law] = math.inf
+            continue
+        if best is None or found[law] < best[0]:
+            best = (found[law], calibrated(body), law)
+    if best is None:
+        raise SimulationDiverged(f"prior=auto: none of {', '.join(candidates)} can be calibrated; set prior.parameters nearer "
+                                 "to the body's")
+    calibrate_as(body, best[1])
+    for material in (body.material, *(variant["material"] for variant in body.frozen.values())):
+        material.choose(best[2])
+    return found

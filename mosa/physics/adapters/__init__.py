@@ -1,0 +1,1 @@
+"""How a simulation asks an adapter for its stress."""

@@ -1,0 +1,1 @@
+"""How many substeps a frame takes, and when."""

@@ -1,0 +1,1 @@
+"""Gaussians that show a body as its images do."""

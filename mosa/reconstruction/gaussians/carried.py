@@ -1,0 +1,152 @@
+"""Appearance of the body: the static stage's Gaussians, fitted further to all training frames, carried by the observed motion.
+
+One frame shows each part in one light and blames what its cameras miss on colours; the frames after it show the same parts from
+other sides, and in another light, which is fitted too (`lighting.py`). The fit is photometric and in the rest shape's
+axes: the motion that carries the Gaussians is the reconstruction's and stays as it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from mosa.reconstruction.gaussians.photometric import image_loss
+from mosa.reconstruction.gaussians.static import SMALLEST, FitSettings
+from mosa.reconstruction.motion.observed import Windows
+from mosa.rendering.appearance.carrying import bind
+from mosa.rendering.appearance.lighting import LIGHT, surface_normals, turned_basis
+from mosa.rendering.appearance.spherical_harmonics import Y0, camera_centers, colors_in, constant_coefficients, mean_colors
+from mosa.rendering.covariance import covariance_from
+from mosa.rendering.rasterizer import rasterize
+from mosa.schema import COUNT, FLAG, WEIGHT, check_knobs, knob, one_of, whole
+from mosa.types import Appearance, Splats
+
+
+@dataclass(frozen=True)
+class CarriedSettings(FitSettings):
+    """As `FitSettings`, of Gaussians that start from the static ones; lr_colors counts for their mean colours. degree: of the
+    spherical harmonics, 0 to 3; lr_harmonics: of those of degree 1 and more, per coefficient; keep_harmonics: what those count for
+    in pixels of an image, since what no training camera sees along has no other reason to be dull; light: whether the light is
+    fitted, lr_light: its step."""
+
+    views: int = knob(4, COUNT)
+    keep: float = knob(1.0, WEIGHT)
+    shape: str = knob("anisotropic", one_of("isotropic", "anisotropic"))
+    lr_colors: float = knob(0.03, WEIGHT)
+    degree: int = knob(1, whole(0, 3))
+    lr_harmonics: float = knob(0.005, WEIGHT)
+    keep_harmonics: float = knob(10.0, WEIGHT)
+    light: bool = knob(True, FLAG)
+    lr_light: float = knob(0.02, WEIGHT)
+
+    def __post_init__(self) -> None:
+        check_knobs(self, "reconstruction.carried")
+
+
+class RestGaussians:
+    """The free numbers of M splats at rest: shift of the centres [m], log scales, quaternions, logits of opacity, harmonics; and of
+    the light."""
+
+    def __init__(self, splats: Splats, normals: Tensor, settings: CarriedSettings) -> None:
+        unit, extra = float(splats.scales.mean()), (settings.degree + 1) ** 2 - 1
+        self.settings, self.start, self.normals = settings, splats, normals
+        self.shift = torch.zeros_like(splats.means)
+        self.log_scale, self.quaternion = splats.scales.log(), splats.rotations.clone()
+        self.logit = torch.logit(splats.opacities.clamp(0.01, 0.99))
+        self.first = constant_coefficients(splats.colors)
+        self.constant, self.higher = self.first.clone(), splats.means.new_zeros(len(splats.means), extra, 3)
+        self.light = splats.means.new_zeros(LIGHT)
+        rates = {"shift": settings.lr_positions * unit, "log_scale": settings.lr_scales, "logit": settings.lr_opacities,
+                 "constant": settings.lr_colors, "higher": settings.lr_harmonics}  # fmt: skip
+        if settings.shape == "anisotropic":
+            rates["quaternion"] = settings.lr_rotations
+        if settings.light:
+            rates["light"] = settings.lr_light
+        groups = [{"params": [getattr(self, name).requires_grad_(True)], "start": rate} for name, rate in rates.items()]
+        self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12)
+        scale = splats.scales.mean(1, keepdim=True)
+        self.lower, self.upper = (SMALLEST * scale).log(), (settings.largest * scale).log()
+
+    @property
+    def harmonics(self) -> Tensor:
+        return torch.cat((self.constant, self.higher), 1)
+
+    @property
+    def covariances(self) -> Tensor:
+        return covariance_from(self.log_scale.exp(), self.quaternion)
+
+    def change(self) -> Tensor:
+        """Sum over the splats of the squares by which their colours, in the mean over directions and channels, left the first ones,
+        each weighted by what it counts for."""
+        constant, higher = ((Y0 * moved).square().mean(2).sum() for moved in (self.constant - self.first, self.higher))
+        return self.settings.keep * constant + self.settings.keep_harmonics * higher
+
+    def step(self, loss: Tensor, factor: float) -> None:
+        """One of Adam's, at `factor` of the first; scales back between their bounds, as those of the static stage."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["start"] * factor
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self.optimizer.step()
+        with torch.no_grad():
+            if self.settings.shape == "isotropic":
+                self.log_scale.copy_(self.log_scale.mean(1, keepdim=True).expand(-1, 3))
+            self.log_scale.copy_(torch.minimum(torch.maximum(self.log_scale, self.lower), self.upper))
+            least = self.log_scale.amax(1, keepdim=True) - math.log(self.settings.axis_ratio)
+            self.log_scale.copy_(torch.maximum(self.log_scale, least))
+
+    @torch.no_grad()
+    def appearance(self) -> Appearance:
+        """The splats as they are."""
+        harmonics = self.harmonics.detach()
+        splats = Splats(self.start.means + self.shift.detach(), self.log_scale.detach().exp(),
+                        normalize(self.quaternion.detach(), dim=-1), torch.sigmoid(self.logit.detach()), mean_colors(harmonics))
+        return Appearance(splats, harmonics, self.normals, self.light.detach())
+
+
+def fit_carried(
+    static: Splats,
+    particles: Tensor,
+    positions: Tensor,
+    windows: Windows,
+    background: Tensor,
+    settings: CarriedSettings,
+    *,
+    seed: int,
+    progress: Callable[[int], None] | None = None,
+) -> Appearance:
+    """The splats of a body that its particles carry, fitted to windows of all frames.
+
+    static: Gaussians at rest, where the fit starts; particles: (N, 3) at rest and positions: (T, N, 3) [m] of the frames 0 to T - 1
+    that `windows` show. Each splat follows the motion's affine part where the static one lies. The same bits for the same seed on
+    a CPU.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    gaussians = RestGaussians(static, surface_normals(static.means, particles), settings)
+    carried, eyes = bind(static.means, particles).carry(positions), camera_centers(windows.cameras)
+    turns = turned_basis(gaussians.normals, carried.rotations)
+    order = torch.empty(0, dtype=torch.long)
+    for step in range(settings.iterations):
+        while len(order) < settings.views:
+            order = torch.cat([order, torch.randperm(len(windows), generator=generator)])
+        chosen, order = order[: settings.views], order[settings.views :]
+        batch = windows.select(chosen.to(windows.frame.device))
+        A, turn = carried.gradients[batch.frame], carried.rotations[batch.frame]
+        means = carried.means[batch.frame] + (A @ gaussians.shift[..., None])[..., 0]
+        directions = (means.detach() - eyes[chosen][:, None])[..., None, :] @ turn  # seen from the body: R^T d
+        colors = colors_in(gaussians.harmonics, directions[..., 0, :]) * (turns[batch.frame] @ gaussians.light).exp()[..., None]
+        image, alpha = rasterize(
+            means, A @ gaussians.covariances @ A.mT, torch.sigmoid(gaussians.logit), colors, batch.cameras,
+            torch.arange(len(batch), device=means.device), background,
+        )  # fmt: skip
+        loss = image_loss(image, alpha, batch, ssim_weight=settings.ssim, matte_weight=settings.matte)
+        loss = loss + gaussians.change() / alpha.numel()
+        gaussians.step(loss, 0.03 + 0.97 * 0.5 * (1 + math.cos(math.pi * step / settings.iterations)))
+        if progress is not None:
+            progress(1)
+    return gaussians.appearance()

@@ -1,0 +1,169 @@
+"""The body that is filled: a visual hull without the air that colours, outlines of the free flight and smoothness tell from
+matter.
+
+Where the images say nothing the hull stays, smoothed between its outlines, and `Geometry.figures` say how much of the surface
+that is. """
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field, replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from mosa.data.hull import Volume, shave_ridges
+from mosa.errors import DataError
+from mosa.reconstruction.geometry.carving import CarvingSettings, carve, keep_silhouettes
+from mosa.reconstruction.geometry.refinement import (
+    BORDER,
+    RefinementSettings,
+    refine,
+    signed_distance,
+    surface_information,
+    voxels,
+)
+from mosa.reconstruction.motion.observed import object_windows
+from mosa.reconstruction.pose.flight import free_motions
+from mosa.schema import COUNT, check_knobs, knob, one_of
+from mosa.types import Scene
+
+OPTIMISM = 1.3
+"""Root mean square error of the surface over the standard deviation that its information alone gives: neighbouring pixels are not
+independent, and a neighbourhood does not move as one. Measured on the gorilla and the bowl."""
+
+
+@dataclass(frozen=True)
+class GeometrySettings:
+    """source: images, the hull carved by colours and refined | hull, with its ridges rounded; frames: of free flight whose
+    outlines and colours are used, at most; first: rounds and blur [px] of the refinement on frame 0, from which the flight is
+    followed; then: on all free frames."""
+
+    source: str = knob("images", one_of("images", "hull"))
+    frames: int = knob(6, COUNT)
+    first: tuple[tuple[int, float], ...] = ((4, 2.0), (4, 1.0))
+    then: tuple[tuple[int, float], ...] = ((3, 1.0), (9, 0.4))
+    carving: CarvingSettings = field(default_factory=CarvingSettings)
+    refinement: RefinementSettings = field(default_factory=RefinementSettings)
+
+    def __post_init__(self) -> None:
+        check_knobs(self, "reconstruction.geometry")
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """body: values 0 or 1; hull_volume [m^3]; deviation: standard deviation [m] of the surface where it is known at all, on the
+    body's grid, infinite where no image says anything (empty: nothing was measured); free_frames: how many frames were used."""
+
+    body: Volume
+    hull_volume: float
+    deviation: Tensor
+    free_frames: int
+
+    def figures(self, spacing: float) -> dict[str, float]:
+        """`geometry/...`: volumes [m^3], share of the hull that was emptied, and, where images were used, share of the surface
+        that they do not tell to 0.7 particle spacings (two standard deviations): there the body is a guess between outlines."""
+        volume = self.body.occupied_volume()
+        figures = {
+            "geometry/hull_volume_m3": self.hull_volume, "geometry/volume_m3": volume,
+            "geometry/carved_share": 1 - volume / self.hull_volume, "geometry/free_frames": float(self.free_frames),
+        }  # fmt: skip
+        if self.deviation.numel():
+            on_surface = self.deviation[surface_of(self.body)]
+            figures["geometry/uncertain_share"] = float((2 * on_surface > 0.7 * spacing).double().mean())
+            figures["geometry/deviation_m"] = float(on_surface.median())
+        return figures
+
+    def stored(self) -> dict:
+        """Tensors and numbers of it, for `read`."""
+        return {
+            "values": self.body.values.cpu(), "origin": self.body.origin.cpu(), "pitch": self.body.pitch,
+            "hull_volume": self.hull_volume, "deviation": self.deviation.cpu(), "free_frames": self.free_frames,
+        }  # fmt: skip
+
+    @classmethod
+    def read(cls, stored: dict) -> Geometry:
+        """The inverse of `stored`."""
+        return cls(Volume(stored["values"], stored["origin"], stored["pitch"]), stored["hull_volume"], stored["deviation"],
+                   stored["free_frames"])
+
+
+def surface_of(body: Volume) -> Tensor:
+    """Voxels (X, Y, Z) bool of a body that have an empty neighbour across a face."""
+    inside = F.pad((body.values > 0.5).float(), (1,) * 6)
+    around = sum(inside.roll(step, dim) for dim in range(3) for step in (-1, 1))
+    return ((inside > 0.5) & (around < 6))[1:-1, 1:-1, 1:-1]
+
+
+def free_frames_at_most(scene: Scene, count: int) -> list[int]:
+    """Training frames 0, 1, ... without a gap, at most `count`."""
+    frames = []
+    for t in scene.training_frames:
+        if t != len(frames) or len(frames) == count:
+            break
+        frames.append(t)
+    return frames
+
+
+def holds_matter(distance: Volume) -> bool:
+    """Whether any point of the grid lies inside of the surface."""
+    return bool((distance.values < 0).any())
+
+
+def nothing_left(scene: Scene, hull: Geometry) -> Geometry:
+    """The hull's geometry, where the images left nothing of it, with a warning that says so."""
+    warnings.warn(
+        f"scene {scene.name}: carving and refinement left nothing of a visual hull of {int(hull.body.values.sum())} voxels of "
+        f"{1e3 * hull.body.pitch:.3g} mm; the hull is the body, as with reconstruction.geometry.source=hull. More voxels "
+        "(reconstruction.resolution) or pixels (scene.scale) may tell more", stacklevel=3,
+    )  # fmt: skip
+    return hull
+
+
+def find_geometry(scene: Scene, hull: Volume, settings: GeometrySettings, *, ridge_passes: int, sigma: float, margin: int,
+                  device: torch.device | str) -> Geometry:
+    """The body of `scene` inside its visual hull (occupancy of frame 0, training cameras only), read from training frames alone;
+    the hull's where they leave nothing of it. Errors: DataError where the hull has no inside.
+
+    ridge_passes, sigma: of `shave_ridges`, which gives the body where source is hull, and else a start; margin: px around the
+    mattes. """
+    whole = replace(hull, values=(hull.values > 0.5).float())
+    volume = whole.occupied_volume()
+    cameras = scene.cameras.select(scene.training_cameras)
+
+    def of_hull() -> Geometry:
+        body = shave_ridges(whole, cameras, passes=ridge_passes, sigma=sigma) if ridge_passes else whole
+        return Geometry(body, volume, torch.empty(0), 1)
+
+    if not holds_matter(signed_distance(whole)):
+        raise DataError(f"scene {scene.name}: expected a visual hull with an inside, found {int(whole.values.sum())} voxels of "
+                        f"{1e3 * hull.pitch:.3g} mm: take more voxels (reconstruction.resolution) or more pixels (scene.scale), "
+                        "and look at the mattes of frame 0 and at scene.box")
+    if settings.source == "hull":
+        return of_hull()
+    frames = free_frames_at_most(scene, max(1, settings.frames))
+    windows = object_windows(scene, scene.training_cameras, frames, margin=margin).to(device)
+    seen = [windows.of_frame(t) for t in frames]
+    solid = Volume(whole.values.to(device), whole.origin.to(device), whole.pitch)
+    bound = signed_distance(solid)
+    start = carve(solid, seen[0], settings.carving)
+    if ridge_passes:
+        # of the whole hull: rounding would widen what was carved by mistake
+        rounded = shave_ridges(solid, cameras, passes=ridge_passes, sigma=sigma)
+        start = replace(start, values=torch.minimum(start.values, rounded.values))
+    distance = signed_distance(start)
+    distance = refine(distance, bound, seen[:1], settings.refinement, settings.first)
+    if not holds_matter(distance):
+        return nothing_left(scene, of_hull())
+    motions = free_motions(scene, distance, seen)
+    moved = [seen[0], *(motion.windows(views) for motion, views in zip(motions, seen[1:]))]
+    distance = refine(distance, bound, moved, settings.refinement, settings.then)
+    if not holds_matter(distance):
+        return nothing_left(scene, of_hull())
+    information = surface_information(distance, moved, settings.refinement, settings.then[-1][1])
+    inner = slice(BORDER, -BORDER)
+    kept = keep_silhouettes(voxels(distance, solid).values > 0.5, solid, seen[0])
+    deviation = OPTIMISM * information[inner, inner, inner].rsqrt()
+    body = Volume(kept.float().cpu(), solid.origin.cpu(), solid.pitch)
+    return Geometry(body, volume, deviation.cpu(), len(moved))

@@ -1,0 +1,128 @@
+"""Scalar fields on a regular grid: values at points, smoothing, sums of points onto the grid, and where rays meet a surface.
+
+Plain torch on any device; sums are made in integers, so that equal arguments give equal bits on a GPU too.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from mosa.data.hull import Volume
+from mosa.types import Cameras
+
+FIXED_POINT = 2.0**24
+
+
+def sample(values: Tensor, index: Tensor) -> Tensor:
+    """Trilinear values (..., C) of fields (C, X, Y, Z) at grid coordinates index (..., 3); beyond the grid those of its border."""
+    size = index.new_tensor(values.shape[1:]) - 1
+    grid = (2 * index / size - 1).flip(-1).reshape(1, 1, 1, -1, 3)
+    found = F.grid_sample(values[None], grid, padding_mode="border", align_corners=True)
+    return found.reshape(len(values), -1).T.reshape(*index.shape[:-1], len(values))
+
+
+def at(volume: Volume, points: Tensor) -> Tensor:
+    """Value of a volume at world points (..., 3) [m]."""
+    return sample(volume.values[None], (points - volume.origin) / volume.pitch)[..., 0]
+
+
+def bell(sigma: float, like: Tensor) -> Tensor:
+    """Weights of a Gaussian of `sigma` cells to three of them either side, with sum 1."""
+    reach = max(1, round(3 * sigma))
+    weights = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, device=like.device, dtype=like.dtype) / sigma) ** 2)
+    return weights / weights.sum()
+
+
+def smooth(values: Tensor, sigma: float, dims: tuple[int, ...] = (-3, -2, -1)) -> Tensor:
+    """Gaussian mean over the last axes named by `dims`; beyond the border the values of the border.
+
+    By sums of shifted copies and not by a convolution, whose rounding depends on the device.
+    """
+    weights = bell(sigma, values).tolist()
+    reach = len(weights) // 2
+    for dim in dims:
+        size = values.shape[dim]
+        index = torch.arange(-reach, size + reach, device=values.device).clamp(0, size - 1)
+        padded = values.index_select(dim % values.dim(), index)
+        values = sum(w * padded.narrow(dim, k, size) for k, w in enumerate(weights))
+    return values
+
+
+def scatter(shape: tuple[int, ...], index: Tensor, values: Tensor) -> Tensor:
+    """Sums (C, X, Y, Z) of values (N, C) shared among the eight grid points around each index (N, 3); exact in any order."""
+    low = index.floor()
+    part, low = index - low, low.long()
+    limit = torch.tensor(shape, device=index.device)
+    fixed = (values.double() * FIXED_POINT).round()
+    total = torch.zeros(values.shape[1], shape[0] * shape[1] * shape[2], dtype=torch.long, device=index.device)
+    for corner in range(8):
+        offset = torch.tensor([corner >> 2 & 1, corner >> 1 & 1, corner & 1], device=index.device)
+        cell = low + offset
+        weight = torch.where(offset.bool(), part, 1 - part).prod(1) * ((cell >= 0) & (cell < limit)).all(1)
+        cell = torch.minimum(cell.clamp(min=0), limit - 1)
+        flat = (cell[:, 0] * shape[1] + cell[:, 1]) * shape[2] + cell[:, 2]
+        total.index_add_(1, flat, (fixed * weight[:, None].double()).round().long().T.contiguous())
+    return (total.double() / FIXED_POINT).to(values).reshape(-1, *shape)
+
+
+def gradient(values: Tensor, pitch: float) -> Tensor:
+    """(3, X, Y, Z) derivatives of a field (X, Y, Z) by central differences."""
+    return torch.stack(torch.gradient(values, spacing=pitch))
+
+
+def camera_rays(cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """Centres (V, 3) [m] and unit directions (V, H, W, 3) through the middles of the pixels."""
+    y = torch.arange(cameras.height, device=cameras.K.device) + 0.5
+    x = torch.arange(cameras.width, device=cameras.K.device) + 0.5
+    pixel = torch.stack((*torch.meshgrid(x, y, indexing="xy"), torch.ones(len(y), len(x), device=x.device)), -1)
+    directions = pixel @ torch.linalg.inv(cameras.K).transpose(1, 2)[:, None] @ cameras.w2c[:, None, :3, :3]
+    centres = -(cameras.w2c[:, :3, :3].transpose(1, 2) @ cameras.w2c[:, :3, 3:])[..., 0]
+    return centres, F.normalize(directions, dim=-1)
+
+
+def span(volume: Volume) -> tuple[Tensor, float]:
+    """Centre (3,) and radius [m] of the ball around a volume's grid."""
+    size = volume.pitch * (torch.tensor(volume.values.shape, device=volume.values.device) - 1)
+    return volume.origin + size / 2, float(size.norm()) / 2
+
+
+def first_crossing(distance: Volume, origin: Tensor, direction: Tensor, start: Tensor | None = None) -> Tensor:
+    """Way (M,) [m] along rays (M, 3) to where a distance (negative inside) first falls below 0; infinite where it never does.
+
+    start: (M,) ways before which nothing is looked for; nan: from the grid's border.
+    """
+    centre, radius = span(distance)
+    middle = ((centre - origin) * direction).sum(-1)
+    first = middle - radius
+    way = first if start is None else torch.where(start.isnan(), first, torch.maximum(start, first))
+    hit = torch.full_like(way, float("inf"))
+    before = torch.full_like(way, float("inf"))
+    left = torch.arange(len(way), device=way.device)
+    step = 0.7 * distance.pitch
+    for _ in range(int(2 * radius / step) + 2):
+        now = at(distance, origin[left] + way[left, None] * direction[left])
+        inside = now < 0
+        share = torch.where(before[left].isinf(), torch.ones_like(now), before[left] / (before[left] - now).clamp(min=1e-9))
+        hit[left[inside]] = (way[left] + (share - 1) * step)[inside]
+        before[left] = now
+        left = left[~inside]
+        way[left] = way[left] + step
+        left = left[way[left] < (middle + radius)[left]]
+        if len(left) == 0:
+            break
+    return hit
+
+
+def nearest_passing(distance: Volume, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+    """Smallest distance (M,) that rays (M, 3) meet inside the grid, and the way (M,) [m] to it."""
+    centre, radius = span(distance)
+    middle = ((centre - origin) * direction).sum(-1)
+    best, way = torch.full_like(middle, float("inf")), middle.clone()
+    for k in range(int(2 * radius / distance.pitch) + 1):
+        here = middle - radius + k * distance.pitch
+        found = at(distance, origin + here[:, None] * direction)
+        nearer = found < best
+        best, way = torch.where(nearer, found, best), torch.where(nearer, here, way)
+    return best, way

@@ -1,0 +1,1 @@
+"""The motion of particles through all frames."""

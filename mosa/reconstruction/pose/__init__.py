@@ -1,0 +1,1 @@
+"""Where a known body is, and how it starts."""

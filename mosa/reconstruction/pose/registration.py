@@ -1,0 +1,320 @@
+"""Where a known body is: its pose in one frame, and its velocity over a few frames of free flight, by render and
+compare.
+
+The body is a set of splats that moves rigidly: x = Q (X - X_c) + x_c. Colour and matte of its rendering are
+compared with the images by robust least squares over poses (Levenberg-Marquardt), from many rotations at first,
+coarse to fine; geometry alone would not fix a ball. Its colours are those of another pose, in a light that stayed while it turned:
+the eight numbers of that light are found along with the pose at the end, so that a bright side does not turn the body.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from mosa.errors import DataError
+from mosa.reconstruction.pose.rigid import (
+    Level,
+    Poses,
+    RigidBody,
+    damped,
+    huber,
+    left_jacobian,
+    light_columns,
+    lit_equations,
+    make_level,
+    normal_equations,
+    rotation_exp,
+)
+from mosa.rendering.appearance.lighting import LIGHT
+from mosa.rendering.covariance import quaternion_to_matrix
+from mosa.types import Cameras, Splats
+
+
+def spread_rotations(count: int) -> Tensor:
+    """`count` rotations spread evenly over SO(3), (count, 3, 3): super-Fibonacci spirals (Alexa, CVPR 2022)."""
+    s = torch.arange(count, dtype=torch.float64) + 0.5
+    t = s / count
+    alpha, beta = 2 * torch.pi * s / 2**0.5, 2 * torch.pi * s / 1.533751168755204288118041
+    r, q = t.sqrt(), (1 - t).sqrt()
+    return quaternion_to_matrix(torch.stack((r * alpha.sin(), r * alpha.cos(), q * beta.sin(), q * beta.cos()), -1)).float()
+
+
+def matte_centres(mattes: Tensor, cameras: Cameras) -> Tensor:
+    """Points (T, 3) [m] nearest to the rays through the mattes' centres of area; mattes: (V, T, H, W).
+
+    Views where the matte is empty or runs over the image's border are left out where two others remain. Raises
+    DataError where fewer than two views see the object.
+    """
+    y = torch.arange(cameras.height, dtype=mattes.dtype, device=mattes.device) + 0.5
+    x = torch.arange(cameras.width, dtype=mattes.dtype, device=mattes.device) + 0.5
+    area = mattes.sum((2, 3))
+    u = (mattes.sum(2) @ x) / area.clamp(min=1e-6)
+    v = (mattes.sum(3) @ y) / area.clamp(min=1e-6)
+    border = torch.stack(
+        (mattes[:, :, 0].amax(-1), mattes[:, :, -1].amax(-1), mattes[..., 0].amax(-1), mattes[..., -1].amax(-1))
+    )
+    seen = area > 0
+    whole = seen & (border.amax(0) < 0.5)
+    use = torch.where(whole.sum(0) >= 2, whole, seen).to(mattes)
+    for t, number in enumerate(use.sum(0).tolist()):
+        if number < 2:
+            raise DataError(
+                f"frame {t}: {int(number)} of {len(cameras)} views have a matte of the object, at least 2 are needed"
+            )
+    K, R = cameras.K.to(mattes), cameras.w2c[:, :3, :3].to(mattes)
+    directions = torch.linalg.solve(K[:, None], torch.stack((u, v, torch.ones_like(u)), -1)[..., None])[..., 0] @ R
+    directions = directions / directions.norm(dim=-1, keepdim=True)
+    origins = -(R.transpose(1, 2) @ cameras.w2c[:, :3, 3:].to(mattes))[..., 0]
+    P = use[..., None, None] * (torch.eye(3).to(mattes) - directions[..., None] * directions[..., None, :])
+    return torch.linalg.solve(P.sum(0), (P @ origins[:, None, :, None]).sum(0))[..., 0]
+
+
+def choose(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """`new` where the mask (K,) is set, else `old`, both (K, ...)."""
+    return torch.where(mask.view(-1, *[1] * (new.dim() - 1)), new, old)
+
+
+def refine(
+    body: RigidBody, level: Level, poses: Poses, background: Tensor, *, iterations: int, central: bool = False
+) -> tuple[Poses, Tensor]:
+    """Each of K poses after a few Levenberg-Marquardt steps, with its cost (K,)."""
+    frame = torch.zeros(len(poses.center), dtype=torch.long, device=poses.center.device)
+    damping = torch.full((len(frame),), 1e-2).to(poses.center)
+    best, trial, state = poses, poses, None
+    for _ in range(iterations):
+        found = normal_equations(body, level, trial, background, frame, central=central)
+        if state is None:
+            state = found
+        else:
+            better = found[0] < state[0]
+            damping = torch.where(better, damping / 3, damping * 6)
+            best = Poses(choose(better, trial.rotation, best.rotation), choose(better, trial.center, best.center))
+            state = tuple(choose(better, new, old) for new, old in zip(found, state))
+        step = damped(state[1], state[2], damping)
+        step = step * (0.6 * body.radius / step.norm(dim=-1, keepdim=True).clamp(min=1e-12)).clamp(max=1)
+        trial = best.moved(step[:, :3], step[:, 3:] / body.radius)
+        if float(step.norm(dim=-1).max()) < 2e-3 * level.pixel:
+            break
+    return best, state[0]
+
+
+def coarse_poses(body: RigidBody, level: Level, center: Tensor, background: Tensor, rotations: int, keep: int) -> Poses:
+    """The `keep` best of many rotations, each placed so that its rendered mattes' centre meets that of the real
+    ones."""
+    R = spread_rotations(rotations).to(center)
+    poses = Poses(R, center.expand(rotations, 3))
+    seen = body.render(poses, level.cameras, background)
+    centres = matte_centres(seen[..., 3].transpose(0, 1), level.cameras)
+    poses = Poses(R, center + center - centres)
+    cost = huber(body.render(poses, level.cameras, background) - level.target)[0].flatten(1).mean(-1)
+    return poses.take(cost.argsort()[:keep])
+
+
+class Registered(NamedTuple):
+    """A pose Q (3, 3), x_c (3,) [m], and the light (8,) that stayed while the body turned into it, None where it was not sought."""
+
+    rotation: Tensor
+    center: Tensor
+    light: Tensor | None
+
+
+RELIT = (0, 2)
+"""Iterations in which the light's part of the Jacobian is made: it changes little with the pose and the light."""
+
+
+def refine_lit(
+    body: RigidBody, level: Level, pose: Poses, before: Tensor, background: Tensor, *, iterations: int = 8, moves: bool = True
+) -> tuple[Poses, Tensor]:
+    """One pose and its light (8,), fitted together by Levenberg-Marquardt steps from the light `before`; moves: whether the pose is
+    fitted too, or known. body: with normals."""
+    best, trial, state, damping = (pose, before), (pose, before), None, torch.full((1,), 1e-3).to(before)
+    for i in range(iterations):
+        if i in RELIT:
+            columns = light_columns(body, level, *trial, background)
+        found = lit_equations(body, level, *trial, before, columns, background)
+        if state is None or found[0] < state[0]:
+            best, state, damping = trial, found, damping / 3
+        else:
+            damping = damping * 6
+        free = slice(0 if moves else 6, None)
+        step = torch.zeros(6 + LIGHT).to(before)
+        step[free] = damped(state[1][None, free], state[2][None, free, free], damping)[0]
+        trial = (best[0].moved(step[None, :3], step[None, 3:6] / body.radius), best[1] + step[6:])
+        if float(step[:6].norm()) < 2e-3 * level.pixel and float(step[6:].norm()) < 1e-3:
+            break
+    return best
+
+
+def light_of(
+    splats: Splats, normals: Tensor, pose: tuple[Tensor, Tensor], images: Tensor, mattes: Tensor, cameras: Cameras, *,
+    background: Tensor, rest_center: Tensor, before: Tensor | None = None,
+) -> Tensor:  # fmt: skip
+    """The light (8,) under which a body in a known pose (Q, x_c) looks as one frame shows it, from its colours at rest. normals:
+    (N, 3) at rest; before: (8,) what is known of the light; the rest as of `register_pose`."""
+    body = RigidBody.of(splats, rest_center, normals)
+    images, mattes, cameras = images[:, None].to(body.arm), mattes[:, None].to(body.arm), cameras.to(body.arm.device)
+    Q, center = (x.to(body.arm) for x in pose)
+    level = make_level(images, mattes, cameras, center, None)
+    before = torch.zeros(LIGHT).to(body.arm) if before is None else before.to(body.arm)
+    return refine_lit(body, level, Poses(Q[None], center[None]), before, background.to(body.arm), moves=False)[1]
+
+
+def register_pose(
+    splats: Splats,
+    images: Tensor,
+    mattes: Tensor,
+    cameras: Cameras,
+    *,
+    background: Tensor,
+    rest_center: Tensor,
+    normals: Tensor | None = None,
+    light: Tensor | None = None,
+    rotations: int = 600,
+    starts: int = 24,
+    coarse_views: int = 6,
+    seed: int = 0,
+) -> Registered:
+    """Rigid pose of a known body in one frame: Q (3, 3) and centre x_c (3,) [m], x = Q (X - X_c) + x_c.
+
+    splats: the body at rest; images: (V, H, W, 3) on `background` (3,); mattes: (V, H, W); rest_center: X_c (3,) [m]; normals:
+    (N, 3) of the splats at rest, None where the light is not to be told from the colours; light: (8,) what is known of it.
+    `rotations` are tried at about 28 px with at most `coarse_views` views, the best `starts` refined there, the best 3
+    at about 56 px, the best at full resolution with all views. Errors: DataError where fewer than two views see the
+    object.
+    """
+    middle = splats.means.detach().mean(0)  # about which the body turns while searching, wherever X_c is
+    body = RigidBody.of(splats, middle, normals)
+    background = background.to(body.arm)
+    images, mattes = images[:, None].to(body.arm), mattes[:, None].to(body.arm)
+    cameras = cameras.to(body.arm.device)
+    center = matte_centres(mattes, cameras)[0]
+    some = torch.linspace(0, len(cameras) - 1, min(coarse_views, len(cameras))).round().long().tolist()
+    thin = body.thinned(400, seed)
+    level = make_level(images[some], mattes[some], cameras.select(some), center, 28)
+    poses = coarse_poses(thin, level, center, background, rotations, starts)
+    for iterations, keep in ((4, max(3, starts // 3)), (6, 3)):
+        poses, cost = refine(thin, level, poses, background, iterations=iterations)
+        poses = poses.take(distinct(poses, cost, keep))
+    level = make_level(images[some], mattes[some], cameras.select(some), center, 56)
+    poses, cost = refine(body, level, poses, background, iterations=8)
+    best = poses.take(cost.argsort()[:1])
+    level, found = make_level(images, mattes, cameras, center, None), None
+    if normals is None:
+        best, _ = refine(body, level, best, background, iterations=8, central=True)
+    else:
+        before = torch.zeros(LIGHT).to(body.arm) if light is None else light.to(body.arm)
+        best, found = refine_lit(body, level, best, before, background)
+    Q = best.rotation[0]
+    return Registered(Q, best.center[0] + Q @ (rest_center.to(body.arm) - middle.to(body.arm)), found)
+
+
+def distinct(poses: Poses, cost: Tensor, count: int, *, degrees: float = 5.0) -> Tensor:
+    """Indices of the best poses that differ by more than `degrees` from every better one."""
+    chosen: list[int] = []
+    for k in cost.argsort().tolist():
+        apart = [(torch.trace(poses.rotation[k].T @ poses.rotation[j]) - 1) / 2 for j in chosen]
+        if all(float(c.clamp(-1, 1).acos()) > degrees * torch.pi / 180 for c in apart):
+            chosen.append(k)
+        if len(chosen) == count:
+            break
+    return torch.tensor(chosen, device=cost.device)
+
+
+def flight(pose: Poses, motion: Tensor, times: Tensor, gravity: Tensor) -> Poses:
+    """Poses at `times` (T,) [s] of free flight; motion: (12,) shift [m], angle [rad], velocity [m/s], angular
+    velocity [rad/s]."""
+    shift, angle, velocity, spin = motion.view(4, 3)
+    start = pose.moved(shift[None], angle[None])
+    t = times[:, None]
+    return Poses(rotation_exp(spin * t) @ start.rotation, start.center + velocity * t + 0.5 * gravity * t**2)
+
+
+def flight_jacobian(motion: Tensor, times: Tensor, radius: float) -> Tensor:
+    """Derivative (T, 6, 12) of the poses' parameters (shift, angle x radius) [m] with respect to `motion`."""
+    angle, spin = motion[3:6], motion[9:]
+    J = torch.zeros(len(times), 6, 12).to(motion)
+    eye = torch.eye(3).to(motion)
+    J[:, :3, :3] = eye
+    J[:, :3, 6:9] = times[:, None, None] * eye
+    J[:, 3:, 3:6] = radius * rotation_exp(spin * times[:, None]) @ left_jacobian(angle)
+    J[:, 3:, 9:] = radius * times[:, None, None] * left_jacobian(spin * times[:, None])
+    return J
+
+
+def initial_velocity(
+    splats: Splats,
+    pose: tuple[Tensor, Tensor],
+    images: Tensor,
+    mattes: Tensor,
+    cameras: Cameras,
+    *,
+    times: Tensor,
+    gravity: Tensor,
+    background: Tensor,
+    rest_center: Tensor,
+    exact: bool = True,
+) -> tuple[Tensor, Tensor]:
+    """Velocity (3,) [m/s] and angular velocity (3,) [rad/s, world axes] at the first of T >= 2 frames of free flight.
+
+    x_c(t) = x_c + v t + g t^2 / 2, R(t) = exp([omega]_x t) Q, with `pose` = (Q, x_c) at the first frame. images:
+    (V, T, H, W, 3); mattes: (V, T, H, W); times: (T,) [s]; gravity: (3,) [m/s^2]. All frames are fitted at once; a
+    small correction of the pose is fitted along and dropped, so that what offsets the first frame does not turn
+    into velocity. exact: at full resolution in the end; False: at about 40 px alone, a third of the time.
+    Errors: DataError for fewer than two frames or views.
+    """
+    if images.shape[1] < 2:
+        raise DataError(f"initial velocity: {images.shape[1]} frame of free flight, at least 2 are needed")
+    body = RigidBody.of(splats, rest_center)
+    background, gravity = background.to(body.arm), gravity.to(body.arm)
+    times = (times - times[0]).to(body.arm)
+    images, mattes, cameras = images.to(body.arm), mattes.to(body.arm), cameras.to(body.arm.device)
+    start = Poses(pose[0].to(body.arm)[None], pose[1].to(body.arm)[None])
+    centres = matte_centres(mattes, cameras)
+    fallen = centres - centres[0] - 0.5 * gravity * times[:, None] ** 2
+    motion = torch.zeros(12).to(body.arm)
+    motion[6:9] = (times @ fallen) / times.square().sum()
+    for target_px, iterations in ((40, 8), (None, 6))[: 2 if exact else 1]:
+        level = make_level(images, mattes, cameras, start.center[0], target_px)
+        last = target_px is None
+        motion = fit_flight(body, level, start, motion, times, gravity, background, iterations=iterations, central=last)
+    return motion[6:9], motion[9:]
+
+
+def fit_flight(
+    body: RigidBody,
+    level: Level,
+    start: Poses,
+    motion: Tensor,
+    times: Tensor,
+    gravity: Tensor,
+    background: Tensor,
+    *,
+    iterations: int,
+    central: bool,
+) -> Tensor:
+    """`motion` (12,) after damped Gauss-Newton steps over all frames of the level."""
+    frame = torch.arange(len(times), device=times.device)
+    damping = torch.full((1,), 1e-3).to(motion)
+    best, trial, state = motion, motion, None
+    for _ in range(iterations):
+        poses = flight(start, trial, times, gravity)
+        cost, gradient, matrix = normal_equations(body, level, poses, background, frame, central=central)
+        J = flight_jacobian(trial, times, body.radius)
+        new = (
+            cost.sum(),
+            (J.transpose(1, 2) @ gradient[..., None]).sum(0)[:, 0],
+            (J.transpose(1, 2) @ matrix @ J).sum(0),
+        )
+        if state is None or new[0] < state[0]:
+            best, state, damping = trial, new, damping / 3
+        else:
+            damping = damping * 6
+        step = damped(state[1][None], state[2][None], damping)[0]
+        trial = best + step
+        moved = torch.stack((step[:3].norm(), step[6:9].norm() * times[-1], step[9:].norm() * times[-1] * body.radius)).max()
+        if float(moved) < 2e-3 * level.pixel:
+            break
+    return best

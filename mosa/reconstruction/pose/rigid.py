@@ -1,0 +1,223 @@
+"""A rigid body of splats against images: rendering, image levels, and the normal equations of its pose.
+
+The residual is the rendered colour and matte minus the real ones; its Jacobian in the six parameters of a pose
+comes from rendered differences, so that twelve renderings replace a backward pass and Gauss-Newton converges in a
+few steps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from mosa.physics.rotations import skew
+from mosa.rendering.appearance.lighting import LIGHT, shading
+from mosa.rendering.cameras import crop_boxes, crop_cameras, crop_images, project
+from mosa.rendering.covariance import covariance_from
+from mosa.rendering.rasterizer import rasterize
+from mosa.types import Cameras, Splats
+
+HUBER = 0.15
+"""Residuals [colour] above count linearly: highlights and shading that do not turn with the body must not pull."""
+
+STEP_PX = 0.3
+"""Differences for the Jacobian move the body by this many pixels of the level's images."""
+
+PIXELS_AT_ONCE = 3_000_000
+"""Images are rendered in batches of at most this many pixels."""
+
+
+@dataclass(frozen=True)
+class Poses:
+    """K rigid poses. rotation: (K, 3, 3); center: (K, 3) [m]."""
+
+    rotation: Tensor
+    center: Tensor
+
+    def moved(self, shift: Tensor, angle: Tensor) -> Poses:
+        """Turned by the rotation vectors `angle` (K, 3) [rad] about the centre, in world axes, and shifted (K, 3)
+        [m]."""
+        return Poses(rotation_exp(angle) @ self.rotation, self.center + shift)
+
+    def take(self, index: Tensor) -> Poses:
+        return Poses(self.rotation[index], self.center[index])
+
+
+@dataclass(frozen=True)
+class Level:
+    """Images of one resolution, cut to the object. target: (T, V, H, W, 4) colour and matte of T frames.
+
+    pixel: what a pixel covers at the object [m].
+    """
+
+    target: Tensor
+    cameras: Cameras
+    pixel: float
+
+
+@dataclass(frozen=True)
+class RigidBody:
+    """Splats about their rest centre. arm: (N, 3) [m]; radius: root mean square distance from the centre [m]; normals: (N, 3) of
+    the surface at rest, where the light shall be told from the colours."""
+
+    arm: Tensor
+    covariances: Tensor
+    opacities: Tensor
+    colors: Tensor
+    radius: float
+    normals: Tensor | None = None
+
+    @staticmethod
+    def of(splats: Splats, rest_center: Tensor, normals: Tensor | None = None) -> RigidBody:
+        arm = splats.means.detach().float() - rest_center.to(splats.means).float()
+        covariances = covariance_from(splats.scales.detach().float(), splats.rotations.detach().float())
+        radius = float(arm.square().sum(-1).mean().sqrt())
+        return RigidBody(arm, covariances, splats.opacities.detach().float(), splats.colors.detach().float(), radius,
+                         None if normals is None else normals.to(arm))  # fmt: skip
+
+    def shaded(self, rotation: Tensor, light: Tensor) -> RigidBody:
+        """In the colours that it has turned by `rotation` (3, 3) under a light that stays (`lighting.py`)."""
+        return replace(self, colors=self.colors * shading(light, self.normals, rotation)[:, None])
+
+    def thinned(self, count: int, seed: int) -> RigidBody:
+        """About `count` of the splats, swollen so that they still cover the body."""
+        total = len(self.arm)
+        if total <= count:
+            return self
+        index = torch.randperm(total, generator=torch.Generator().manual_seed(seed))[:count].to(self.arm.device)
+        swell = (total / count) ** (2 / 3)
+        return RigidBody(
+            self.arm[index], swell * self.covariances[index], self.opacities[index], self.colors[index], self.radius,
+            None if self.normals is None else self.normals[index],
+        )  # fmt: skip
+
+    @torch.no_grad()
+    def render(self, poses: Poses, cameras: Cameras, background: Tensor) -> Tensor:
+        """Colour and alpha of every pose in every view, (K, V, H, W, 4)."""
+        views = len(cameras)
+        chunk = max(1, PIXELS_AT_ONCE // (views * cameras.width * cameras.height))
+        parts = []
+        for k in range(0, len(poses.center), chunk):
+            R, c = poses.rotation[k : k + chunk], poses.center[k : k + chunk]
+            means = self.arm @ R.transpose(1, 2) + c[:, None]
+            covariances = R[:, None] @ self.covariances @ R[:, None].transpose(-1, -2)
+            batch = replace(cameras, K=cameras.K.repeat(len(R), 1, 1), w2c=cameras.w2c.repeat(len(R), 1, 1))
+            index = torch.arange(len(R), device=c.device).repeat_interleave(views)
+            image, alpha = rasterize(means, covariances, self.opacities, self.colors[None], batch, index, background)
+            parts.append(torch.cat((image, alpha[..., None]), -1).unflatten(0, (len(R), views)))
+        return torch.cat(parts)
+
+
+def rotation_exp(vectors: Tensor) -> Tensor:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad]."""
+    return torch.linalg.matrix_exp(skew(vectors))
+
+
+def left_jacobian(v: Tensor) -> Tensor:
+    """J with exp(v + d) = exp(J d) exp(v) to first order in d, (..., 3, 3): integral of exp(s v) over s from 0 to
+    1."""
+    S = skew(v)
+    angle = v.norm(dim=-1)[..., None, None]
+    small = angle < 1e-4
+    safe = torch.where(small, torch.ones_like(angle), angle)
+    a = torch.where(small, 0.5 - angle**2 / 24, (1 - safe.cos()) / safe**2)
+    b = torch.where(small, 1 / 6 - angle**2 / 120, (safe - safe.sin()) / safe**3)
+    return torch.eye(3).to(S) + a * S + b * (S @ S)
+
+
+def make_level(images: Tensor, mattes: Tensor, cameras: Cameras, center: Tensor, target_px: float | None) -> Level:
+    """Images (V, T, H, W, 3) and mattes (V, T, H, W) cut to the object, its window reduced to about `target_px`
+    (None: kept)."""
+    margin = round(0.12 * max(crop_boxes(mattes, margin=0)[2:])) + 2
+    x0, y0, width, height = crop_boxes(mattes, margin=margin)
+    factor = 1 if target_px is None else max(1, round(max(width, height) / target_px))
+    x0, y0, width, height = crop_boxes(mattes, margin=margin, multiple=factor)
+    width, height = width - width % factor, height - height % factor
+    stack = torch.cat((images, mattes[..., None]), -1).float()
+    stack = crop_images(stack, x0, y0, width, height, axis=2)
+    views, frames = mattes.shape[:2]
+    if factor > 1:
+        flat = stack.flatten(0, 1).permute(0, 3, 1, 2)
+        stack = F.avg_pool2d(flat, factor).permute(0, 2, 3, 1).unflatten(0, (views, frames))
+    cut = crop_cameras(cameras, x0, y0, width, height)
+    K = cut.K.clone()
+    K[:, :2] /= factor
+    cut = replace(cut, K=K, width=width // factor, height=height // factor)
+    depth = project(center[None].to(cut.K), cut)[1].clamp(min=1e-3)
+    pixel = float((depth[:, 0] / cut.K[:, 0, 0]).median())
+    return Level(stack.transpose(0, 1).contiguous(), cut, pixel)
+
+
+def huber(residual: Tensor) -> tuple[Tensor, Tensor]:
+    """Cost and weight of residuals."""
+    size = residual.abs()
+    return torch.where(size < HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER)), HUBER / size.clamp(min=HUBER)
+
+
+def pose_columns(body: RigidBody, level: Level, poses: Poses, background: Tensor, *, central: bool) -> tuple[Tensor, Tensor]:
+    """What K poses look like, (K, P), and its derivative (K, 6, P) in their numbers: shift, then angle times the body's radius [m].
+
+    One-sided differences (`central` false) cost half and move the optimum a little: good enough on the way, not at the end."""
+    count, h = len(poses.center), STEP_PX * level.pixel
+    sides = (torch.zeros(1, 6), torch.eye(6), -torch.eye(6))[: 3 if central else 2]
+    steps = h * torch.cat(sides).to(poses.center)
+    shift, angle = steps[:, :3].repeat(count, 1), steps[:, 3:].repeat(count, 1) / body.radius
+    around = Poses(poses.rotation.repeat_interleave(len(steps), 0), poses.center.repeat_interleave(len(steps), 0))
+    seen = body.render(around.moved(shift, angle), level.cameras, background).view(count, len(steps), -1)
+    return seen[:, 0], (seen[:, 1:7] - seen[:, 7:]) / (2 * h) if central else (seen[:, 1:] - seen[:, :1]) / h
+
+
+def equations(residual: Tensor, columns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Cost (K,), gradient (K, D) and Gauss-Newton matrix (K, D, D) of residuals (K, P) with derivatives (K, D, P), each residual
+    weighted by Huber's rule."""
+    cost, weight = huber(residual)
+    weighted = columns * weight[:, None]
+    return cost.sum(-1), (weighted @ residual[..., None])[..., 0], weighted @ columns.transpose(1, 2)
+
+
+def normal_equations(
+    body: RigidBody, level: Level, poses: Poses, background: Tensor, frame: Tensor, *, central: bool = True
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`equations` of K poses against the frames (K,) of the level, in the numbers of `pose_columns`."""
+    seen, columns = pose_columns(body, level, poses, background, central=central)
+    return equations(seen - level.target[frame].flatten(1), columns)
+
+
+def damped(gradient: Tensor, matrix: Tensor, damping: Tensor) -> Tensor:
+    """Levenberg-Marquardt step (K, P); the ridge keeps a direction the images say nothing about at rest."""
+    diagonal = torch.diagonal(matrix, dim1=-2, dim2=-1)
+    ridge = damping[:, None] * diagonal + 1e-9 * diagonal.amax(-1, keepdim=True) + 1e-12
+    system = (matrix + torch.diag_embed(ridge)).double()
+    return -torch.linalg.solve(system, gradient.double()[..., None])[..., 0].to(gradient)
+
+
+LIGHT_STEP = 0.02
+"""Differences for the Jacobian change a number of the light by this."""
+LIGHT_RIDGE = 1e-3
+"""Of the mean of the light's own diagonal: what pulls it to the light that was known before. One pose hardly tells some of its
+numbers, and what they are then does not show."""
+
+
+def light_columns(body: RigidBody, level: Level, pose: Poses, light: Tensor, background: Tensor) -> Tensor:
+    """(8, P) derivative of the level's first frame in the numbers of the light, at one pose."""
+    frames = [body.shaded(pose.rotation[0], each).render(pose, level.cameras, background).flatten()
+              for each in (light, *(light + LIGHT_STEP * torch.eye(LIGHT).to(light)))]  # fmt: skip
+    return (torch.stack(frames[1:]) - frames[0]) / LIGHT_STEP
+
+
+def lit_equations(
+    body: RigidBody, level: Level, pose: Poses, light: Tensor, before: Tensor, columns: Tensor, background: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Cost (), gradient (14,) and Gauss-Newton matrix (14, 14) of one pose and a light (8,) against the level's first frame; the
+    pose's numbers as of `pose_columns`. before: (8,) what the ridge pulls to; columns: of `light_columns`, near by."""
+    # the colours turn with the light's own columns alone: a pose's columns know its geometry
+    seen, moved = pose_columns(body.shaded(pose.rotation[0], light), level, pose, background, central=True)
+    every = torch.cat((moved, columns[None]), 1)
+    cost, gradient, matrix = (found[0] for found in equations(seen - level.target[:1].flatten(1), every))
+    ridge = LIGHT_RIDGE * matrix.diagonal()[6:].mean()
+    matrix[6:, 6:] += ridge * torch.eye(LIGHT).to(light)
+    gradient[6:] += ridge * (light - before)
+    return cost + 0.5 * ridge * (light - before).square().sum(), gradient, matrix

@@ -1,0 +1,108 @@
+"""Where a sequence starts: pose of frame 0 and velocity of the frames before first contact, from images alone.
+
+The training sequence starts in the rest pose, every other in the pose that its first frame shows. The fit does not move them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from scipy.spatial.transform import Rotation
+
+from mosa.errors import DataError
+from mosa.physics.world import Start
+from mosa.reconstruction.pose.registration import initial_velocity, register_pose
+from mosa.reconstruction.rest_shape import RestShape
+from mosa.rendering.appearance.lighting import LIGHT, shading, surface_normals
+from mosa.rendering.appearance.spherical_harmonics import constant_coefficients
+from mosa.types import Appearance, Scene, Splats
+
+MOST_FRAMES = 6
+"""Frames of free flight that a velocity is fitted to at most: more take longer and say little more."""
+
+FINER = 2
+"""Splats for each particle up to which they are what a body is looked for by: with more, a start takes longer than the coarse body
+that is simulated from it is worth."""
+
+
+def splats_of(body: RestShape) -> Splats:
+    """The body's particles as (isotropic or not) splats with axes from their covariances."""
+    values, vectors = torch.linalg.eigh(body.covariances.double())
+    vectors = vectors * torch.linalg.det(vectors)[:, None, None]
+    quaternions = torch.as_tensor(Rotation.from_matrix(vectors.cpu().numpy()).as_quat(scalar_first=True))
+    return Splats(body.rest, values.clamp(min=0).sqrt().to(body.rest), quaternions.to(body.rest), body.opacities, body.colors)
+
+
+def lowest(body: RestShape, start: Start, scene: Scene, time: float) -> float:
+    """Height [m] above the ground of the lowest rest particle after `time` [s] of free flight."""
+    up, gravity = scene.up.to(body.rest), scene.gravity.to(body.rest)
+    spin = Rotation.from_rotvec((start.angular_velocity * time).cpu().numpy()).as_matrix()
+    R = torch.as_tensor(spin).to(body.rest) @ start.rotation.to(body.rest)
+    arm = (body.rest - body.center) @ R.T
+    center = start.center + start.velocity * time + 0.5 * gravity * time**2
+    return float(((arm + center) @ up).min()) - (scene.ground.height if scene.ground is not None else -torch.inf)
+
+
+def first_contact(body: RestShape, start: Start, scene: Scene) -> int:
+    """Index of the first frame after first contact: given by the scene, or where free flight would have touched the ground."""
+    if scene.last_free_frame is not None:
+        return min(scene.last_free_frame + 1, scene.frames - 1)
+    surface = 0.5 * float(body.volume.mean()) ** (1 / 3)  # particles lie half a spacing below the surface
+    for t, time in enumerate((scene.times - scene.times[0]).tolist()):
+        if t > 0 and lowest(body, start, scene, time) < surface:
+            return t
+    return scene.frames - 1
+
+
+def appearance_of(body: RestShape) -> Appearance:
+    """What a body is looked for by: the splats that it carries, which all training frames were fitted to; its particles where it
+    has no such splats or is far coarser than they are. With the normals of its surface."""
+    if body.splats is not None and len(body.splats) <= FINER * len(body.rest):
+        found = body.splats.appearance
+    else:
+        splats = splats_of(body)
+        found = Appearance(splats, constant_coefficients(splats.colors))
+    if found.light is None or not bool(found.light.any()):
+        found = replace(found, normals=surface_normals(found.splats.means, body.rest), light=found.splats.means.new_zeros(LIGHT))
+    return found
+
+
+def sequence_start(body: RestShape, appearance: Appearance, scene: Scene, *, register: bool) -> Start:
+    """Pose and velocity of `scene`. register: find the pose by rendering (held-out sequences), in the light that it shows; else the
+    rest shape's own. appearance: at rest, of `appearance_of`.
+
+    The free frames are found on the way: a rough velocity from the first two frames predicts the contact, the frames before it
+    give the final one. Where that one puts the contact earlier, into the frames it was fitted to, they are fewer: no velocity is
+    kept that frames after its own contact went into. Errors: DataError where contact comes before the second frame.
+    """
+    cameras = scene.training_cameras
+    images, mattes = scene.images[cameras], scene.mattes[cameras]
+    views = scene.cameras.select(cameras)
+    rotation, center, splats = torch.eye(3), body.center.cpu(), appearance.splats
+    if register:
+        rotation, center, light = register_pose(
+            splats, images[:, 0], mattes[:, 0], views, background=scene.background, rest_center=body.center,
+            normals=appearance.normals, light=appearance.light,
+        )  # fmt: skip
+        lit = shading(light, appearance.normals.to(light), rotation)
+        splats = replace(splats, colors=splats.colors * lit.to(splats.colors)[:, None])
+    start = Start(rotation.to(body.rest), center.to(body.rest), torch.zeros(3).to(body.rest), torch.zeros(3).to(body.rest))
+    count, most, exact = 2, MOST_FRAMES, False
+    while True:
+        velocity, spin = initial_velocity(splats, (rotation, center), images[:, :count], mattes[:, :count], views,
+                                          times=scene.times[:count], gravity=scene.gravity, background=scene.background,
+                                          rest_center=body.center, exact=exact)
+        start = Start(start.rotation, start.center, velocity.to(body.rest), spin.to(body.rest))
+        free = first_contact(body, start, scene)
+        if free < 2 and exact:
+            raise DataError(f"{scene.name}/{scene.sequence}: the object touches the ground before the second frame; at least two "
+                            "frames of free flight are needed (scene.frames, scene.last_free_frame)")
+        if not exact:
+            count, exact = max(2, min(free, most)), True
+            continue
+        if free < count:
+            most = count - 1  # so that the loop ends
+        elif count == min(free, most):
+            return start
+        count = min(free, most)

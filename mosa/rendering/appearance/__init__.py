@@ -1,0 +1,1 @@
+"""What a body looks like: its Gaussians, carried by its motion, in their light."""

@@ -1,0 +1,130 @@
+"""What a body looks like wherever its particles go: splats carried by their motion, or the particles themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from mosa.rendering.appearance.carrying import Binding, Carried, bind
+from mosa.rendering.appearance.lighting import LIGHT, shading
+from mosa.rendering.appearance.spherical_harmonics import camera_centers, colors_in, constant_coefficients, mean_colors
+from mosa.rendering.covariance import covariance_from
+from mosa.rendering.observer import deformed_covariances, repeat_cameras
+from mosa.rendering.rasterizer import rasterize
+from mosa.types import Appearance, Cameras, Splats
+
+COLORED = ("harmonics", "normals", "light")
+
+
+class CarriedSplats(nn.Module):
+    """M splats of a body of N particles, all at rest: the appearance (`types.Appearance`) and how it hangs on the particles. Its
+    buffers go along to a device and are no part of a state dictionary: a checkpoint keeps what `written` gives."""
+
+    def __init__(self, appearance: Appearance, particles: Tensor) -> None:
+        """particles: (N, 3) [m]. Errors: DataError for fewer than 8 particles."""
+        super().__init__()
+        splats = appearance.splats
+        self._keep({f.name: getattr(splats, f.name) for f in fields(Splats)} | {"harmonics": appearance.harmonics}, particles)
+        lit = appearance.light is not None and appearance.normals is not None
+        upright = torch.tensor([0.0, 0, 1]).expand_as(splats.means)
+        self._keep({"normals": appearance.normals if lit else upright, "light": appearance.light if lit else torch.zeros(LIGHT)},
+                   particles)
+        bound = bind(splats.means, particles)
+        self._keep({f"bound_{f.name}": getattr(bound, f.name) for f in fields(Binding) if f.name != "index"}, particles)
+        self.register_buffer("bound_index", bound.index.to(particles.device), persistent=False)
+
+    def _keep(self, tensors: Mapping[str, Tensor], like: Tensor) -> None:
+        for name, value in tensors.items():
+            self.register_buffer(name, value.detach().to(like), persistent=False)
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def appearance(self) -> Appearance:
+        return Appearance(Splats(*(getattr(self, f.name) for f in fields(Splats))), self.harmonics, self.normals, self.light)
+
+    @property
+    def binding(self) -> Binding:
+        return Binding(**{f.name: getattr(self, f"bound_{f.name}") for f in fields(Binding)})
+
+    def carry(self, positions: Tensor) -> Carried:
+        """Where the splats are and what the motion's gradient is there, with the particles at positions (T, N, 3) [m]."""
+        return self.binding.carry(positions)
+
+    def written(self) -> dict[str, Tensor]:
+        """Tensors on the CPU, fit for a checkpoint; `read` gives the same splats."""
+        names = (*(f.name for f in fields(Splats)), *COLORED)
+        return {name: getattr(self, name).detach().cpu().clone() for name in names}
+
+    @classmethod
+    def read(cls, written: Mapping[str, Any], particles: Tensor) -> CarriedSplats:
+        tensors = dict(written)
+        colored = {name: tensors.pop(name) for name in COLORED}
+        return cls(Appearance(Splats(**tensors), **colored), particles)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """M Gaussians over T frames. means: (T, M, 3) [m]; covariances: (T, M, 3, 3) [m^2]; opacities: (M,); harmonics: (M, K, 3) in
+    the axes of the rest shape; rotations: (T, M, 3, 3) from there, None where the colours are the same from everywhere; shades:
+    (T, M) factors of the colours, None where the light does not matter."""
+
+    means: Tensor
+    covariances: Tensor
+    opacities: Tensor
+    harmonics: Tensor
+    rotations: Tensor | None = None
+    shades: Tensor | None = None
+
+    def images(self, cameras: Cameras, background: Tensor) -> Tensor:
+        """(V, T, H, W, 3), in [0, 1] up to harmonics that are brighter than white. One camera at a time, which bounds memory."""
+        frames = len(self.means)
+        index, found = torch.arange(frames, device=self.means.device), []
+        for v in range(len(cameras)):
+            camera = cameras.select([v])
+            if self.rotations is None:
+                colors = colors_in(self.harmonics, torch.ones_like(self.means[:1]))
+            else:
+                lines = self.means - camera_centers(camera).to(self.means)
+                colors = colors_in(self.harmonics, (lines[..., None, :] @ self.rotations)[..., 0, :])  # R^T d
+            if self.shades is not None:
+                colors = colors * self.shades[..., None]
+            found.append(rasterize(self.means, self.covariances, self.opacities, colors, repeat_cameras(camera, frames), index,
+                                   background)[0])
+        return torch.stack(found)
+
+    def colors(self) -> Tensor:
+        """(T, M, 3) in [0, 1], averaged over all directions, in each frame's light."""
+        constant = mean_colors(self.harmonics)
+        shades = self.means.new_ones(self.means.shape[:2]) if self.shades is None else self.shades
+        return (constant * shades[..., None]).clamp(0, 1)
+
+
+class HasAppearance(Protocol):
+    """A body (`body.py`), or one that is only shown (`shown_body.py`). splats: None where particles are what is seen of it;
+    covariances: (N, 3, 3) [m^2], opacities: (N,), colors: (N, 3) of its particles."""
+
+    splats: CarriedSplats | None
+    covariances: Tensor
+    opacities: Tensor
+    colors: Tensor
+
+
+def seen(body: HasAppearance, positions: Tensor, F_tot: Tensor | None) -> Seen:
+    """The body's splats where its particles are at positions (T, N, 3) [m]; where it has none the particles, deformed by F_tot
+    (T, N, 3, 3), which splats do not need."""
+    splats = body.splats
+    if splats is None:
+        if F_tot is None:
+            raise ValueError("seen: a body without splats needs F_tot")
+        return Seen(positions, deformed_covariances(F_tot, body.covariances), body.opacities, constant_coefficients(body.colors))
+    carried = splats.carry(positions)
+    shapes = carried.covariances(covariance_from(splats.scales, splats.rotations))
+    turns = carried.rotations if splats.harmonics.shape[1] > 1 else None
+    shades = shading(splats.light, splats.normals, carried.rotations) if bool(splats.light.any()) else None
+    return Seen(carried.means, shapes, splats.opacities, splats.harmonics, turns, shades)

@@ -1,0 +1,42 @@
+"""Light that stays where it is while a body turns: one factor for a surface's colours, by where its normal points.
+
+What a distant light of any shape makes of a matt surface is, to about a hundredth, a function of the normal in nine spherical
+harmonics (Ramamoorthi and Hanrahan 2001). Of these only differences show against the first frame, whose light the colours already
+have: a splat of normal n, turned by R, is exp(sum_k l_k (Y_k(R n) - Y_k(n))) times as bright, with the eight l_k of degree 1 and 2
+for the whole scene. Shadows and a light's own colour are not in it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from mosa.rendering.appearance.spherical_harmonics import basis
+
+LIGHT = 8
+"""Numbers of a light: the harmonics of degree 1 and 2."""
+
+
+def surface_normals(points: Tensor, particles: Tensor, *, neighbours: int = 24) -> Tensor:
+    """Outward unit normals (M, 3) at points (M, 3) [m] on or near the surface of what particles (N, 3) [m] fill: away from the
+    weighted mean of the nearest, with w = 1 - r^2 / r_max^2; along z where that is nowhere else."""
+    P, X = particles.detach().cpu().double(), points.detach().cpu().double()
+    distance, index = cKDTree(P.numpy()).query(X.numpy(), k=np.arange(1, min(neighbours, len(P)) + 1))
+    share = 1 - (torch.as_tensor(distance) / torch.as_tensor(distance[:, -1:]).clamp(min=1e-12)).square()
+    away = (share[..., None] * (X[:, None] - P[torch.as_tensor(index)])).sum(1)
+    length = away.norm(dim=1, keepdim=True)
+    away = torch.where(length > 1e-9, away / length.clamp(min=1e-9), away.new_tensor([0.0, 0, 1]))
+    return away.to(points)
+
+
+def turned_basis(normals: Tensor, rotations: Tensor) -> Tensor:
+    """Y_k(R n) - Y_k(n), (..., M, LIGHT), of normals (M, 3) and rotations (..., M, 3, 3)."""
+    turned = (rotations @ normals[..., None])[..., 0]
+    return (basis(turned, 2) - basis(normals, 2))[..., 1:]
+
+
+def shading(light: Tensor, normals: Tensor, rotations: Tensor) -> Tensor:
+    """Factors (..., M) of the colours of splats with normals (M, 3) at rest, turned by (..., M, 3, 3). light: (LIGHT,)."""
+    return (turned_basis(normals, rotations) @ light).exp()

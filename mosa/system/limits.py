@@ -1,0 +1,49 @@
+"""What this machine can hold: sizes that a file or a key asks for are compared with it before memory is asked for."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+import torch
+
+from mosa.errors import ConfigError, MosaError
+from mosa.system.refused import lacks_memory
+
+CGROUP = Path("/sys/fs/cgroup/memory.max")
+
+
+def machine_memory() -> int:
+    """Bytes of memory of this machine, or of its container where that has a limit."""
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    try:
+        limit = CGROUP.read_text().strip()
+    except OSError:
+        return total
+    return min(total, int(limit)) if limit.isdigit() else total
+
+
+def counted(where: str, sizes: Iterable[float], remedy: str, *, each: float = 8, most: float = math.inf,
+            error: type[MosaError] = ConfigError) -> tuple[int, ...]:  # fmt: skip
+    """Sizes (whole numbers) of an array that is about to be allocated. Their product is compared in floating point, before they
+    become integers, which would wrap. It may be `most`, and as many of `each` bytes as fill half of the memory. Errors: `error`."""
+    sizes, most = [min(n, 10**300) if isinstance(n, int) else float(n) for n in sizes], min(most, machine_memory() / (2 * each))
+    if not math.prod(map(float, sizes)) <= most:  # as NaN is not
+        raise error(f"{where}: expected at most {int(most)}, found {' x '.join(f'{n:.6g}' for n in sizes)}: {remedy}")
+    return tuple(map(int, sizes))
+
+
+def named_device(name: str | torch.device) -> str:
+    """The name of a device that torch can use here. Errors: ConfigError."""
+    wanted = "device: expected cpu, or cuda on a machine with a GPU, found"
+    if not isinstance(name, (str, torch.device)) or (str(name) != "cpu" and str(name).split(":")[0] != "cuda"):
+        raise ConfigError(f"{wanted} {name!r}")
+    try:
+        torch.empty(0, device=name)
+    except (RuntimeError, AssertionError) as error:  # AssertionError: torch without CUDA
+        if lacks_memory(error):
+            raise
+        raise ConfigError(f"{wanted} {str(name)!r} ({str(error).splitlines()[0]})") from error
+    return str(name)

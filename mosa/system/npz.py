@@ -1,0 +1,52 @@
+"""npz files of a run: written whole or not at all, and read with their sizes checked before memory is asked for."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from mosa.errors import DataError
+from mosa.system.limits import counted
+from mosa.system.whole_files import written_whole
+
+HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+
+
+def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """The arrays, compressed: beside the target first, so that a full disk or a kill leaves no half file under its name."""
+    with written_whole(path) as partial, open(partial, "wb") as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]  # numpy declares allow_pickle beside them
+
+
+def read_npz(path: Path) -> dict[str, np.ndarray]:
+    """Numbers by name. Errors: DataError naming the file: damaged, of objects, or larger than it says."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+            counted(f"{path}: bytes", [sum(entry.file_size for entry in entries)], "more than is read", each=1, error=DataError)
+            for entry in entries:
+                check_entry(archive, entry, path)
+        with np.load(path, allow_pickle=False) as stored:
+            return {key: stored[key] for key in stored.files}
+    except DataError:
+        raise
+    except Exception as error:  # whatever zip, zlib and numpy find: the file is not what its name says
+        raise DataError(f"{path}: expected a readable npz file, found a damaged one ({type(error).__name__}: {error})") from error
+
+
+def check_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path) -> None:
+    """An array has as many bytes as its header says: numpy would believe the header, and ask for that much. Errors: DataError."""
+    with archive.open(entry) as file:
+        version = np.lib.format.read_magic(file)
+        if version not in HEADERS:
+            raise DataError(f"{path}: {entry.filename}: expected an array of numbers, found one of version {version}")
+        shape, _, dtype = HEADERS[version](file)
+        if dtype.kind not in "fiub":
+            raise DataError(f"{path}: {entry.filename}: expected numbers, found {dtype}: nothing else is read")
+        if min(shape, default=1) < 0 or file.tell() + math.prod(shape) * dtype.itemsize != entry.file_size:
+            raise DataError(f"{path}: {entry.filename}: expected as many numbers as are stored, found a header of shape {shape} "
+                            f"over {entry.file_size} bytes")

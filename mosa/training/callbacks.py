@@ -1,0 +1,174 @@
+"""What accompanies a fit: atomic checkpoints after every step, progress and notes on the stages, rates and times, image strips."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import math
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from lightning.pytorch.callbacks import Checkpoint
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+from torch import Tensor
+
+from mosa.modules.fitting.stages import Stage
+from mosa.system.progress import tqdm
+from mosa.training.loggers import PICTURED, add_picture
+
+log = logging.getLogger(__name__)
+
+
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Writes beside the target, flushes to the disk and renames: a run killed while it saves leaves the last checkpoint whole."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(path.name + ".partial")
+        try:
+            with open(partial, "wb") as file:
+                torch.save(checkpoint, file)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(partial, path)
+        except RuntimeError as error:  # what torch makes of a disk that is full
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
+        finally:
+            partial.unlink(missing_ok=True)
+
+
+class KeepLast(Checkpoint):
+    """Saves `last.ckpt` after every step, so that an interruption costs no more than that."""
+
+    def __init__(self, folder: str | Path | None = None) -> None:
+        """folder: of the file; None: checkpoints/ in the trainer's default_root_dir."""
+        self.folder = folder
+
+    def setup(self, trainer: L.Trainer, module: Any, stage: str) -> None:
+        root = Path(trainer.default_root_dir)
+        self.path = (root / "checkpoints" if self.folder is None else Path(self.folder)) / "last.ckpt"
+
+    def on_fit_start(self, trainer: L.Trainer, module: Any) -> None:
+        """The figures of an earlier run in this folder go: they would say that this one is complete."""
+        (Path(trainer.default_root_dir) / "metrics.json").unlink(missing_ok=True)
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+        """Within an epoch; at its end, and at that of a stage, the next hook saves what the next epoch begins with."""
+        if not (trainer.fit_loop.epoch_loop.batch_progress.is_last_batch or module.stage_over):
+            trainer.save_checkpoint(self.path)
+
+    def on_train_epoch_end(self, trainer: L.Trainer, module: Any) -> None:
+        trainer.save_checkpoint(self.path)
+
+
+class FitProgress(L.Callback):
+    """One tqdm bar per stage with loss and parameters."""
+
+    def __init__(self) -> None:
+        self.bar: tqdm | None = None
+        self.shown: int | None = None  # number of the stage
+
+    def on_train_batch_start(self, trainer: L.Trainer, module: Any, batch: Any, batch_idx: int) -> None:
+        if module.stage is not None and self.shown != module.stage_index:
+            self._close()
+            self.shown = module.stage_index
+            self.bar = tqdm(total=module.stage.iterations, initial=len(module.losses), desc=f"fit {module.stage.name}", unit="it",
+                            dynamic_ncols=True, mininterval=2.0)
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+        if self.bar is not None:
+            self.bar.set_postfix(figures_of(module.last), refresh=False)
+            self.bar.update()
+
+    def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
+        self._close()
+
+    def on_exception(self, trainer: L.Trainer, module: Any, exception: BaseException) -> None:
+        self._close()
+
+    def _close(self) -> None:
+        if self.bar is not None:
+            self.bar.close()
+            self.bar = None
+
+
+def figures_of(last: dict[str, float]) -> dict[str, str]:
+    """Loss and parameters of the last step, as they are shown."""
+    found = {"loss": f"{last['loss/total']:.5f}"} if "loss/total" in last else {}
+    return found | {k.removeprefix("id/"): f"{v:.4g}" for k, v in last.items() if k.startswith("id/")}
+
+
+class StageNotes(L.Callback):
+    """A line in the run's log when a stage begins, and one with its figures when it ends."""
+
+    def __init__(self) -> None:
+        self.stage: Stage | None = None
+        self.began, self.steps = 0.0, 0
+
+    def on_train_batch_start(self, trainer: L.Trainer, module: Any, batch: Any, batch_idx: int) -> None:
+        if self.stage is not None and module.stage is not self.stage:  # ended by a callback
+            self._note(module)
+        if module.stage is not None and self.stage is None:
+            self.stage, self.began, self.steps = module.stage, time.perf_counter(), 0
+            done = f", going on after {len(module.losses)}" if module.losses else ""
+            log.info("stage %s: at most %d steps%s", self.stage.name, self.stage.iterations, done)
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+        self.steps += 1
+        if self.stage is not None and module.stage_over:
+            self._note(module)
+
+    def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
+        self._note(module)
+
+    def _note(self, module: Any) -> None:
+        if self.stage is None:
+            return
+        figures = ", ".join(f"{name} {value}" for name, value in figures_of(module.last).items())
+        log.info("stage %s: ended after %d steps, %.1f s: %s", self.stage.name, self.steps, time.perf_counter() - self.began,
+                 figures)  # fmt: skip
+        self.stage = None
+
+
+class Pace(L.Callback):
+    """Logs what a step took (`time/step_s`) and the learning rate of each group of parameters in it (`lr/<group>`). Gauss-Newton
+    has no rates."""
+
+    def __init__(self) -> None:
+        self.began, self.rates = 0.0, dict[str, float]()
+
+    def on_train_batch_start(self, trainer: L.Trainer, module: Any, batch: Any, batch_idx: int) -> None:
+        self.began = time.perf_counter()
+        self.rates = {} if module.stage is None or module.stage.newton else {
+            f"lr/{group['name']}": group["lr"] for optimizer in trainer.optimizers for group in optimizer.param_groups}
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+        values = {"time/step_s": time.perf_counter() - self.began} | self.rates
+        module.log_dict({k: torch.tensor(v, dtype=torch.float32) for k, v in values.items()}, on_step=True, on_epoch=False)
+
+
+class ImageStrips(L.Callback):
+    """Adds a strip of real (above) and rendered (below) frames to the loggers every `every` iterations."""
+
+    def __init__(self, every: int) -> None:
+        self.every = every
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+        shown = [each for each in module.loggers if isinstance(each, PICTURED)]
+        if shown and self.every > 0 and module.steps_done % self.every == 0:
+            add_picture(shown, "real_above_rendered_below", enlarged(module.strip()), module.steps_done)
+
+
+LEGIBLE = 320
+"""Height [px] that a strip of two rows has at least: windows around an object are often 60 px high."""
+
+
+def enlarged(picture: Tensor) -> Tensor:
+    """A picture (3, H, W) in [0, 1] whose pixels are repeated until it is `LEGIBLE` high."""
+    times = max(1, math.ceil(LEGIBLE / picture.shape[1]))
+    return picture.repeat_interleave(times, 1).repeat_interleave(times, 2)

@@ -1,0 +1,76 @@
+"""What the curves of a fit are: the tags that loggers get, each with its unit and a sentence.
+
+TensorBoard shows them beside the curves (`mosa.training.loggers`), and docs/figures.md has the table that `table` makes of them."""
+
+from __future__ import annotations
+
+import re
+from typing import NamedTuple
+
+from mosa.modules.body.material import unit_of
+
+
+class Curve(NamedTuple):
+    """tag: with <...> for what differs; unit: `-` for a number without one; what: a sentence without it."""
+
+    tag: str
+    unit: str
+    what: str
+
+
+CURVES = (
+    Curve("loss/total", "-", "what the step descends: the sum of all weighted terms, mean over the training sequences; of "
+          "Gauss-Newton its cost, minus the logarithm of the posterior, after the step (of several drops the first four count a "
+          "part of the data, and less)"),
+    Curve("loss_raw/<term>", "-", "a term of the loss (`mosa/modules/fitting/losses.py`) before its weight"),
+    Curve("loss_weighted/<term>", "-", "a term of the loss times its weight in `losses`"),
+    Curve("id/contact_offset", "m", "height above the ground at which the grid stops the body, after the step"),
+    Curve("id/<p>", "SI, degrees", "parameter p after the step, without eta"),
+    Curve("adapter/mean_abs_C", "-", "mean of |C| in the step, once the adapter is fitted"),
+    Curve("gradient_norm/<group>", "-", "norm of the gradient of a group of parameters; those of networks before they are clipped"),
+    Curve("lr/<group>", "-", "Adam: learning rate of the group in the step"),
+    Curve("time/step_s", "s", "wall time of the step"),
+    Curve("fit/stage", "-", "0, 1, 2: prior, prior_eta, joint, without those that the run leaves out"),
+    Curve("fit/frames", "-", "frames that the step simulated: the first stage begins with those around first contact"),
+    Curve("fit/inverted", "-", "particles with det F <= 0, counted in every frame"),
+    Curve("fit/distance_m", "m", "Gauss-Newton: mean distance of free rollouts from the motion cues after frame 0, after the step"),
+    Curve("newton/share", "-", "Gauss-Newton: the way that an iteration's steps went, over the length of its first; 0 where none "
+          "improved the cost"),
+    Curve("newton/length", "-", "Gauss-Newton: length of an iteration's first step, in standard deviations of the posterior"),
+    Curve("newton/sd/<block>", "-", "Gauss-Newton: mean prior standard deviation of the numbers of a kind, as the evidence has it "
+          "now"),
+    Curve("epoch", "-", "how many steps the fit had made before this one, as Lightning counts them"),
+    Curve("final/<figure>", "as above", "figure of `metrics.json`, once, beside the configuration (TensorBoard: the tab HPARAMS)"),
+)  # fmt: skip
+
+
+def table() -> str:
+    """The curves in Markdown, as docs/figures.md has them."""
+    rows = [f"| `{curve.tag}` | {curve.unit} | {curve.what.replace('|', chr(92) + '|')} |" for curve in CURVES]
+    return "\n".join(["| tag | unit | what |", "|---|---|---|", *rows])
+
+
+def described(tag: str, law: str) -> str | None:
+    """What a logged tag is, with its unit; None for one that the table does not have. law: of the prior, which says what its
+    parameters are measured in. Errors: ConfigError for an unknown law."""
+    for curve in CURVES:
+        if re.fullmatch(re.sub(r"<\w+>", ".+", curve.tag), tag):
+            unit = unit_in(tag, law) if "<" in curve.tag else curve.unit
+            name = tag.partition("/")[2]
+            named = curve.what.replace("parameter p ", f"parameter {name} ").replace("figure of ", f"figure {name} of ")
+            return named if unit in ("", "-") else f"{named} [{unit}]"
+    return None
+
+
+FIGURES = {r".*_relative_error|.*_ratio": "", r".*_m": "m", r".*/psnr_\w+": "dB", r".*_deg": "degrees", r".*/v0_[xyz]": "m/s",
+           r".*/omega0_[xyz]": "rad/s"}  # fmt: skip
+"""Units of figures that are no parameters, by patterns of their names."""
+
+
+def unit_in(tag: str, law: str) -> str:
+    """Of a tag with a name in it: a parameter's, or a figure's; empty for none."""
+    for pattern, unit in FIGURES.items():
+        if re.fullmatch(pattern, tag):
+            return unit
+    kind, _, name = tag.removeprefix("final/").partition("/")
+    return unit_of(law, name) if law and kind in ("id", "id_prior") else ""

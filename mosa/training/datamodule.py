@@ -1,0 +1,269 @@
+"""The data of a scene under Lightning: films, reconstruction, starts, and batches of frames with their motion cues.
+
+    from mosa import SceneDataModule
+
+    data = SceneDataModule("rabbit")
+    data.prepare_data()                             # makes or finds the films
+    data.setup("fit")                               # checks, reconstructs (cached) and finds the starts
+    batch = next(iter(data.train_dataloader()))     # some views of every frame, with their cues
+
+It stands alone; `LitMosa` asks it for the particles that a body is made of.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from omegaconf import DictConfig
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+from mosa.config.build import plain, run_config
+from mosa.data.batches import Epochs, MotionBatch, SequenceBatch, ViewSchedule
+from mosa.data.observations import Observations, cropped, training_observations
+from mosa.data.sequences import load_sequences, taught_names
+from mosa.data.synthetic.films import default_cache
+from mosa.evaluation.evaluate import Sequence as EvaluatedSequence
+from mosa.evaluation.evaluate import sequences
+from mosa.modules.fitting.training_sequences import Take
+from mosa.physics.world import Start
+from mosa.reconstruction.motion.moved import SecondLook
+from mosa.reconstruction.pipeline import follow, reconstruct, spacing_for, stored
+from mosa.reconstruction.pose.starts import appearance_of, first_contact, sequence_start
+from mosa.reconstruction.resolution import grid_spacing
+from mosa.reconstruction.rest_shape import RestShape
+from mosa.reconstruction.settings import ReconstructionSettings, build_settings
+from mosa.system.progress import tqdm
+from mosa.training.run_folder import most_particles
+from mosa.types import MotionCues, Reconstruction, Scene
+
+
+def unchanged(batch: Any) -> Any:
+    """Batches are made whole: nothing is collated."""
+    return batch
+
+
+def served(batches: Any) -> DataLoader[Any]:
+    """Batches that are made whole, one after another. batches: an iterable data set, or a sequence."""
+    return DataLoader(batches, batch_size=None, collate_fn=unchanged)
+
+
+class SceneDataModule(L.LightningDataModule):
+    """One scene: the sequence that is reconstructed and learned from, further ones of the same object (`scene.also_train`), and
+    those that are held out.
+
+    Batches: train_dataloader has `MotionBatch` (some views of all frames that may be read), one epoch a pass over the views;
+    val_dataloader the held-out cameras and the held-out frames of the training sequence, where there are any; test_dataloader the
+    held-out sequences (`evaluation.Sequence`); predict_dataloader new starts in the words of `Twin.simulate`.
+    """
+
+    def __init__(
+        self,
+        scene: str | Mapping[str, Any] | DictConfig = "rabbit",
+        *overrides: str,
+        device: torch.device | str | None = None,
+        held_out: bool = True,
+        predict: Sequence[Mapping[str, Any]] = (),
+    ) -> None:
+        """scene: a name of conf/scene, or a whole configuration (`mosa.compose`); overrides: as on the command line, beside a name.
+
+        device: where reconstruction and targets are; None: the trainer's. held_out: whether to load sequences that nothing is
+        learned from. predict: starts of predict_dataloader; none: those of all sequences. Errors, here or where a part is asked
+        for: ConfigError naming the key, DataError naming the file."""
+        super().__init__()
+        from mosa.config.composition import composed
+
+        self.cfg = composed(scene, overrides)
+        self.device, self.held_out, self.predict = device, held_out, list(predict)
+
+    # ---------------------------------------------------------------- Lightning's hooks
+    def prepare_data(self) -> None:
+        """Makes the films of a built-in scene where they are not in the cache, or reads those of a folder. Nothing is kept."""
+        load_sequences(plain(self.cfg.scene))
+
+    def setup(self, stage: str) -> None:
+        """Loads the films, reconstructs and finds the starts, each once. stage: fit | validate | test | predict."""
+        if self.device is None:
+            self.device = "cpu" if self.trainer is None else self.trainer.strategy.root_device
+        _ = self.starts
+        if stage in ("fit", "validate"):
+            _ = self.epochs
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        """Batches of one epoch each time it is iterated over (`Epochs`)."""
+        return served(self.epochs)
+
+    def val_dataloader(self) -> DataLoader[Any]:
+        """Of the training sequence: held-out cameras in the frames that are learned from, and all cameras in the held-out frames.
+        Empty where nothing is held out."""
+        return served(self.held_back)
+
+    def test_dataloader(self) -> DataLoader[Any]:
+        """The held-out sequences."""
+        return served([s for s in self.sequences if s.prefix.startswith("test")])
+
+    def predict_dataloader(self) -> DataLoader[Any]:
+        """Keyword arguments of `Twin.simulate`, one mapping a start."""
+        given = self.predict or [
+            {"rotation": s.start.rotation, "position": s.start.center, "velocity": s.start.velocity,
+             "angular_velocity": s.start.angular_velocity, "frames": s.scene.frames} for s in self.sequences
+        ]  # fmt: skip
+        return served(given)
+
+    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
+        """Sequences and starts stay where they are: what of them is needed on the device is brought there where it is needed."""
+        return batch.to(device) if isinstance(batch, MotionBatch) else batch
+
+    # ---------------------------------------------------------------- films
+    @cached_property
+    def taught(self) -> list[str]:
+        """Names of the sequences beside the training one that are learned from."""
+        return taught_names(plain(self.cfg.scene))
+
+    @cached_property
+    def scenes(self) -> tuple[Scene, list[Scene]]:
+        """The training sequence and the others of the same object."""
+        training, others = load_sequences(plain(self.cfg.scene))
+        return training, [s for s in others if self.held_out or s.sequence in self.taught]
+
+    @property
+    def scene(self) -> Scene:
+        """The training sequence."""
+        return self.scenes[0]
+
+    # ---------------------------------------------------------------- reconstruction
+    @property
+    def cache(self) -> Path:
+        """Folder of cached reconstructions: scene.cache, or mosa/ in the user's cache folder."""
+        return Path(self.cfg.scene.cache) if self.cfg.scene.get("cache") else default_cache()
+
+    @property
+    def reconstruction_settings(self) -> ReconstructionSettings:
+        return build_settings(**plain(self.cfg.reconstruction))
+
+    @cached_property
+    def spacing(self) -> float:
+        """Of the particles [m]."""
+        settings = self.cfg.simulation
+        dx, particles, per_cell = settings.dx, settings.particles, settings.particles_per_cell
+        if dx is not None:
+            return float(dx / grid_spacing(1.0, per_cell))
+        return spacing_for(self.scene, None if particles == "auto" else particles, self.reconstruction_settings, per_cell=per_cell,
+                           most=most_particles(self.device or "cpu"), cache_dir=self.cache, device=self.device or "cpu")
+
+    @property
+    def dx(self) -> float:
+        """Grid spacing [m]."""
+        return grid_spacing(self.spacing, self.cfg.simulation.particles_per_cell)
+
+    def reconstructed(self) -> bool:
+        """Whether the training sequence's reconstruction lies in the cache."""
+        return stored(self.scene, lambda: self.spacing, self.reconstruction_settings, cache_dir=self.cache, seed=self.cfg.seed)
+
+    @cached_property
+    def reconstruction(self) -> Reconstruction:
+        """Of the training sequence."""
+        return reconstruct(self.scene, settings=self.reconstruction_settings, spacing=self.spacing, cache_dir=self.cache,
+                           seed=self.cfg.seed, device=self.device or "cpu")
+
+    @cached_property
+    def shape(self) -> RestShape:
+        """The particles of the body, on the device."""
+        shown = plain(self.cfg.rendering).get("appearance", "splats") == "splats"
+        return RestShape.of(self.reconstruction, self.device or "cpu", with_splats=shown)
+
+    def followed(self, scene: Scene) -> Reconstruction:
+        """Reconstruction of another sequence of the body that was found in the training one."""
+        start = self.starts[f"train/{scene.sequence}"]
+        return follow(scene, self.scene, self.reconstruction, rotation=start.rotation, center=start.center,
+                      rest_center=self.shape.center, settings=self.reconstruction_settings, cache_dir=self.cache,
+                      seed=self.cfg.seed, device=self.device or "cpu")
+
+    # ---------------------------------------------------------------- starts
+    @cached_property
+    def starts(self) -> dict[str, Start]:
+        """Initial states by prefix, from images alone: pose of frame 0, velocity of the frames before contact.
+
+        Prefixes: train, then train/<name> for the sequences that are learned from, test/<name> for the rest, in their order."""
+        shape, (training, others) = self.shape, self.scenes
+        seen = appearance_of(shape)
+        found = {"train": sequence_start(shape, seen, training, register=False)}
+        for scene in tqdm(others, "poses of the other sequences", leave=False):
+            prefix = f"{'train' if scene.sequence in self.taught else 'test'}/{scene.sequence}"
+            found[prefix] = sequence_start(shape, seen, scene, register=True)
+        return found
+
+    @property
+    def sequences(self) -> list[EvaluatedSequence]:
+        """What a run is evaluated on: every sequence with its start."""
+        return sequences(self.shape, *self.scenes, self.starts)
+
+    @property
+    def measured(self) -> dict[str, Any]:
+        """What a checkpoint keeps of the data, beside the configuration: world, density, spacing, starts."""
+        found = run_config(plain(self.cfg), self.scene, self.dx)
+        return found | {"starts": {prefix: start.written() for prefix, start in self.starts.items()}}
+
+    # ---------------------------------------------------------------- what a fit reads
+    @cached_property
+    def takes(self) -> list[Take]:
+        """The sequences that are learned from, the training one first."""
+        seen = [("train", self.scene, self.reconstruction)]
+        seen += [(f"train/{s.sequence}", s, self.followed(s)) for s in self.scenes[1] if s.sequence in self.taught]
+        return [self.take(scene, self.starts[prefix], found) for prefix, scene, found in seen]
+
+    def take(self, scene: Scene, start: Start, reconstruction: Reconstruction) -> Take:
+        """What the fit reads of one sequence, on the device."""
+        device, frames = self.device or "cpu", len(scene.training_frames)
+        return Take(
+            start, training_observations(scene, reconstruction, margin=self.cfg.rendering.margin, device=device),
+            reconstruction.cues.first(frames).to(device), float(scene.times[1] - scene.times[0]),
+            first_contact(self.shape, start, scene), self.second_look(scene, reconstruction), scene.sequence,
+            self.further_cues(scene, reconstruction),
+        )  # fmt: skip
+
+    def second_look(self, scene: Scene, reconstruction: Reconstruction) -> SecondLook | None:
+        """Finds the cues of a sequence about a prediction, where reconstruction.informed asks for it."""
+        settings = self.reconstruction_settings
+        if not settings.looks_again:
+            return None
+        return SecondLook(scene, reconstruction, settings, self.cfg.seed, self.device or "cpu")
+
+    def further_cues(self, scene: Scene, reconstruction: Reconstruction) -> dict[str, Tensor]:
+        """Tensors by name that batches carry as `extra`, for loss terms of one's own, frames first. A subclass returns them."""
+        return {}
+
+    @cached_property
+    def epochs(self) -> Epochs:
+        """The batches of training; the fit says before each epoch what it is."""
+        views = len(self.takes[0].observations.cameras)
+        return Epochs(ViewSchedule(views, self.cfg.fit.views, self.cfg.seed), self.batch)
+
+    def batch(self, views: Sequence[int]) -> MotionBatch:
+        """These views of all sequences that are learned from, in all frames that may be read."""
+        return MotionBatch(sequences=tuple(self.sequence_batch(i, take, views) for i, take in enumerate(self.takes)))
+
+    def sequence_batch(self, index: int, take: Take, views: Sequence[int]) -> SequenceBatch:
+        chosen = [view % len(take.observations.cameras) for view in views]
+        frames = list(range(len(take.cues.positions)))
+        return SequenceBatch(name=take.name, index=index, views=chosen, frames=frames,
+                             observations=take.observations.select(chosen), cues=take.cues, extra=dict(take.extra))
+
+    @cached_property
+    def held_back(self) -> list[MotionBatch]:
+        """The batches of validation, named `cameras` and `frames`."""
+        scene, margin = self.scene, self.cfg.rendering.margin
+        parts = {"cameras": (scene.holdout_cameras, scene.training_frames),
+                 "frames": (range(len(scene.cameras)), scene.holdout_frames)}  # fmt: skip
+        return [self.seen_in(name, cropped(scene, views, frames, margin), views, frames)
+                for name, (views, frames) in parts.items() if views and frames]  # fmt: skip
+
+    def seen_in(self, name: str, seen: Observations, views: Sequence[int], frames: Sequence[int]) -> MotionBatch:
+        cues: MotionCues | None = None
+        return MotionBatch(sequences=(SequenceBatch(name=name, index=0, views=list(views), frames=list(frames), observations=seen,
+                                                    cues=cues, extra={}),))

@@ -1,0 +1,125 @@
+"""The staged fit under Lightning: how long it will take, and the optimisation itself, which goes on from a checkpoint."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from lightning.pytorch.callbacks import LambdaCallback
+from lightning.pytorch.plugins.environments import LightningEnvironment
+from omegaconf import DictConfig, OmegaConf
+
+from mosa.config.checkpoints import check_same, checked_posterior, read_checkpoint
+from mosa.errors import ConfigError, DataError, SimulationDiverged
+from mosa.modules.fitting.parameters import read_numbers
+from mosa.system.refused import lacks_memory
+from mosa.training.callbacks import AtomicCheckpointIO
+from mosa.training.costs import Costs, duration, seconds_of_fit, speed_of_rollouts
+from mosa.training.datamodule import SceneDataModule
+from mosa.training.lit_mosa import LitMosa
+from mosa.training.loggers import DescribingLogger
+
+log = logging.getLogger(__name__)
+
+
+def fit_estimate(module: LitMosa, costs: Costs) -> str:
+    """One line on how long the fit will take, from rollouts of the body that was found, which `costs` takes over."""
+    first, body = module.takes[0], module.body
+    frames = len(first.cues.positions)
+    frame = speed_of_rollouts(body, first.frame_dt, module.world.gravity, module.world.up)
+    speeds = replace(costs.speeds, frame=frame)
+    seconds = seconds_of_fit(module, speeds, frames)
+    costs.known("fit", seconds)
+    return (f"fit: {len(body.rest)} particles, {frames} frames of {body.last_substeps} substeps, at most "
+            f"{sum(s.iterations for s in module.stages)} steps, about {duration(seconds)}; the run takes about "
+            f"{costs.memory / 1e9:.1f} GB")
+
+
+def instantiated(cfg: DictConfig, section: str) -> list[Any]:
+    """The objects of a section whose entries have `_target_`. Errors: ConfigError naming the entry."""
+    found = []
+    for name, entry in (cfg.get(section) or {}).items():
+        if entry is None:  # switched off: callbacks.pictures=null
+            continue
+        if not OmegaConf.is_dict(entry) or "_target_" not in entry:
+            raise ConfigError(f"{section}.{name}: expected a section with _target_, the class to make, found {str(entry)[:80]!r}")
+        found.append(made(f"{section}.{name}", entry))
+    return found
+
+
+def made(where: str, entry: DictConfig, **arguments: Any) -> Any:
+    """What `entry` describes, by Hydra. Only conf/ and the command line are ever made so, never what a checkpoint holds. Errors:
+    ConfigError."""
+    try:
+        return instantiate(entry, **arguments)
+    except Exception as error:
+        cause = error.__cause__ if isinstance(error, InstantiationException) and error.__cause__ is not None else error
+        lines = [line for line in str(cause).splitlines() if line.strip() and not line.startswith("full_key")]
+        way = f"; pip install {cause.name}" if isinstance(cause, ModuleNotFoundError) and cause.name else ""
+        if where == "trainer" and "gpu" in str(cause):
+            way = "; trainer=cpu runs without one"
+        raise ConfigError(f"{where}: expected what {entry.get('_target_')} takes, found: {' '.join(lines)[:300]}{way}") from error
+
+
+def build_trainer(cfg: DictConfig, folder: Path) -> L.Trainer:
+    """Lightning's Trainer of conf/trainer, with the callbacks of conf/callbacks and the loggers of conf/logger. Errors: ConfigError
+    naming the section."""
+    loggers, callbacks = instantiated(cfg, "logger"), instantiated(cfg, "callbacks")
+    trainer = made("trainer", cfg.trainer, logger=loggers or False, callbacks=callbacks, default_root_dir=str(folder),
+                   plugins=[AtomicCheckpointIO(), LightningEnvironment()])
+    if trainer.num_devices * trainer.num_nodes != 1:
+        raise ConfigError(f"trainer.devices: expected 1, or a list with the index of one GPU, found {trainer.num_devices}: a fit "
+                          "runs on one device, and the runs of a sweep on several (docs/sweeps.md)")
+    check_monitors(cfg, callbacks)
+    return trainer
+
+
+def check_monitors(cfg: DictConfig, callbacks: Sequence[L.Callback]) -> None:
+    """Errors: ConfigError where a callback watches validation and nothing is held out."""
+    if cfg.scene.get("holdout_cameras") or cfg.scene.get("holdout_frames"):
+        return
+    for each in callbacks:
+        if str(getattr(each, "monitor", None)).startswith("val/"):
+            raise ConfigError(f"callbacks: {type(each).__name__} watches {each.monitor}: expected something that is held out of "
+                              "the training sequence, found nothing; scene.holdout_cameras=[0] or scene.holdout_frames=2")
+
+
+def fit(trainer: L.Trainer, module: LitMosa, data: SceneDataModule, ckpt_path: str | None) -> None:
+    """The staged optimisation under Lightning; goes on from ckpt_path. Errors: DataError for a checkpoint of another run."""
+    if ckpt_path is not None:
+        stored = read_checkpoint(ckpt_path)
+        check_same(stored, module, ckpt_path)
+        checked_posterior(stored, len(read_numbers(module.body)), ckpt_path)
+    for logger in trainer.loggers:
+        if isinstance(logger, DescribingLogger):
+            logger.law = module.body.material.law
+    device = module.body.rest.device
+    begun: list[bool] = []
+    trainer.callbacks.append(LambdaCallback(on_train_start=lambda *_: begun.append(True)))
+    try:
+        trainer.fit(module, datamodule=data, ckpt_path=ckpt_path, weights_only=True)
+    except SystemExit:  # Lightning's answer to Ctrl-C
+        raise KeyboardInterrupt from None
+    except torch.linalg.LinAlgError as error:
+        if lacks_memory(error):
+            raise
+        raise SimulationDiverged(f"the fit came to numbers that cannot be solved with ({' '.join(str(error).split())[:200]}); "
+                                 "check the checkpoint that it goes on from, or lower simulation.courant") from error
+    except (ArithmeticError, AttributeError, FileNotFoundError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        if begun or ckpt_path is None or lacks_memory(error):
+            raise
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:300]  # Lightning takes its own entries as they are
+        raise DataError(f"ckpt_path: {ckpt_path}: the fit cannot go on from it ({reason})") from error
+    if trainer.interrupted:
+        raise KeyboardInterrupt
+    if module.stage is not None:
+        log.warning("the trainer ended the fit after %d steps, in stage %s of %s: what follows is of the law as it stands",
+                    module.steps_done, module.stage.name, ", ".join(stage.name for stage in module.stages))
+    module.body.to(device)

@@ -1,0 +1,460 @@
+"""The LightningModule: a body in its world, fitted in stages to what a `SceneDataModule` serves.
+
+    import lightning as L
+    from mosa import LitMosa, SceneDataModule, compose
+
+    cfg = compose("scene=rabbit", "prior=neo_hookean")
+    data, module = SceneDataModule(cfg), LitMosa(cfg)
+    L.Trainer(max_epochs=-1).fit(module, datamodule=data)     # ends with the last stage
+    module = LitMosa.load_from_checkpoint(path)               # to use, to test, or to fit on
+
+Any Trainer drives it. A stage runs by Gauss-Newton (`newton_steps.py`: an epoch is one iteration, over all views) or by Adam
+(`gradient_steps.py`: an epoch is a pass over the training views). `Stages`, a callback that the module brings along, leads from one
+stage to the next.
+"""
+
+from __future__ import annotations
+
+import copy
+import logging
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from lightning.pytorch.callbacks import Checkpoint
+from omegaconf import DictConfig
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+from mosa.config.build import build_body, build_criterion, build_evaluation, build_identification, build_stages, build_world, plain
+from mosa.config.checkpoints import VERSION, read_checkpoint
+from mosa.data.batches import MotionBatch
+from mosa.errors import ConfigError, SimulationDiverged
+from mosa.evaluation import metrics
+from mosa.evaluation.evaluate import evaluate, run_sequences
+from mosa.modules.adapters.penalties import MISFIT
+from mosa.modules.body.body import Body, World
+from mosa.modules.body.material import material_states
+from mosa.modules.fitting import losses
+from mosa.modules.fitting.adam_steps import GradientSteps
+from mosa.modules.fitting.criteria import Criterion
+from mosa.modules.fitting.gauss_newton import Posterior
+from mosa.modules.fitting.identification import Identification
+from mosa.modules.fitting.identification_settings import IdentificationSettings
+from mosa.modules.fitting.newton_optimizer import GaussNewtonOptimizer
+from mosa.modules.fitting.newton_steps import NewtonSteps
+from mosa.modules.fitting.parameters import is_learned, tensors_of
+from mosa.modules.fitting.retreat import Retreat
+from mosa.modules.fitting.stages import Stage
+from mosa.modules.fitting.stages_callback import Stages
+from mosa.modules.fitting.terms import check_terms
+from mosa.modules.fitting.training_sequences import Take, seen_again, with_positions
+from mosa.physics.constitutive.laws import law_named
+from mosa.physics.world import Start
+from mosa.reconstruction.rest_shape import RestShape
+from mosa.rendering.observer import deformed_covariances, observe
+from mosa.types import AUTO, Ground, Rollout
+
+log = logging.getLogger(__name__)
+
+PRECISIONS = ("32-true",)
+"""Of a Trainer. The simulation has its own: simulation.precision=64."""
+
+
+MADE = ("trainer", "callbacks", "logger")
+"""Sections that Hydra makes objects of. A checkpoint does not keep them: what it holds is data."""
+OF_DATA = ("scene", "reconstruction", "rendering", "seed")
+"""Sections of the configuration that the data module decides."""
+
+
+def body_of(shape: RestShape, config: Mapping[str, Any]) -> Body:
+    """The body of a reconstruction, with the law, settings and appearance of the run, on the device of `shape`."""
+    body = build_body(config, shape.tensors())
+    body.splats = shape.splats
+    return body.to(shape.rest.device)
+
+
+def parts_of(config: Mapping[str, Any], body: Body) -> dict[str, Any]:
+    """What `LitMosa._begin` takes of a configuration that a checkpoint keeps. Errors: ConfigError naming the key."""
+    cfg = config["cfg"]
+    stages = build_stages(cfg["fit"], body.heterogeneity, body.adapter)
+    if not (cfg["reconstruction"].get("informed") or {}).get("iterations", 0):
+        stages = [stage for stage in stages if not stage.looks_again]
+    return {"world": build_world(config["world"]), "stages": stages, "weights": cfg["losses"], "clip": cfg["fit"]["clip"],
+            "criterion": build_criterion(cfg), "settings": build_identification(cfg)}
+
+
+class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
+    """Fits a body to one or more sequences in stages: the loss is the mean over them.
+
+    It has no body until `setup` has asked the data module for its particles, or a checkpoint was loaded.
+    """
+
+    def __init__(self, first: str | Mapping[str, Any] | DictConfig | None = None, *overrides: str) -> None:
+        """first, overrides: a whole configuration (`mosa.compose`), or overrides as on the command line. Errors: ConfigError."""
+        super().__init__()
+        from mosa.config.composition import composed
+
+        whole = dict(first) if isinstance(first, dict) and not overrides else plain(composed(first, overrides))
+        self.cfg = {key: value for key, value in whole.items() if key not in MADE}
+        self.save_hyperparameters({"cfg": self.cfg}, logger=False)
+        self._begin({"cfg": self.cfg, "world": None}, None, (), torch.ones(3), (), {})
+
+    def _begin(
+        self, config: dict, body: Body | None, takes: Sequence[Take], background: Tensor, stages: Sequence[Stage],
+        weights: Mapping[str, float], *, world: World | None = None, clip: float = 1.0, criterion: Criterion | None = None,
+        settings: IdentificationSettings | None = None,
+    ) -> None:  # fmt: skip
+        """Everything as it is before the first step. weights: per loss term (`mosa.modules.fitting.terms`)."""
+        self.body, self.world, self.background = body, world, background
+        self.takes, self.first_takes, self.stages = list(takes), list(takes), list(stages)
+        self.weights, self.clip, self.config = dict(weights), clip, config
+        self.stage_index, self.losses, self.steps_done, self.stage_over = 0, [], 0, False
+        self.start = takes[0].start.written() if takes and takes[0] is not None else None  # of the training sequence
+        self.misfit = MISFIT  # of the model the joint stage starts from, measured when it begins
+        self.last: dict[str, float] = {}
+        self.criterion, self.settings = criterion or Criterion("free"), settings or IdentificationSettings()
+        self.identification: Identification | None = None  # of the running stage, where it is Gauss-Newton's
+        self.saved_identification: dict | None = None  # its state in the checkpoint that the fit goes on from
+        self.posterior: Posterior | None = None
+        self.retreat, self.saved_retreat, self.taken_back = Retreat(), None, False  # of the running stage, where it is Adam's
+        self.running_optimizer: torch.optim.Optimizer | None = None
+        self.norms: dict[str, float] = {}  # of the last step's gradient, by parameter group
+        self.terms_of_step: dict[str, Tensor] = {}
+        self.saved_cues: tuple | None = None  # those of a checkpoint that was loaded without data
+        self.informed = False  # whether the takes have the cues about the calibrated backbone
+        self.compared: dict[str, float] = {}  # mean distance [m] of the calibrated candidates for the backbone
+        self.ground_gains: dict[str, float] = {}  # of other contacts about the learned law, once it has been asked
+        self.untouched = copy.deepcopy(body.state_dict()) if body is not None and self.ground_is_sought else None
+        self.grounds: dict[str, float] = {}  # mean distance [m] of the contacts with the ground that were tried
+
+    @classmethod
+    def of_parts(
+        cls, body: Body, *, takes: Sequence[Take | None], world: World, background: Tensor, stages: Sequence[Stage],
+        weights: Mapping[str, float], config: dict | None = None, **parts,
+    ) -> LitMosa:  # fmt: skip
+        """Of parts that were made elsewhere (see `_begin`). config: plain containers that a checkpoint keeps."""
+        config = {} if config is None else config
+        module = cls(config.get("cfg") or {})
+        check_terms(weights, body.adapter)
+        module._begin(config, body, takes, background, stages, weights, world=world, **parts)
+        return module
+
+    @classmethod
+    def from_config(cls, config: dict, body: Body, *, takes: Sequence[Take | None], background: Tensor) -> LitMosa:
+        """The module that fits `body` in the stages of a run. config: what a checkpoint keeps (`mosa.config.run_config`); takes:
+        what it learns from, none where it is only used. Errors: ConfigError naming the key."""
+        return cls.of_parts(body, takes=takes, background=background, config=config, **parts_of(config, body))
+
+    # ---------------------------------------------------------------- data
+    def setup(self, stage: str) -> None:
+        """Asks the trainer's data module for the body's particles, its world and, for a fit, what it learns from."""
+        data = self.trainer.datamodule
+        if hasattr(data, "takes") and hasattr(data, "shape"):
+            self.attach(data, fitting=stage in ("fit", "validate"))
+        elif self.body is None:
+            raise ConfigError("LitMosa: expected a SceneDataModule, which knows the particles of the body "
+                              "(trainer.fit(module, datamodule=SceneDataModule(cfg))), or a module from load_from_checkpoint, "
+                              f"found {type(data).__name__ if data is not None else 'neither'}")
+        # what is saved at the end of an epoch belongs to the stage that comes next
+        callbacks = self.trainer.callbacks
+        own = [each for each in callbacks if isinstance(each, Stages)]
+        others = [each for each in callbacks if not isinstance(each, Stages)]
+        place = next((i for i, each in enumerate(others) if isinstance(each, Checkpoint)), len(others))
+        self.trainer.callbacks = [*others[:place], *own, *others[place:]]
+
+    def configure_callbacks(self) -> list[L.Callback]:
+        """Asked for first of all, before the data take their time."""
+        if self.trainer.world_size > 1:
+            raise ConfigError(f"trainer.devices: expected one, found {self.trainer.world_size}: a fit runs on one device, and "
+                              "the runs of a sweep on several (docs/sweeps.md)")
+        if self.trainer.precision not in PRECISIONS:
+            raise ConfigError(f"trainer.precision: expected {' or '.join(PRECISIONS)}, found {self.trainer.precision!r}: the "
+                              "simulation is single precision, or double by simulation.precision=64")
+        return [Stages()]
+
+    def attach(self, data, fitting: bool = True) -> None:
+        """Makes the body of the particles of `data`, a `SceneDataModule`, where there is none yet; fitting: and takes what a fit
+        reads. `setup` does it; a caller may before, where the body is wanted before there is a trainer. Errors: ConfigError where
+        a body from a checkpoint has other particles."""
+        if self.body is None:
+            measured = data.measured
+            config = measured | {"cfg": self.cfg | {key: measured["cfg"][key] for key in OF_DATA}}
+            config["world"] = measured["world"] | (self.cfg.get("world") or {})
+            body = body_of(data.shape, config)
+            parts = parts_of(config, body)
+            check_terms(parts["weights"], body.adapter)
+            self._begin(config, body, (), data.scene.background.to(body.rest.device), **parts)
+            self.start = data.starts["train"].written()
+        elif len(data.shape.rest) != len(self.body.rest):
+            raise ConfigError(f"ckpt_path: expected a scene whose body has {len(self.body.rest)} particles, found "
+                              f"{len(data.shape.rest)}: the checkpoint belongs to another scene, reconstruction or "
+                              "simulation.particles")
+        if fitting and not self.takes:
+            plastic = lambda: law_named(self.body.material.law).plastic  # noqa: E731
+            self.takes = [replace(take, again=take.again and replace(take.again, plastic=plastic)) for take in data.takes]
+            self.first_takes = list(self.takes)
+            if self.saved_cues is not None:
+                self.takes, self.informed = with_positions(self.takes, *self.saved_cues), True
+
+    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
+        """What is no batch of a fit stays where it is: what of it is needed on the device is brought there where it is needed."""
+        return batch.to(device) if isinstance(batch, MotionBatch) else batch
+
+    # ---------------------------------------------------------------- state
+    @property
+    def stage(self) -> Stage | None:
+        """The running stage; None when all have ended."""
+        return self.stages[self.stage_index] if self.stage_index < len(self.stages) else None
+
+    def on_save_checkpoint(self, checkpoint: dict) -> None:
+        checkpoint["mosa"] = {"version": VERSION, "config": self.config, "stage": self.stage_index, "losses": list(self.losses),
+                              "steps_done": self.steps_done, "stage_over": self.stage_over,
+                              "particles": len(self.body.rest), "misfit": self.misfit, "start": self.start,
+                              "identification": self.identification.state() if self.identification else None,
+                              "compared": self.compared, "grounds": self.grounds, "ground_gains": self.ground_gains,
+                              "retreat": self.retreat.written(),
+                              "cues": [take.cues.positions.cpu() for take in self.takes] if self.informed else None,
+                              "responses": [take.response and take.response.written() for take in self.takes]
+                              if self.informed else None,
+                              "posterior": self.posterior.written() if self.posterior else None,
+                              "splats": self.body.splats.written() if self.body.splats is not None else None}
+
+    def on_load_checkpoint(self, checkpoint: dict) -> None:
+        if "mosa" not in checkpoint:
+            raise ConfigError("ckpt_path: the checkpoint was not written by this program (no entry 'mosa')")
+        saved = checkpoint["mosa"]
+        if saved["particles"] != len(self.body.rest):
+            raise ConfigError(f"ckpt_path: expected a body of {len(self.body.rest)} particles, found {saved['particles']}: the "
+                              "checkpoint belongs to another scene, reconstruction or simulation.particles")
+        self.stage_index, self.losses, self.steps_done = saved["stage"], list(saved["losses"]), saved["steps_done"]
+        self.stage_over, self.start = bool(saved.get("stage_over", False)), saved["start"]
+        self.misfit = saved.get("misfit", MISFIT)
+        self.saved_identification = saved.get("identification")
+        self.saved_retreat = saved.get("retreat")
+        self.compared = dict(saved.get("compared") or {})
+        if self.compared and (candidates := self.body.material.candidates):
+            if (law := saved["config"]["cfg"]["prior"]["law"]) not in candidates:
+                raise ConfigError(f"ckpt_path: expected a law among prior.candidates, {', '.join(candidates)}, found {law!r} in "
+                                  "the checkpoint: it belongs to another configuration")
+            for material in (self.body.material, *(variant["material"] for variant in self.body.frozen.values())):
+                material.choose(law)
+            self.settle_law()
+        self.grounds, self.ground_gains = dict(saved.get("grounds") or {}), dict(saved.get("ground_gains") or {})
+        if self.ground_is_sought and (written := saved["config"]["world"]["ground"]) is not None:
+            self.settle_ground(Ground(**written))
+        self.posterior = Posterior.read(saved["posterior"]) if saved.get("posterior") else None
+        if saved.get("cues") is not None:
+            self.saved_cues = saved["cues"], saved.get("responses")
+            if self.takes:
+                self.takes, self.informed = with_positions(self.takes, *self.saved_cues), True
+        elif (self.losses and self.stage is not None and (self.stage.looks_again or not self.stage.calibrates)
+              and any(take.again for take in self.takes)):  # fmt: skip
+            raise ConfigError("ckpt_path: expected the motion that reconstruction.informed finds, as this stage began after it, "
+                              "found none in the checkpoint: set reconstruction.informed.iterations=0, as the run had it")
+
+    def settle_law(self) -> None:
+        """What is written from now on is a run of the law that was chosen."""
+        prior = dict(self.config.get("cfg", {}).get("prior", {}))
+        if prior:
+            self.config["cfg"]["prior"] = prior | {"law": self.body.material.law, "candidates": []}
+
+    @property
+    def ground_is_sought(self) -> bool:
+        """Whether nobody said how the ground is touched (scene.ground.mode=auto), and it is not found yet."""
+        return ((self.config.get("world") or {}).get("ground") or {}).get("mode") == AUTO
+
+    def settle_ground(self, ground: Ground) -> None:
+        """What is simulated and written from now on meets this ground."""
+        self.world = replace(self.world, ground=ground)
+        self.config["world"]["ground"] = asdict(ground)
+
+    def begin_again(self, ground: Ground) -> None:
+        """All stages from the start, on another ground, with the motion that was seen at first: the second look was about a body
+        that met the old one."""
+        self.settle_ground(ground)
+        self.body.load_state_dict(self.untouched)
+        self.takes, self.informed = list(self.first_takes), False
+        self.stage_index, self.losses, self.identification, self.posterior = 0, [], None, None
+        self.stage_over = False
+
+    # ---------------------------------------------------------------- one step
+    def configure_optimizers(self):
+        """Of the running stage; `Stages` asks again for the next one."""
+        stage = self.stage
+        if stage is None:  # the fit has ended
+            return None
+        if not stage.newton:
+            found = self.adam(stage)
+            self.running_optimizer = found["optimizer"]
+            return found
+        body = self.body
+        numbers = tensors_of(body, adapter=stage.learns_adapter and is_learned(body.adapter),
+                             heterogeneity=stage.learns_heterogeneity and is_learned(body.heterogeneity))
+        self.running_optimizer = GaussNewtonOptimizer(numbers, lambda: self.identification)
+        return self.running_optimizer
+
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> int | None:
+        """The rest of an epoch is left out once its stage is over."""
+        return -1 if self.stage_over or self.stage is None else None
+
+    def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor | None:
+        """The loss before the step. By Gauss-Newton: minus the logarithm of the posterior; by Adam: the weighted terms of the views
+        of `batch`, None where the step before was taken back."""
+        stage, iteration = self.stage, len(self.losses)
+        return self.newton_loss(stage, iteration) if stage.newton else self.gradient_loss(stage, iteration, batch)
+
+    def backward(self, loss: Tensor, *args: Any, **kwargs: Any) -> None:
+        if loss.requires_grad:  # Gauss-Newton's has none
+            loss.backward(*args, **kwargs)
+
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        if not (self.stage.newton or self.taken_back):
+            self.retreat.note(self.learned())
+
+    def optimizer_step(self, epoch: int, batch_idx: int, optimizer, optimizer_closure=None) -> None:
+        stage, iteration = self.stage, len(self.losses)
+        loss = optimizer.step(closure=optimizer_closure)
+        if stage.newton:
+            self.after_newton_step()
+        else:
+            self.after_gradient_step(stage, iteration, loss)
+        self.steps_done += 1
+        self.stage_over = stage.ended(self.losses) or (stage.newton and self.identification.converged)
+
+    @torch.no_grad()
+    def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
+        """Logs how far the law's free rollout is from what was held back of the training sequence: `val/loss`, the weighted terms
+        of images and mattes, `val/psnr` [dB] in the object's windows, and both by part (`val/cameras/...`, `val/frames/...`)."""
+        (part,), take, body = batch.sequences, self.takes[0], self.body
+        values = {"loss": float("inf"), "psnr": -float("inf")}  # of a law that cannot be simulated
+        try:
+            rollout = body.simulate(take.start, self.world, 1 + max(part.frames), take.frame_dt)
+        except (SimulationDiverged, ConfigError) as error:
+            log.warning("validation: the law cannot be simulated: %s", error)
+        else:
+            seen, x, F = part.observations, rollout.x[part.frames], rollout.F_tot[part.frames]
+            shown = observe(x, deformed_covariances(F, body.covariances), body.opacities, body.colors, seen.cameras,
+                            self.background)  # fmt: skip
+            terms = {"image": losses.image_loss(shown.images, seen.images), "mask": losses.mask_loss(shown.mattes, seen.mattes)}
+            loss = sum(self.weights.get(name, 0.0) * float(value) for name, value in terms.items())
+            psnr = metrics.psnr(shown.images.clamp(0, 1).flatten(0, 1), seen.images.flatten(0, 1))
+            values = {"loss": loss, "psnr": psnr}
+        self.log_dict({f"val/{name}": value for name, value in values.items()}, batch_size=1)
+        self.log_dict({f"val/{part.name}/{name}": value for name, value in values.items()}, batch_size=1)
+
+    def test_dataloader(self) -> DataLoader:
+        """Without a data module: the sequences that the run was evaluated on, from the configuration in its checkpoint. Errors:
+        DataError, ConfigError."""
+        return DataLoader(run_sequences(self.config, self.body), batch_size=None, collate_fn=lambda sequence: sequence)
+
+    def test_step(self, batch, batch_idx: int) -> None:
+        """Logs the figures of docs/figures.md of one sequence, of every model. batch: `evaluation.Sequence`."""
+        here = replace(batch, start=type(batch.start).read(batch.start.written(), self.body.rest))
+        figures, _ = evaluate(self.body, [here], self.world, build_evaluation(self.config["cfg"]))
+        figures.pop("time/particle_substeps_per_s")
+        self.log_dict(figures, batch_size=1)  # `test/<metric>` of several sequences is averaged
+
+    def predict_step(self, batch: Mapping[str, Any], batch_idx: int) -> Rollout:
+        """The law's rollout from a new start. batch: keyword arguments of `Twin.simulate`."""
+        return self.twin().simulate(**batch)
+
+    def twin(self):
+        """The law that has been learned so far, for simulation (`mosa.twin.Twin`)."""
+        from mosa.twin.twin import Twin
+
+        first = Start.read(self.start, self.body.rest)
+        return Twin(self.body, self.world, self.config["frame_dt"], self.config, first, self.posterior)
+
+    @classmethod
+    def load_from_checkpoint(cls, checkpoint_path: str | Path, map_location: str | torch.device | None = None, **unused) -> LitMosa:
+        """The module of a checkpoint, in evaluation mode: body, world, configuration, and how far its fit was. `trainer.fit` with
+        the scene's data module goes on from there.
+
+        The file is read as data (docs/safety.md); Lightning's other arguments (`strict`, `hparams_file`, ...) change nothing.
+        Errors: DataError naming the file.
+        """
+        from mosa.twin.twin import Twin
+
+        twin = Twin.load(checkpoint_path, "cpu" if map_location is None else map_location)
+        module = cls.from_config(twin.config, twin.body, takes=(), background=torch.ones(3))
+        module.on_load_checkpoint(read_checkpoint(checkpoint_path))
+        return module.to(twin.body.rest.device).eval()
+
+    # ---------------------------------------------------------------- stages
+    def begin(self, stage: Stage) -> None:
+        """What a stage starts from."""
+        if stage.start is not None:
+            self.body.thaw(stage.start)
+        if self.ground_is_sought and not stage.newton:
+            warnings.warn(f"scene.ground.mode: auto asks for fit.{stage.name}.optimizer=gauss_newton, which compares contacts; "
+                          "found adam, and the body sticks to the ground: say sticky, slip, separate or touch", stacklevel=1)
+            self.settle_ground(self.world.ground)
+        if stage.looks_again or not (stage.calibrates or self.informed):
+            self.inform(response=stage.newton and not stage.calibrates)
+        adapter, material = self.body.adapter, self.body.material
+        if stage.learns_adapter and adapter is not None:
+            adapter.switch_on(material.reference_modulus(), material.poisson())
+            parameters = {k: v.detach() for k, v in material.per_particle(1.0).items()}
+            adapter.prepare(material.law, material_states(material.law, parameters, self.body.law_options))
+            if self.weights.get("operator", 0.0) != 0:
+                self.misfit = max(self.measure_misfit(), 0.1 * MISFIT)
+
+    def inform(self, response: bool = True) -> None:
+        """The cues of the takes once more, about what the calibrated backbone predicts; response: and what they keep of that."""
+        if any(take.again for take in self.takes):
+            self.takes, self.informed = [seen_again(take, self.body, self.world, response) for take in self.takes], True
+
+    @torch.no_grad()
+    def measure_misfit(self) -> float:
+        """Mean distance of the particles from the reconstruction's, over the object's size, without adapter."""
+        misfits = []
+        for take in self.takes:
+            model = self.body.model().only(adapter=False)
+            rollout = self.body.simulate(take.start, self.world, len(take.cues.positions), take.frame_dt, model=model)
+            misfits.append(float(losses.position_loss(rollout.x, take.cues.positions, self.body.size)))
+        return sum(misfits) / len(misfits)
+
+    def finish(self) -> None:
+        """Ends the running stage: the next one follows, or all of them again on another ground."""
+        stage = self.stage
+        if stage.newton:
+            if (ground := self.better_ground(stage)) is not None:
+                self.begin_again(ground)
+                return
+            self.keep_posterior(stage)
+        else:
+            self.try_last_step(stage)
+        self.end(stage)
+
+    def end(self, stage: Stage) -> None:
+        """Keep the stage's result as a backbone and go on to the next."""
+        for name in stage.keeps:
+            self.body.freeze(name)
+        self.stage_index, self.losses, self.identification = self.stage_index + 1, [], None
+        self.retreat, self.stage_over = Retreat(), False
+
+    # ---------------------------------------------------------------- logs
+    def log_values(self, values: dict[str, Tensor | float]) -> None:
+        """These scalars and the parameters, into the logs and `last`."""
+        for name, value in self.body.material.physical().items():
+            values[f"id/{name}"] = value.detach()
+        values["id/contact_offset"] = self.body.contact.lift(self.world.ground).detach()
+        self.log_dict({k: torch.as_tensor(v, dtype=torch.float32) for k, v in values.items()}, on_step=True, on_epoch=False)
+        self.last |= {k: float(v) for k, v in values.items()}
+
+    @torch.no_grad()
+    def strip(self, view: int = 0) -> Tensor:
+        """(3, 2 h, T w) strip of one view of the first sequence: real above, rendered below, every frame from left to right."""
+        take, body = self.takes[0], self.body
+        frames = len(take.cues.positions)
+        rollout = body.simulate(take.start, self.world, frames, take.frame_dt)
+        targets = take.observations.select([view], frames)
+        seen = observe(rollout.x, deformed_covariances(rollout.F_tot, body.covariances), body.opacities, body.colors,
+                       targets.cameras, self.background)
+        rows = [torch.cat(list(images[0]), 1) for images in (targets.images, seen.images)]
+        return torch.cat(rows, 0).clamp(0, 1).permute(2, 0, 1)

@@ -1,0 +1,113 @@
+"""Figures of a run, and the files that it leaves in its folder."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from mosa.data.io.gaussian_ply import save_ply
+from mosa.data.synthetic.true_geometry import geometry_figures
+from mosa.evaluation.analysis.comparison import TITLES, compare, write_comparisons
+from mosa.evaluation.analysis.tables import (
+    columns_text,
+    continued_text,
+    determined_text,
+    geometry_lines,
+    parameter_table,
+    results_table,
+)
+from mosa.evaluation.evaluate import (
+    Sequence,
+    evaluate,
+    floor_figures,
+    hidden_figures,
+    identification,
+    law_figures,
+    test_means,
+    true_motion,
+)
+from mosa.evaluation.settings import EvaluationSettings
+from mosa.evaluation.uncertainty import determined, predicted_spread
+from mosa.modules.body.body import Body, Start, World
+from mosa.modules.fitting.gauss_newton import Posterior
+from mosa.system.whole_files import written_whole
+from mosa.training.run_folder import write_figures
+from mosa.twin.rollout_file import save_rollout, save_spread, save_truth
+from mosa.types import Rollout, Scene
+
+log = logging.getLogger(__name__)
+
+
+def figures_of(
+    settings: EvaluationSettings, body: Body, evaluated: list[Sequence], world: World, posterior: Posterior | None, folder: Path
+) -> tuple[dict[str, float], dict[str, dict[str, Rollout]]]:
+    """All that is measured on a fitted body, and the rollouts by sequence and variant.
+
+    Writes uncertainty.npz into `folder` where there is a posterior."""
+    scene = evaluated[0].scene
+    figures, kept = evaluate(body, evaluated, world, settings)
+    figures |= identification(body, scene) | law_figures(body)
+    figures |= hidden_figures(body, scene, figures) | posterior_figures(body, posterior, evaluated, world, folder)
+    if settings.floor:
+        figures |= floor_figures(body, evaluated, world, settings) | true_geometry(body, scene)
+    return figures, kept
+
+
+def posterior_figures(body: Body, posterior: Posterior | None, evaluated: list[Sequence], world: World, folder: Path) -> dict:
+    """What the data determined and how sure predictions are; uncertainty.npz with the latter. Nothing where there is no
+    posterior."""
+    if posterior is None:
+        return {}
+    figures, spreads = predicted_spread(body, posterior, evaluated, world)
+    if spreads:
+        save_spread(folder / "uncertainty.npz", spreads)
+    return figures | test_means(figures) | determined(body, posterior)
+
+
+def true_geometry(body: Body, scene: Scene) -> dict[str, float]:
+    """Figures of the body against the true shape, where that is known."""
+    return geometry_figures(body.rest, body.volume, scene) if scene.synthetic and scene.truth is not None else {}
+
+
+def start_figures(start: Start) -> dict[str, float]:
+    names = ("x", "y", "z")
+    return {f"id/v0_{n}": float(v) for n, v in zip(names, start.velocity)} | {
+        f"id/omega0_{n}": float(v) for n, v in zip(names, start.angular_velocity)}
+
+
+def write_outputs(
+    folder: Path, cfg: DictConfig, body: Body, evaluated: list[Sequence], figures: dict, kept: dict, world: World
+) -> None:
+    """rollout.npz and prior.npz, truth.npz where it is known; splats.ply; video.mp4 of the last held-out sequence, strip.png of
+    all; tables in results.md; metrics.json."""
+    for variant, name in (("adapted", "rollout.npz"), ("prior", "prior.npz")):
+        motions = {prefix: variants[variant] for prefix, variants in kept.items() if variant in variants}
+        save_rollout(folder / name, motions, world.colliders)
+    if known := {s.prefix: true_motion(body, s.scene) for s in evaluated if s.scene.truth is not None}:
+        save_truth(folder / "truth.npz", known)
+    if body.splats is not None:
+        known = body.splats.appearance
+        save_ply(folder / "splats.ply", known.splats.to("cpu"), known.harmonics.cpu())
+    if cfg.evaluation.video:
+        simulated = [s for s in evaluated if TITLES.keys() & kept[s.prefix].keys()]
+        shown = [s for s in simulated if s.prefix.startswith("test")] or simulated[:1]
+        if shown:
+            write_comparisons(folder, {s.prefix: compare(body, s, kept[s.prefix]) for s in shown})
+    law = body.material.law
+    parts = (results_table(figures), columns_text(figures, evaluated[0].scene.name), parameter_table(figures, law),
+             continued_text(figures, law), determined_text(figures, law), geometry_lines(figures))  # fmt: skip
+    table = "\n\n".join(filter(None, parts))
+    with written_whole(folder / "results.md") as partial:
+        partial.write_text(table + "\n")
+    write_figures(folder, figures)  # the last file: the run is complete
+    log.info("\n%s\n\nrun folder: %s", table, folder)
+
+
+def optimized(figures: dict[str, float], wanted: str) -> float | None:
+    """The figure a sweep minimises: `wanted`, or the first that exists of its fallbacks; of image figures the negative."""
+    for key in (wanted, "test/rms_m", "train/rms_m"):
+        if key in figures:
+            return figures[key]
+    return next((-figures[key] for key in ("test/psnr_crop", "train/psnr_crop") if key in figures), None)

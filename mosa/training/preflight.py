@@ -1,0 +1,165 @@
+"""What is refused before anything long runs: one function for each moment at which something more is known."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from mosa.config.build import build_world, plain, rehearse, world_config
+from mosa.config.checkpoints import check_resumed, check_same_scene, read_checkpoint
+from mosa.config.extensions import registered_keys
+from mosa.config.idle import warn_of_idle
+from mosa.config.keys import CAPTURE, ENVIRONMENTS, EVALUATION, SIMULATION, SPLATS, TRAINING
+from mosa.config.known import check_known, conf_folder
+from mosa.data.checks.cameras import lines_of_sight, misses
+from mosa.data.io.splat_formats import check_formats
+from mosa.errors import ConfigError, DataError
+from mosa.evaluation.analysis.figures import ffmpeg
+from mosa.modules.body.body import Body, Start, World
+from mosa.physics.contact.colliders import colliders_from_config
+from mosa.physics.contact.overlap import check_clear
+from mosa.physics.contact.planes import ground_plane
+from mosa.physics.engine.axes import turn_along
+from mosa.reconstruction.pose.starts import first_contact
+from mosa.schema import check
+from mosa.system.limits import counted
+from mosa.twin.twin import Twin
+from mosa.types import Scene
+
+PARTICLE_BYTES = 5e3
+"""Of a particle through reconstruction and fit, at least: modes, neighbours, frames, buffers of the rollout."""
+FEWEST = 8
+DEFORMED = 3
+"""Frames after first contact: of three a smoke run on the tiny scene finds E to 15 %, of one to a seventh of it."""
+
+
+def check_configuration(values: Mapping[str, Any], conf: Path | None = None) -> None:
+    """All that train.py's configuration says by itself; a warning for each key that was set and does nothing. conf: the folder of
+    its YAML files, None for the running program's. Errors: ConfigError naming the key."""
+    schemas = TRAINING, EVALUATION, registered_keys(values)
+    if (conf := conf or conf_folder()) is not None:
+        check_known(values, conf, "train", *schemas)
+    check(values, *schemas)
+    if values["simulation"]["particles"] != "auto":
+        check_particles("simulation.particles", values["simulation"]["particles"])
+    if values["evaluation"]["video"]:
+        ffmpeg("evaluation.video")
+    stages = rehearse(values)
+    if HydraConfig.initialized():
+        warn_of_idle(HydraConfig.get().overrides.task, values, stages)
+
+
+def check_evaluation(values: Mapping[str, Any]) -> None:
+    """All that eval.py's configuration says by itself. Errors: ConfigError naming the key."""
+    if (conf := conf_folder()) is not None:
+        check_known({k: v for k, v in values.items() if k != "scene"}, conf, "eval", EVALUATION, SIMULATION)
+    check(values, EVALUATION, SIMULATION)
+    if values["evaluation"]["video"]:
+        ffmpeg("evaluation.video")
+
+
+def check_splats(values: Mapping[str, Any]) -> None:
+    """All that the configuration of `python -m mosa.splats` says by itself. Errors: ConfigError naming the key."""
+    schemas = SPLATS, registered_keys(values)
+    if (conf := conf_folder()) is not None:
+        check_known(values, conf, "splats", *schemas)
+    check(values, *schemas)
+    if values["video"]:
+        ffmpeg("video")
+    check_formats(values["formats"])
+    if values["simulation"]["particles"] != "auto":
+        check_particles("simulation.particles", values["simulation"]["particles"])
+
+
+def check_capture(values: Mapping[str, Any]) -> None:
+    """All that the configuration of `python -m mosa.capture` says by itself. Errors: ConfigError naming the key."""
+    if (conf := conf_folder()) is not None:
+        check_known(values, conf, "capture", CAPTURE)
+    check(values, CAPTURE)
+
+
+def check_environments(values: Mapping[str, Any]) -> None:
+    """All that the configuration of `python -m mosa.environments` says by itself. Errors: ConfigError naming the key."""
+    if (conf := conf_folder()) is not None:
+        check_known(values, conf, "environments", ENVIRONMENTS)
+    check(values, ENVIRONMENTS)
+
+
+def check_particles(key: str, count: float) -> None:
+    """Errors: ConfigError where the machine cannot hold as many."""
+    counted(key, [count], "take as many as this machine has memory for", each=PARTICLE_BYTES / 2)
+
+
+def check_begin(cfg: DictConfig) -> None:
+    """The checkpoint that a fit is to go on from is one, and of this scene. Errors: DataError, ConfigError naming the keys."""
+    if cfg.ckpt_path is None:
+        return
+    try:
+        found = read_checkpoint(cfg.ckpt_path)
+        check_resumed(found, cfg.ckpt_path)
+    except DataError as error:
+        again = "; remove the file, and resume=auto begins the fit anew" if cfg.resume == "auto" else ""
+        raise DataError(f"{error}{again}") from error
+    check_same_scene(found, plain(cfg), cfg.ckpt_path)
+
+
+def check_seen(cfg: DictConfig, scene: Scene) -> None:
+    """The object as frame 0 shows it, before its reconstruction: no solid contains it, a grid suits its size, ground and walls.
+
+    Errors: ConfigError naming the key. Silent where fewer than two mattes are whole.
+    """
+    world = build_world(world_config(scene) | {"walls": plain(cfg.world).get("walls")})
+    turn_along([*([ground_plane(world.ground, world.up)] if world.ground is not None else []), *world.planes])
+    chosen, origins, directions, radii = lines_of_sight(scene, 0)
+    if len(chosen) < 2:
+        return
+    place, _ = misses(origins, directions, radii)
+    solids = colliders_from_config(plain(cfg.world)["colliders"] or ())
+    check_clear(solids, place[None], "the object, as frame 0 shows it,")
+    dx, radius = cfg.simulation.dx, float((radii * ((place - origins) * directions).sum(1)).mean())
+    if dx is not None:
+        count = 4 / 3 * 3.14 * min(radius / dx, 1e30) ** 3 * cfg.simulation.particles_per_cell
+        check_particles("simulation.dx", count)
+        if count < FEWEST:
+            raise ConfigError(f"simulation.dx: expected a grid that is finer than the object, of a radius of {radius:.3g} m, found "
+                              f"{dx} m")
+
+
+def check_starts(world: World, body: Body, found: dict[str, Start]) -> None:
+    """No sequence starts inside of a solid. Errors: ConfigError naming the collider."""
+    for prefix, start in found.items():
+        x = (body.rest - body.center) @ start.rotation.to(body.rest).T + start.center.to(body.rest)
+        check_clear(world.colliders, x, f"the body of {prefix}", spacing=float(body.volume.mean()) ** (1 / 3))
+
+
+def warn_of_little(world: World, body: Body, found: Mapping[str, Start], scenes: Sequence[Scene]) -> None:
+    """A warning for a film that is learned from and ends when the object has hardly begun to deform. found: starts by prefix;
+    scenes: theirs, in this order. Silent where something else than the ground may deform it."""
+    if world.colliders or world.planes:
+        return
+    for (prefix, start), scene in zip(found.items(), scenes):
+        if not prefix.startswith("train") or scene.ground is None:
+            continue
+        after = sum(frame >= first_contact(body, start, scene) for frame in scene.training_frames)  # type: ignore[arg-type]  # a body has the parts of its rest shape
+        if after < DEFORMED:
+            warnings.warn(f"{prefix}: {after} of the {len(scene.training_frames)} frames that are learned from come after first "
+                          f"contact: expected {DEFORMED} at least, in which the object deforms; what the film does not tell stays "
+                          "where the search begins, and its standard deviations do not say so (scene.frames, "
+                          "scene.holdout_frames, scene.last_free_frame)", stacklevel=2)  # fmt: skip
+
+
+def evaluated_scene(cfg: DictConfig, twin: Twin) -> DictConfig:
+    """The keys of the scene to evaluate on: eval.py's own, else what the run stored, which is read as data. Stored paths are read
+    from, and never written to: what is made goes to eval.py's own cache. Errors: DataError."""
+    stored = twin.config["cfg"].get("scene")
+    if not cfg.get("scene") and not (isinstance(stored, dict) and all(isinstance(key, str) for key in stored)):
+        raise DataError(f"ckpt_path: {cfg.ckpt_path}: expected the stored configuration's scene, found none; set scene=<option>")
+    keys = plain(cfg.scene) if cfg.get("scene") else {**stored, "cache": None}
+    if not cfg.get("scene") and keys.get("path") is not None:
+        print(f"scene: reads {keys['path']} below {keys.get('root')}, as the checkpoint says (scene=... reads another)")
+    return OmegaConf.create({"scene": keys | {"cache": keys.get("cache") or cfg.get("cache")}})

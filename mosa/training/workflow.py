@@ -1,0 +1,204 @@
+"""The way of a run: scene -> reconstruction -> starts -> fit -> figures, rollouts, video. Stages are cached or resumable."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+import warnings
+from contextlib import contextmanager
+from dataclasses import replace
+
+import lightning as L
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from mosa import __version__
+from mosa.config.build import build_evaluation, build_world, plain, world_config
+from mosa.config.extensions import load_extensions
+from mosa.errors import ConfigError, DataError
+from mosa.evaluation.evaluate import sequences
+from mosa.evaluation.likeness import warn_of_others
+from mosa.modules.body.body import Body, Start
+from mosa.physics import exact_sums
+from mosa.physics.contact.colliders import colliders_from_config
+from mosa.reconstruction.pose.starts import appearance_of, sequence_start
+from mosa.reconstruction.resolution import ENOUGH, resolution
+from mosa.rendering.rasterizer import use_backend
+from mosa.system.limits import named_device
+from mosa.system.whole_files import write_whole
+from mosa.training.assembly import assemble, scenes
+from mosa.training.costs import Costs, before_data, estimate
+from mosa.training.extrapolation import check_can_extrapolate, extrapolated
+from mosa.training.fitting import build_trainer, fit, fit_estimate
+from mosa.training.loggers import log_outcome
+from mosa.training.outputs import figures_of, optimized, start_figures, write_outputs
+from mosa.training.preflight import (
+    check_begin,
+    check_configuration,
+    check_evaluation,
+    check_seen,
+    check_starts,
+    evaluated_scene,
+    warn_of_little,
+)  # fmt: skip
+from mosa.training.run_folder import (
+    begins_from,
+    cost,
+    finished,
+    most_particles,
+    quiet,
+    run_folder,
+)  # fmt: skip
+from mosa.twin.drop_planning import plan, plan_text
+from mosa.twin.rollout_file import save_observed
+from mosa.twin.twin import Twin
+from mosa.types import AUTO
+
+log = logging.getLogger(__name__)
+
+
+class StageTimes:
+    """Wall time per stage, into `time/<stage>_s`. costs: of what is still to come, once that can be said."""
+
+    def __init__(self) -> None:
+        self.figures: dict[str, float] = {}
+        self.costs = Costs({}, 0.0)
+
+    @contextmanager
+    def measure(self, stage: str):
+        began = time.perf_counter()
+        yield
+        self.figures[f"time/{stage}_s"] = self.figures.get(f"time/{stage}_s", 0.0) + time.perf_counter() - began
+        log.info(self.costs.done(stage, time.perf_counter() - began))
+
+
+def train(cfg: DictConfig) -> float | None:
+    """Run everything `cfg` asks for; returns the figure a sweep optimises. Errors: MosaError of whatever was wrong."""
+    quiet()
+    load_extensions(plain(cfg).get("extensions"))
+    check_configuration(plain(cfg))
+    L.seed_everything(cfg.seed, verbose=False)
+    exact_sums.use(cfg.deterministic)
+    clock, folder = StageTimes(), run_folder()
+    log.info("mosa %s: %s", __version__, " ".join(HydraConfig.get().overrides.task))
+    if (done := finished(cfg, folder)) is not None:
+        log.info("skipped: %s has its metrics.json (resume=auto)", folder)
+        return optimized(done, cfg.optimized_metric)
+    cfg.ckpt_path = begins_from(cfg, folder)
+    check_begin(cfg)
+    trainer = build_trainer(cfg, folder)
+    device = str(trainer.strategy.root_device)
+    run = assemble(cfg, device)
+    data = run.data
+    log.info(before_data(plain(cfg), most_particles(device)))
+    with clock.measure("data"):
+        scene, others = data.scenes
+    sequences_taught = 1 + len(data.taught)
+    check_seen(cfg, scene)
+    clock.costs = estimate(plain(cfg), scene, len(others), sequences_taught, device, stored=data.reconstructed(),
+                           most=most_particles(device))
+    log.info("this run takes %s; %.1f GB", clock.costs.said(), clock.costs.memory / 1e9)
+    if scene.synthetic:
+        log.info("scene %s: synthetic, made by this program; not a capture", scene.name)
+    with clock.measure("reconstruction"):
+        shape, dx = data.shape, data.dx
+    log.info("body: %d particles, %.4g cm^3, grid spacing %.4g m", len(shape.rest), 1e6 * float(shape.volume.sum()), dx)
+    resolved = resolution(shape.rest, data.reconstruction.spacing, dx)
+    if not resolved.enough:
+        warnings.warn(f"simulation.particles: the thin parts of this body are {resolved.cells:.1f} cells across, fewer than "
+                      f"{ENOUGH:g}: the grid stiffens them, and the law that is found makes up for it; about "
+                      f"{resolved.particles} particles would resolve them", stacklevel=1)
+    with clock.measure("starts"):
+        starts = data.starts
+    for prefix, start in starts.items():
+        log.info("start of %s: velocity (%s) m/s", prefix, ", ".join(f"{v:.3f}" for v in start.velocity.tolist()))
+    with clock.measure("fit"):
+        module, world = run.module, run.world
+        body = module.body
+        check_starts(world, body, starts)
+        warn_of_little(world, body, starts, [scene, *others])
+        warn_of_others(body, starts, [scene, *others])
+        if cfg.extrapolate:
+            check_can_extrapolate(module)
+        log.info(fit_estimate(module, clock.costs))
+        fit(trainer, module, data, cfg.ckpt_path)
+    world = module.world  # where how the ground is touched was sought, it has been found
+    learned_from = [prefix for prefix in starts if prefix.startswith("train")]
+    save_observed(folder / "observed.npz", {prefix: take.cues for prefix, take in zip(learned_from, module.takes)})
+    with clock.measure("evaluation"):
+        evaluated = run.sequences
+        figures, kept = figures_of(build_evaluation(plain(cfg)), body, evaluated, world, module.posterior, folder)
+        figures |= start_figures(starts["train"]) | data.reconstruction.geometry
+        figures |= {f"id_prior/compared/{law}_m": distance for law, distance in module.compared.items()}
+        touched = {f"{contact}_m": distance for contact, distance in module.grounds.items()}
+        touched |= {f"{contact}_gain": gain for contact, gain in module.ground_gains.items()}
+        figures |= {f"id_prior/ground/{name}": value for name, value in touched.items() if math.isfinite(value)}
+    if cfg.extrapolate:
+        with clock.measure("extrapolation"):
+            figures |= extrapolated(cfg, run, scene.known_parameters)
+    figures |= clock.figures | cost(device) | {"seed": cfg.seed, "particles": len(body.rest), "dx_m": dx}
+    figures["geometry/cells_across"] = resolved.cells
+    figures |= {k: float(v) for k, v in trainer.callback_metrics.items() if k.startswith("val/")}
+    log_outcome(trainer.loggers, plain(cfg), figures)
+    write_outputs(folder, cfg, body, evaluated, figures, kept, world)
+    return optimized(figures, cfg.optimized_metric)
+
+
+def evaluate_checkpoint(cfg: DictConfig) -> float | None:
+    """`eval.py`: reproduce the figures of a run, evaluate on another scene, or simulate from a new start."""
+    quiet()
+    if OmegaConf.is_missing(cfg, "ckpt_path"):
+        raise ConfigError("ckpt_path: expected the checkpoint of a run, found none; "
+                          "python eval.py ckpt_path=<run folder>/checkpoints/last.ckpt")
+    load_extensions(plain(cfg).get("extensions"))
+    check_evaluation(plain(cfg))
+    exact_sums.use(cfg.deterministic)
+    folder = run_folder()
+    twin = Twin.load(cfg.ckpt_path, named_device(cfg.device))
+    # as the run rendered; a machine without it renders the same pictures by warp
+    use_backend((twin.config["cfg"].get("rendering") or {}).get("backend", "warp"), required=False)
+    if cfg.plan is not None:
+        ranked = plan(twin, count=cfg.plan)
+        log.info("\n%s", plan_text(ranked))
+        write_whole(folder / "plan.md", plan_text(ranked) + "\n")
+        return -ranked[0].gain
+    show(twin.body, cfg.appearance)
+    simulate = plain(cfg.simulate)
+    if any(simulate[k] is not None for k in ("velocity", "rotation", "position", "height", "angular_velocity", "colliders")):
+        rollout = twin.simulate(**simulate, progress=True)
+        given = simulate["colliders"]
+        solids = twin.world.colliders if given is None else colliders_from_config(given, "simulate.colliders")
+        written = twin.export(rollout, folder, colliders=solids, video=cfg.evaluation.video)
+        log.info("simulated %d frames into %s", len(rollout.x), written)
+        return None
+    scene, held_out = scenes(evaluated_scene(cfg, twin))
+    body, world = twin.body, twin.world
+    if cfg.get("scene"):
+        seen = appearance_of(body)
+        found = {f"test/{s.sequence}": sequence_start(body, seen, s, register=True) for s in (scene, *held_out)}
+        # the body moves in the world that the scene shows, among the run's walls and colliders
+        world = build_world(world_config(scene) | (twin.config["cfg"].get("world") or {}))
+        if scene.ground is not None and scene.ground.mode == AUTO and twin.world.ground is not None:
+            touched = replace(twin.world.ground, height=scene.ground.height)  # as the run found it
+            world = replace(world, ground=touched)
+        warn_of_others(body, found, [scene, *held_out])
+    else:
+        found = {k: Start.read(s, body.rest) for k, s in (twin.config.get("starts") or {}).items()}
+        if len(found) != 1 + len(held_out):
+            raise DataError(f"ckpt_path: {cfg.ckpt_path}: expected a start for each of the scene's {1 + len(held_out)} sequences, "
+                            f"found {len(found)}: the scene is another one than the run's")
+    check_starts(world, body, found)
+    evaluated = sequences(body, scene, held_out, found)
+    figures, kept = figures_of(build_evaluation(plain(cfg)), body, evaluated, world, twin.posterior, folder)
+    write_outputs(folder, cfg, body, evaluated, figures, kept, world)
+    return optimized(figures, "test/rms_m")
+
+
+def show(body: Body, appearance: str | None) -> None:
+    """What the body's images show from now on: splats or particles, None for what they are. Errors: ConfigError without splats."""
+    if appearance == "splats" and body.splats is None:
+        raise ConfigError("appearance: expected particles, found splats: the run kept none (rendering.appearance=particles, or an "
+                          "older one)")
+    if appearance == "particles":
+        body.splats = None

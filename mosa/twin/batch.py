@@ -1,0 +1,127 @@
+"""A twin's body in many worlds at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mosa.errors import ConfigError
+from mosa.modules.body.body import Body, Start, World
+from mosa.modules.fitting.parameters import read_numbers
+from mosa.physics.contact.colliders import Collider
+from mosa.system.limits import counted
+from mosa.twin.episode import Episode, Stepped, TwinState
+from mosa.twin.start import (
+    STARTED,
+    check_differentiable,
+    check_frames,
+    check_variant,
+    check_wants_no_gradients,
+    checked_dt,
+    checked_substeps,
+    numbers,
+    start_in,
+)
+
+
+class TwinWorlds:
+    """A twin's body in `count` worlds that never meet, stepped together: on CUDA in the same launches, on a CPU in threads."""
+
+    def __init__(
+        self, body: Body, world: World, frame_dt: float, training_start: Start, count: int, laws: Tensor | None = None
+    ) -> None:
+        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+            raise ConfigError(f"worlds: expected a whole number of at least 1, found {count!r}")
+        counted("worlds", (count, len(body.rest)), "take fewer", each=500)  # bytes of a particle
+        shape, fits = (count, len(read_numbers(body))), isinstance(laws, Tensor) and laws.is_floating_point()
+        if laws is not None and not (fits and laws.shape == shape and bool(torch.isfinite(laws.detach()).all())):
+            found = tuple(laws.shape) if fits and laws.shape != shape else repr(laws)[:80]
+            raise ConfigError(f"laws: expected one for each of {count} worlds, a tensor {shape} of finite numbers, found {found}")
+        self.body, self.world, self.frame_dt, self.training_start = body, world, frame_dt, training_start
+        self.count, self.laws = count, laws
+        self.episode: Episode | None = None
+        self._box: Sequence[Sequence[float]] | Tensor | None = None
+
+    def reset(
+        self, starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None, *,
+        colliders: Sequence[Collider | Mapping[str, Any]] | None = None, gravity: Tensor | Sequence[Any] | None = None,
+        variant: str = "adapted", control_dt: float | None = None,
+        substeps: int | None = None, frames: int = 30, differentiable: bool = False,
+        box: Sequence[Sequence[float]] | Tensor | None = None,
+    ) -> TwinState:  # fmt: skip
+        """Begin a motion in every world; returns the state (count, ...).
+
+        starts: rotation, height, position, velocity, angular_velocity as `Twin.simulate` takes them, for all worlds or one mapping
+        for each; gravity: (count, 3) [m/s^2], None for the world's; others as `Twin.reset`. Errors: ConfigError naming the world.
+        """
+        check_frames(frames, self.count * len(self.body.rest))
+        check_variant(variant)
+        check_differentiable(differentiable)
+        if not differentiable:
+            check_wants_no_gradients(starts=starts, colliders=colliders, gravity=gravity, box=box)
+        found = self._found(starts, range(self.count), colliders, box)
+        if gravity is not None:
+            gravity = numbers("gravity", gravity, f"finite numbers ({self.count}, 3)")
+            if gravity.shape != (self.count, 3):
+                raise ConfigError(f"gravity: expected shape ({self.count}, 3), found {tuple(gravity.shape)}")
+        self._box = box
+        self.episode = Episode(
+            self.body, found[0][1], checked_dt(control_dt, self.frame_dt), [start for start, _ in found],
+            variant=variant, frames=frames, substeps=checked_substeps(substeps), laws=self.laws, gravity=gravity,
+            differentiable=differentiable,
+        )  # fmt: skip
+        return self.episode.state
+
+    def restart(self, which: Sequence[int], starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None) -> TwinState:
+        """Put the worlds with these numbers back to new starts, as `reset` takes them, None for those they had; the others stay as
+        they are. Time is one for all and goes on: colliders that were driven are back where they began, others follow their
+        motion. Errors: ConfigError naming the world."""
+        if not isinstance(which, (list, tuple, range)):
+            raise ConfigError(f"restart: expected a list of numbers of worlds, found {str(which)[:80]}")
+        which, episode = list(which), self._going()
+        given = None if starts is None else [start for start, _ in self._found(starts, which, (), self._box)]
+        return episode.restart(which, given)
+
+    def _found(
+        self, starts: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None, which: Sequence[int], colliders: Any, box: Any
+    ) -> list[tuple[Start, World]]:
+        """The starts of these worlds, and the world. Errors: ConfigError."""
+        listed = isinstance(starts, (list, tuple)) and all(isinstance(start, Mapping) for start in starts)
+        if starts is not None and not isinstance(starts, Mapping) and not listed:
+            raise ConfigError(f"starts: expected what Twin.simulate takes, by name, or a list of that, found {str(starts)[:80]}")
+        each = [dict(starts or {})] * len(which) if starts is None or isinstance(starts, Mapping) else list(starts)
+        if len(each) != len(which):
+            raise ConfigError(f"starts: expected one, or one for each of {len(which)} worlds, found {len(each)}")
+        found: list[tuple[Start, World]] = []
+        for i, (b, given) in enumerate(zip(which, each)):
+            if unknown := sorted(set(given) - set(STARTED)):
+                raise ConfigError(f"starts[{b}]: expected {', '.join(STARTED)}, found {', '.join(unknown)}")
+            if i and given is each[0]:
+                found.append(found[0])
+                continue
+            try:
+                found.append(start_in(self.body, self.world, self.training_start, colliders=colliders, box=box, **given))
+            except ConfigError as error:
+                raise ConfigError(f"starts[{b}]: {error}") from error
+        return found
+
+    def _going(self) -> Episode:
+        if self.episode is None:
+            raise ConfigError("worlds: expected reset(...) before step and state, found no motion")
+        return self.episode
+
+    def step(self, action: Mapping[str, Any] | None = None) -> Stepped:
+        """As `Twin.step`; every command is the same in all worlds, or (count, 3), rotations (count, 3, 3), for each."""
+        return self._going().step(action)
+
+    @property
+    def state(self) -> TwinState:
+        """As `Twin.state`, of all worlds."""
+        return self._going().state
+
+    @state.setter
+    def state(self, state: TwinState) -> None:
+        self._going().state = state

@@ -1,0 +1,98 @@
+"""Which drop to film next: starts ranked by how much they would tell about the learned law.
+
+Where the laws that are still possible predict different motions, seeing the motion tells them apart. For laws drawn from the
+posterior
+the expected information of a drop is that of the linear Gaussian model, 1/2 log det(I + K), K the draws' covariance in units of the
+noise (Chaloner and Verdinelli, Bayesian experimental design: a review, Statistical Science 10, 1995).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from mosa.errors import ConfigError, SimulationDiverged
+from mosa.modules.fitting.parameters import each_law
+from mosa.system.progress import tqdm
+from mosa.twin.twin import Twin
+
+INDEPENDENT = 30.0
+"""Data in a frame, as `identification.count`."""
+LEAST_DRAWS = 4
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A start as `Twin.simulate` takes it, and the information [nats] that its motion is expected to give."""
+
+    rotation: tuple[float, float, float, float]
+    height: float
+    velocity: tuple[float, float, float]
+    gain: float
+
+
+def information(drawn: Tensor, noise: float) -> float:
+    """1/2 log det(I + K) [nats] of positions (D, T, N, 3) [m] under D drawn laws; noise [m]: of a particle's position."""
+    draws, _, particles = drawn.shape[:3]
+    away = (drawn - drawn.mean(0)).reshape(draws, -1).double()
+    # neighbouring particles are one datum: each counts as INDEPENDENT/N of one, and noise is over three components
+    share = min(1.0, INDEPENDENT / particles) * 3 / noise**2 / (draws - 1)
+    values = torch.linalg.eigvalsh(away @ away.T).clamp(min=0) * share
+    return 0.5 * float(torch.log1p(values).sum())
+
+
+def drawn_starts(count: int, seed: int) -> list[tuple[float, float, float, float]]:
+    """(axis, degrees) of `count` rotations, evenly drawn; the first is the rest pose, which the training drop shows already."""
+    quaternions = np.random.default_rng(seed).normal(size=(count - 1, 4))
+    rotations = [Rotation.from_quat(q) for q in quaternions]
+    found = [(0.0, 1.0, 0.0, 0.0)]
+    for rotation in rotations:
+        vector = rotation.as_rotvec()
+        angle = float((vector @ vector) ** 0.5)
+        found.append((*(float(v) / angle for v in vector), math.degrees(angle)))
+    return found
+
+
+@torch.no_grad()
+def plan(twin: Twin, *, count: int = 8, draws: int = 16, frames: int = 15, seed: int = 0) -> list[Candidate]:
+    """`count` starts, the most telling first: turned at random, thrown down as the training drop was, from where it fell.
+
+    Errors: ConfigError where the run kept no posterior, or no start can be simulated.
+    """
+    if twin.posterior is None:
+        raise ConfigError("plan: this run kept no posterior; a fit by Gauss-Newton does (fit.joint.optimizer=auto)")
+    speed = tuple(float(v) for v in twin.training_start.velocity)
+    up, ground = twin.world.up, twin.world.ground
+    lowest = float((twin.body.rest.cpu() @ up).min())
+    height = max(0.02, lowest - (ground.height if ground is not None else 0.0))
+    numbers = twin.posterior.draws(draws, torch.Generator().manual_seed(seed))
+    ranked = []
+    for rotation in tqdm(drawn_starts(count, seed), "candidate drops"):
+        motions = []
+        for _ in each_law(twin.body, numbers):
+            try:
+                motions.append(twin.simulate(rotation=rotation, height=height, velocity=speed, frames=frames).x.cpu())
+            except SimulationDiverged:
+                continue
+        if len(motions) >= LEAST_DRAWS:
+            gain = information(torch.stack(motions), max(twin.posterior.model_error, 1e-3))
+            ranked.append(Candidate(rotation, height, speed, gain))
+    if not ranked:
+        raise ConfigError("plan: none of the candidate starts can be simulated: the body leaves the box of the scene")
+    return sorted(ranked, key=lambda each: -each.gain)
+
+
+def plan_text(ranked: list[Candidate]) -> str:
+    """What a person does next, in lines."""
+    lines = ["Film this drop next (rotation: axis and degrees from the pose of the training drop's first frame):", ""]
+    for i, each in enumerate(ranked):
+        x, y, z, degrees = each.rotation
+        speed = ", ".join(f"{v:.2f}" for v in each.velocity)
+        lines.append(f"{i + 1}. {each.gain:6.2f} nats: turned by {degrees:3.0f} degrees about ({x:.2f}, {y:.2f}, {z:.2f}), lowest "
+                     f"point {each.height:.3f} m above the ground, thrown at ({speed}) m/s")
+    return "\n".join(lines)

@@ -1,0 +1,288 @@
+"""The learned twin in use: load a checkpoint, roll its law out from a new start or step by step, export particles and a video.
+
+    from mosa.twin import Twin
+    twin = Twin.load("outputs/train/.../checkpoints/last.ckpt")
+    rollout = twin.simulate(rotation=(1, 0, 0, 45), height=0.2, velocity=(0.5, -2, 0), frames=30)
+    twin.export(rollout, "falling/")
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement
+from torch import Tensor
+
+from mosa.config.build import build_body, build_world
+from mosa.config.checkpoints import TENSORS, check_kinds, checked, checked_posterior, checked_splats, read_checkpoint
+from mosa.data.io.splat_formats import check_formats, drop_later_frames, save_frames
+from mosa.errors import ConfigError, DataError, MosaError
+from mosa.evaluation.analysis.comparison import ground_lines, on_ground
+from mosa.evaluation.analysis.figures import side_by_side, to_uint8, write_video
+from mosa.evaluation.uncertainty import DRAWS, among_forms, drawn_motions, rival_motions, total_spread
+from mosa.modules.body.body import Body, Start, World
+from mosa.modules.fitting.gauss_newton import Posterior
+from mosa.modules.fitting.parameters import read_numbers
+from mosa.physics.contact.colliders import Collider, colliders_from_config, reach
+from mosa.rendering.appearance.carried_splats import CarriedSplats, seen
+from mosa.rendering.cameras import look_at
+from mosa.system.limits import named_device
+from mosa.system.progress import tqdm
+from mosa.system.whole_files import written_whole
+from mosa.twin.batch import TwinWorlds
+from mosa.twin.episode import Episode, Stepped, TwinState
+from mosa.twin.rollout_file import poses, save_rollout
+from mosa.twin.shown_body import FILE as BODY_FILE
+from mosa.twin.shown_body import save_body
+from mosa.twin.shown_solids import with_solids
+from mosa.twin.start import (
+    check_differentiable,
+    check_frames,
+    check_variant,
+    check_wants_no_gradients,
+    checked_dt,
+    checked_substeps,
+    start_in,
+)
+from mosa.types import Cameras, Rollout
+
+
+class Twin:
+    """A learned body in its world. `frame_dt` [s]: time between the frames it was trained on."""
+
+    def __init__(
+        self, body: Body, world: World, frame_dt: float, config: dict[str, Any], training_start: Start,
+        posterior: Posterior | None = None,
+    ) -> None:  # fmt: skip
+        self.body, self.world, self.frame_dt = body, world, frame_dt
+        self.config, self.training_start, self.posterior = config, training_start, posterior
+        self._episode: Episode | None = None
+
+    @classmethod
+    def load(cls, path: str | Path, device: str = "cpu") -> Twin:
+        """Read a checkpoint, as data alone (docs/safety.md). Errors: DataError naming file and part where it is missing, damaged,
+        or was not written by this program; ConfigError for a device that is not here."""
+        device = named_device(device)
+        checkpoint = read_checkpoint(path)
+        config, begun, tensors = checked(checkpoint, path)
+        splats = checked_splats(checkpoint, path)
+        try:
+            body = build_body(config, {name: tensors[name] for name in TENSORS})
+            check_kinds(tensors, body.state_dict())
+            body.load_state_dict(tensors)
+            if splats is not None:
+                body.splats = CarriedSplats.read(splats, body.rest)
+            world, start = build_world(config["world"]), Start.read(begun)
+        except Exception as error:  # every part has been checked; a file of a stranger may still fit no body
+            reason = str(error) if isinstance(error, MosaError) else f"{type(error).__name__}: {error}"
+            raise DataError(f"ckpt_path: {path}: no body can be built from it ({' '.join(reason.split())[:300]})") from error
+        known = checked_posterior(checkpoint, len(read_numbers(body)), path)
+        posterior = None if known is None else Posterior.read(known)
+        return cls(body.to(device).eval(), world, config["frame_dt"], config, start, posterior)
+
+    def predict(self, *, draws: int = DRAWS, seed: int = 0, **start: Any) -> tuple[Rollout, Tensor]:
+        """(rollout of the learned law, standard deviation (T, N) [m] of every particle's position) from a new start.
+
+        start: as `simulate` takes it; draws: laws drawn from the posterior. Errors: ConfigError where the run kept no posterior
+        (a fit by Adam), or where fewer than two of the draws can be simulated.
+        """
+        if self.posterior is None:
+            raise ConfigError("predict: this run kept no posterior; a fit by Gauss-Newton does (fit.joint.optimizer=auto)")
+        rollout, laws = self.simulate(**start), self.posterior.draws(draws, torch.Generator().manual_seed(seed))
+        found = drawn_motions(self.body, laws, lambda: self.simulate(**start).x, quiet=True)
+        if len(found) < 2:
+            raise ConfigError(f"predict: expected at least two of {draws} draws of the law that can be simulated from this start, "
+                              f"found {len(found)}")
+        others = rival_motions(self.body, self.posterior, lambda: self.simulate(**start).x)
+        return rollout, total_spread(torch.stack(found), self.posterior.model_error, among_forms(rollout.x, others))
+
+    def simulate(
+        self,
+        *,
+        rotation: Sequence[float] | Tensor | None = None,
+        height: float | None = None,
+        position: Sequence[float | None] | Tensor | None = None,
+        velocity: Sequence[float] | None = None,
+        angular_velocity: Sequence[float] | None = None,
+        frames: int = 30,
+        variant: str = "adapted",
+        progress: bool = False,
+        colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
+        box: Sequence[Sequence[float]] | Tensor | None = None,
+    ) -> Rollout:
+        """Roll the learned law out from a new start.
+
+        rotation: (ax, ay, az, degrees) about the body's centre, or a (3, 3) matrix, relative to the rest shape; position: (3,) [m]
+        of the body's centre, None for a number that is left as it is; height [m] of the lowest point above the ground, in place
+        of the position along `up`; velocity [m/s]; angular_velocity [rad/s]; what is left out is taken from the training
+        sequence. colliders: rigid solids instead of the world's, or entries as a configuration has them; `reactions` of the result
+        holds the forces on them. box: (2, 3) [m] the lower and the upper corner of what no particle may leave, None for the
+        scene's; walls of the world stay where they are. No gradients: `reset(differentiable=True)` and `step` have them, and a
+        tensor that requires them is refused. Errors: ConfigError naming the argument (also a solid that the body starts in),
+        SimulationDiverged (the body leaves the box).
+        """
+        check_frames(frames, len(self.body.rest))
+        check_variant(variant)
+        given = {"rotation": rotation, "height": height, "position": position, "velocity": velocity,
+                 "angular_velocity": angular_velocity, "colliders": colliders, "box": box}  # fmt: skip
+        check_wants_no_gradients(**given)
+        with torch.no_grad(), tqdm(total=frames - 1, desc="simulate", unit="frame", disable=not progress) as bar:
+            start, world = start_in(self.body, self.world, self.training_start, **given)
+            model = self.body.model(variant)
+            return self.body.simulate(start, world, frames, self.frame_dt, model=model, progress=lambda _: bar.update())
+
+    def reset(
+        self,
+        *,
+        rotation: Sequence[float] | Tensor | None = None,
+        height: float | None = None,
+        position: Sequence[float | None] | Tensor | None = None,
+        velocity: Sequence[float] | Tensor | None = None,
+        angular_velocity: Sequence[float] | Tensor | None = None,
+        colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
+        variant: str = "adapted",
+        control_dt: float | None = None,
+        substeps: int | None = None,
+        frames: int = 30,
+        differentiable: bool = False,
+        box: Sequence[Sequence[float]] | Tensor | None = None,
+    ) -> TwinState:
+        """Begin a motion that `step` goes on with; returns its state at time 0.
+
+        rotation, height, position, velocity, angular_velocity, colliders, variant, box: as `simulate`. control_dt [s]: of a step,
+        the `frame_dt` of the training by default; substeps: of every step, None for as many as the time step bound asks for in a
+        motion of `frames` steps, `simulate(frames=...)`'s. differentiable: whether gradients reach tensors among these arguments
+        (a rotation as a matrix), the actions, and the law's parameters; it keeps states between the passes. Without it tensors that
+        require gradients are refused. Errors: ConfigError.
+        """
+        check_frames(frames, len(self.body.rest))
+        check_variant(variant)
+        check_differentiable(differentiable)
+        given = {"rotation": rotation, "height": height, "position": position, "velocity": velocity,
+                 "angular_velocity": angular_velocity, "colliders": colliders, "box": box}  # fmt: skip
+        if not differentiable:
+            check_wants_no_gradients(**given)
+        start, world = start_in(self.body, self.world, self.training_start, **given)
+        self._episode = Episode(
+            self.body, world, checked_dt(control_dt, self.frame_dt), start, variant=variant, frames=frames,
+            substeps=checked_substeps(substeps), differentiable=differentiable,
+        )  # fmt: skip
+        return self._episode.state
+
+    def step(self, action: Mapping[str, Any] | None = None) -> Stepped:
+        """Go one step on: (state, reactions), see `mosa.twin.episode`.
+
+        action: for colliders by name (their number as a text where they have none), either `velocity` (3,) [m/s] and
+        `angular_velocity` (3,) [rad/s] in world axes, about the collider's origin, for this step, or the `position` (3,) [m] and
+        `rotation` ((3,) vector [rad] or (3, 3)) where it shall be after it; three numbers alone are a velocity. A collider that
+        was never in an action follows its own motion; one that was, but is not in this one, stands still.
+        Errors: ConfigError naming the collider, what was expected and found; SimulationDiverged.
+        """
+        return self.episode.step(action)
+
+    @property
+    def episode(self) -> Episode:
+        """The motion that `reset` began. Errors: ConfigError before that."""
+        if self._episode is None:
+            raise ConfigError("twin: expected reset(...) before step and state, found no motion")
+        return self._episode
+
+    @property
+    def state(self) -> TwinState:
+        """Of the motion now; set it to go back to an earlier one, or to branch. `state.tensors()` are plain tensors to save, and
+        `TwinState.read` makes them a state again, after a reset with the same arguments."""
+        return self.episode.state
+
+    @state.setter
+    def state(self, state: TwinState) -> None:
+        self.episode.state = state
+
+    def worlds(self, count: int, laws: Tensor | None = None) -> TwinWorlds:
+        """`count` copies of the body, each in a world of its own, that are reset and stepped together.
+
+        laws: (count, numbers) of a law for each, as `posterior.draws(count)` gives them, None for the learned one in all.
+        Errors: ConfigError."""
+        return TwinWorlds(self.body, self.world, self.frame_dt, self.training_start, count, laws)
+
+    @torch.no_grad()
+    def render(self, rollout: Rollout, size: int = 400, colliders: Sequence[Collider | Mapping[str, Any]] | None = None) -> Tensor:
+        """(T, size, size, 3) images from one camera that sees the whole motion, on the ground and among `colliders`, those that the
+        rollout was simulated with (None: the world's). Half spaces and meshes are not drawn."""
+        body, up = self.body, self.world.up.to(self.body.rest)
+        solids = self._met(rollout, colliders)
+        low, high = rollout.x.amin((0, 1)), rollout.x.amax((0, 1))
+        # solids about as large as the body are in the picture as a whole, tables and walls as far as they reach into it
+        for at, solid in zip(poses(solids, rollout.times)[0].unbind(1) if solids else (), solids):
+            if 0 < (far := reach(solid.shape)) < body.size:
+                low, high = torch.minimum(low, at.amin(0).to(low) - far), torch.maximum(high, at.amax(0).to(high) + far)
+        target = 0.5 * (low + high)
+        side = torch.tensor([0.9, 0.0, 1.0]).to(body.rest)
+        side = side - (side @ up) * up if float((side - (side @ up) * up).norm()) > 1e-3 else torch.roll(up, 1)
+        focal = 1.6 * size
+        distance = 0.75 * float((high - low).norm()) * focal / size + 0.2
+        eye = target + distance * (side / side.norm() + 0.25 * up)
+        K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
+        camera = Cameras(K[None].to(body.rest), look_at(eye, target, up)[None].to(body.rest), size, size, ("view",))
+        shown = with_solids(seen(body, rollout.x, rollout.F_tot), solids, rollout.times, up, body.size / 30)
+        images = shown.images(camera, torch.ones(3).to(body.rest))[0].clamp(0, 1).cpu()
+        lines = ground_lines(self.world, camera, body.size)
+        drawn = [on_ground(to_uint8(image), lines, 1, torch.ones(3)) for image in images] if lines else []
+        return torch.from_numpy(np.stack(drawn)).float() / 255 if lines else images
+
+    def _met(self, rollout: Rollout, colliders: Sequence[Collider | Mapping[str, Any]] | None) -> tuple[Collider, ...]:
+        """The solids of a rollout, None for the world's. Errors: ConfigError where they are not as many as it has reactions of."""
+        met = 0 if rollout.reactions is None else rollout.reactions.shape[-2]
+        solids = self.world.colliders if met and colliders is None else colliders_from_config(colliders or (), "colliders")
+        if met != len(solids):
+            raise ConfigError(f"colliders: expected the {met} that the rollout was simulated with, as simulate takes them, found "
+                              f"{len(solids)}")
+        return tuple(solids)
+
+    def export(
+        self, rollout: Rollout, folder: str | Path, *, video: bool = True, title: str = "learned twin",
+        formats: Sequence[str] = ("ply",), colliders: Sequence[Collider | Mapping[str, Any]] | None = None,
+    ) -> Path:  # fmt: skip
+        """Write into `folder`: `body.npz`, which the viewer shows the motion with; `rollout.npz`, with the poses of `colliders`;
+        one PLY a frame (x y z red green blue); `simulation.mp4`, with them and the ground; and the Gaussians of the body that its
+        images show in `formats` (`data.splat_files.FORMATS`: 3DGS PLY, splat, spz, usd) below `splats/`. colliders: those that
+        the rollout was simulated with, None for the world's. Errors: ConfigError where they are not."""
+        if not isinstance(formats, (list, tuple)):
+            raise ConfigError(f"formats: expected a list like ['ply'], found {str(formats)[:80]!r}")
+        check_formats(formats)
+        solids = self._met(rollout, colliders)
+        try:
+            folder = Path(folder)
+            (folder / "ply").mkdir(parents=True, exist_ok=True)
+        except (OSError, TypeError, ValueError) as error:
+            raise ConfigError(f"export: expected a folder that can be written, found {str(folder)[:100]!r} ({error})") from error
+        save_body(folder / BODY_FILE, self.body, self.world)
+        save_rollout(folder / "rollout.npz", {"simulation": rollout}, solids)
+        write_frames(folder / "ply", rollout.x.cpu().numpy(), self.body.colors.cpu().numpy())
+        save_frames(seen(self.body, rollout.x, rollout.F_tot), folder / "splats", formats, rate=1 / self.frame_dt, up=self.world.up)
+        if video:
+            moments = [f"frame {t}, {time:.3f} s" for t, time in enumerate(rollout.times.tolist())]
+            frames = side_by_side({title: self.render(rollout, colliders=solids)}, footer=moments)
+            write_video(folder / "simulation.mp4", frames, fps=max(5.0, 0.3 / self.frame_dt))
+        return folder
+
+
+def write_frames(folder: Path, x: np.ndarray, colors: np.ndarray) -> None:
+    """A PLY for each frame of x (T, N, 3), each whole or not there."""
+    drop_later_frames(folder, ".ply", len(x))
+    for t, points in enumerate(x):
+        with written_whole(folder / f"{t:03d}.ply") as partial:
+            write_ply(partial, points, colors)
+
+
+def write_ply(path: str | Path, points: np.ndarray, colors: np.ndarray) -> None:
+    """Binary PLY with x y z [m] and 8-bit colours."""
+    vertex = np.empty(len(points), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
+    for i, name in enumerate(("x", "y", "z")):
+        vertex[name] = points[:, i]
+    for i, name in enumerate(("red", "green", "blue")):
+        vertex[name] = np.clip(colors[:, i] * 255 + 0.5, 0, 255).astype(np.uint8)
+    PlyData([PlyElement.describe(vertex, "vertex")]).write(str(path))

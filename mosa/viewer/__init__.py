@@ -1,0 +1,1 @@
+"""Runs and twins in a browser: python -m mosa.viewer"""

@@ -1,0 +1,333 @@
+"""What a run's files become for the viewer: motions, what is measured between them, and its colours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from scipy.spatial import cKDTree
+
+from mosa.errors import ConfigError, DataError
+from mosa.modules.body.body import World
+from mosa.reconstruction.motion.cues import neighbourhood
+from mosa.rendering.appearance.carried_splats import seen
+from mosa.rendering.observer import deformed_covariances
+from mosa.system.npz import read_npz
+from mosa.twin.shown_body import FILE, ShownBody
+from mosa.twin.twin import Twin
+from mosa.viewer.pages import cell, horizontal
+
+BODIES = ("observed", "truth", "prior", "learned")
+"""What a clip can have, from left to right: the motion learned from, or where none was the true one, and the two models'."""
+COLORS = ("appearance", "heterogeneity", "deviation", "uncertainty")
+DISTANCE = 1.4
+"""From one body to the next, in widths of what they take up together in the frame where that is most."""
+GRAY = 0.6
+"""Of what has no value, and of a body under another one: white would not be seen on viser's white."""
+FAINT = 0.25
+"""Opacity of a body under another one, relative to its own: where both lie together the upper one's colours are to be seen."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Colours of a quantity: `colors` (of matplotlib) over low to high, in the unit that `label` names. beyond: max where values
+    can lie above high, which the legend then shows."""
+
+    label: str
+    colors: str
+    low: float
+    high: float
+    beyond: str = "neither"
+
+    def paint(self, values: np.ndarray) -> np.ndarray:
+        """(N, 3) colours in [0, 1] of (N,) values."""
+        return matplotlib.colormaps[self.colors]((values - self.low) / (self.high - self.low))[:, :3]
+
+    def legend(self) -> np.ndarray:
+        """(H, W, 3) picture of the colour bar, 8 bit."""
+        figure = Figure(figsize=(3.2, 0.7), dpi=200, layout="constrained")
+        canvas = FigureCanvasAgg(figure)
+        shown = ScalarMappable(Normalize(self.low, self.high), self.colors)
+        bar = figure.colorbar(shown, cax=figure.add_subplot(), orientation="horizontal", extend=self.beyond)
+        bar.set_label(self.label, fontsize=9)
+        bar.ax.tick_params(labelsize=8)
+        canvas.draw()
+        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+@dataclass(frozen=True)
+class ShownSplats:
+    """M splats that a body's particles carry, over T frames: centers (T, M, 3) [m], covariances (T, M, 3, 3) [m^2], colors
+    (T, M, 3) in [0, 1], in the light of each frame."""
+
+    centers: np.ndarray
+    covariances: np.ndarray
+    colors: np.ndarray
+
+
+@dataclass(frozen=True)
+class ShownMotion:
+    """N particles over T frames: centers (T, N, 3) [m], covariances (T, N, 3, 3) [m^2]; carried: the splats that they carry."""
+
+    centers: np.ndarray
+    covariances: np.ndarray
+    carried: ShownSplats | None = None
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A sequence of a run. times: (T,) [s]; bodies: by name, in the order of BODIES: learned always, over all frames; prior, the
+    calibrated law's without adapter and heterogeneity, where the run left it; one of observed, over the frames that were learned
+    from, and truth, or neither; appearance: (N, 3) in [0, 1]; opacities: (N,); factor: (N,) 1 + a tanh eta, by which a particle's
+    stiffness differs from the law's; spread: (T, N) [m] predicted standard deviation of the learned positions, None where the run
+    left none; splat_opacities: (M,), splat_particles: (M,) nearest particles of the splats that all bodies carry, where the run has
+    them."""
+
+    name: str
+    times: np.ndarray
+    bodies: dict[str, ShownMotion]
+    appearance: np.ndarray
+    opacities: np.ndarray
+    factor: np.ndarray
+    world: World
+    spread: np.ndarray | None = None
+    splat_opacities: np.ndarray | None = None
+    splat_particles: np.ndarray | None = None
+
+    @property
+    def learned(self) -> ShownMotion:
+        return self.bodies["learned"]
+
+    @property
+    def reference(self) -> str | None:
+        """What the models are compared with: observed, truth, or None."""
+        return next((name for name in ("observed", "truth") if name in self.bodies), None)
+
+    @property
+    def models(self) -> list[str]:
+        """prior, where it is there, and learned."""
+        return [name for name in self.bodies if name != self.reference]
+
+    @property
+    def overlays(self) -> dict[str, tuple[str, str]]:
+        """By what they are called, the pairs (above, below) that can lie over each other: each model over what it is compared
+        with, or learned over prior where that is nothing."""
+        if self.reference is not None:
+            pairs = [(model, self.reference) for model in reversed(self.models)]
+        else:
+            pairs = [("learned", below) for below in self.models[:-1]]
+        return {f"{above} over {below}": (above, below) for above, below in pairs}
+
+    @property
+    def up(self) -> np.ndarray:
+        """(3,) unit vector."""
+        return self.world.up.numpy()
+
+    @property
+    def size(self) -> float:
+        """Largest extent of the body at the start [m]."""
+        return float(np.ptp(self.learned.centers[0], axis=0).max())
+
+    @property
+    def across(self) -> np.ndarray:
+        """(3,) horizontal unit vector, from each body to the next."""
+        return horizontal(self.up)
+
+    @property
+    def moved(self) -> np.ndarray:
+        """(M, 3) all positions of all bodies [m]."""
+        return np.concatenate([motion.centers.reshape(-1, 3) for motion in self.bodies.values()])
+
+    @cached_property
+    def side(self) -> np.ndarray:
+        """(3,) shift of a body beside the one before it [m]."""
+        along = [motion.centers @ self.across for motion in self.bodies.values()]
+        widths = [np.ptp(np.concatenate([x[t] for x in along if t < len(x)])) for t in range(len(self.times))]
+        return DISTANCE * float(max(widths)) * self.across
+
+    def deviation(self, frame: int, model: str = "learned") -> np.ndarray | None:
+        """(N,) distance [m] of a model's particles from those of the reference; None where it has no such frame."""
+        if self.reference is None or frame >= len(self.bodies[self.reference].centers):
+            return None
+        return np.linalg.norm(self.bodies[model].centers[frame] - self.bodies[self.reference].centers[frame], axis=-1)
+
+    @cached_property
+    def scales(self) -> dict[str, Scale]:
+        """Of each quantity, one for all frames and models: a colour means one value while the sequence plays, in both bodies."""
+        span = max(float(np.abs(self.factor - 1).max()), 0.01)  # what differs by less than 1 % shall not look like a contrast
+        found = {"heterogeneity": Scale(r"stiffness factor $1 + a\,\tanh\,\eta$ [-]", "coolwarm", 1 - span, 1 + span)}
+        if self.reference is not None:
+            frames = range(len(self.bodies[self.reference].centers))
+            high = max(float(np.quantile(self.deviation(t, model), 0.99)) for t in frames for model in self.models)
+            label = {"observed": "distance to the observed motion [mm]", "truth": "distance to the true motion [mm]"}
+            found["deviation"] = Scale(label[self.reference], "viridis", 0, max(1e3 * high, 1e-3), "max")
+        if self.spread is not None:
+            high = float(np.quantile(self.spread, 0.99, axis=1).max())
+            found["uncertainty"] = Scale("predicted standard deviation [mm]", "magma", 0, max(1e3 * high, 1e-3), "max")
+        return found
+
+    def paint(self, frame: int, by: str, model: str = "learned") -> np.ndarray:
+        """(N, 3) colours in [0, 1] of a model's body. heterogeneity: blue softer, red stiffer, the prior has none; deviation: up
+        to the 99th percentile of the sequence's worst frame, gray where there is nothing to compare with; uncertainty: likewise, of
+        the learned body. Errors: ConfigError for another name."""
+        if by not in COLORS:
+            raise ConfigError(f"color: expected {' or '.join(COLORS)}, found {by!r}")
+        if by == "appearance":
+            return self.appearance
+        if by == "heterogeneity":
+            return self.scales[by].paint(self.factor if model == "learned" else np.ones_like(self.factor))
+        if by == "uncertainty":
+            known = self.spread is not None and model == "learned"
+            return self.scales[by].paint(1e3 * self.spread[frame]) if known else np.full_like(self.appearance, GRAY)
+        far = self.deviation(frame, model)
+        return np.full_like(self.appearance, GRAY) if far is None else self.scales[by].paint(1e3 * far)
+
+    def splats(self, name: str, frame: int, by: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Centers (M, 3) [m], covariances (M, 3, 3) [m^2], colours (M, 3) and opacities (M,) of a body's splats: those it carries,
+        where it carries some, painted as the particles nearest to them at rest; else the particles themselves."""
+        motion = self.bodies[name]
+        plain = by == "appearance" or name == self.reference
+        colors = self.appearance if plain else self.paint(frame, by, name)
+        if motion.carried is None:
+            return motion.centers[frame], motion.covariances[frame], colors, self.opacities
+        colors = motion.carried.colors[frame] if plain else colors[self.splat_particles]
+        return motion.carried.centers[frame], motion.carried.covariances[frame], colors, self.splat_opacities
+
+    def caption(self, frame: int) -> str:
+        """What a frame is, and what the scene leaves out."""
+        said = f"**{self.name}**, frame {frame}, {self.times[frame] - self.times[0]:.3f} s  \n"
+        if self.reference is None:
+            said += "No observed and no true motion to compare with."
+        elif self.deviation(frame) is None:
+            said += "Not observed in this frame."
+        else:
+            far = {model: 1e3 * float(np.sqrt(np.square(self.deviation(frame, model)).mean())) for model in self.models}
+            motion = {"observed": "observed", "truth": "true"}[self.reference]
+            said += f"rms distance to the {motion} motion: " + ", ".join(f"{model} {value:.1f} mm" for model, value in far.items())
+        if self.world.ground is not None:
+            said += f"  \nGround grid: {1e3 * cell(self.size):g} mm"
+        hidden = {"walls": len(self.world.planes), "colliders": len(self.world.colliders)}
+        if any(hidden.values()):
+            said += "  \nNot drawn: " + ", ".join(f"{kind} ({count})" for kind, count in hidden.items() if count)
+        return said
+
+
+@torch.no_grad()
+def read_run(folder: str | Path, checkpoint: str | Path | None = None) -> list[Clip]:
+    """The sequences of a run, the training one first, or the motion of a folder that `Twin.export` or eval.py wrote. prior.npz,
+    observed.npz and truth.npz may be missing: older runs left fewer files, captures have no truth. checkpoint: of the run, None for
+    the folder's own, or else its body.npz. Errors: DataError naming the file that is missing or of another run."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise DataError(f"run: expected the folder of a finished run (run=outputs/train/<date>/<time>), or of an exported motion, "
+                        f"found no folder {folder}")
+    rollouts = arrays(folder / "rollout.npz")  # first: it is what a run that has not ended lacks
+    body = shown_body(folder, checkpoint)
+    paths = {kind: folder / f"{'rollout' if kind == 'learned' else kind}.npz" for kind in BODIES}
+    files = {kind: arrays(path) for kind, path in paths.items() if kind != "learned" and path.is_file()} | {"learned": rollouts}
+    spreads = arrays(folder / "uncertainty.npz") if (folder / "uncertainty.npz").is_file() else {}
+    clips = []
+    for name in (key.removesuffix("/x") for key in rollouts if key.endswith("/x")):
+        check_motion(rollouts, name, paths["learned"], ("x",))
+        bodies, shape = {}, (len(rollouts[f"{name}/x"]), len(body.rest))
+        times = rollouts.get(f"{name}/times")
+        if times is None or times.shape != shape[:1] or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+            raise DataError(f"{paths['learned']}: {name}/times: expected {shape[0]} increasing times, found "
+                            f"{'none' if times is None else times.tolist()[:8]}")
+        for kind, stored in files.items():
+            if f"{name}/x" not in stored or (kind == "truth" and "observed" in bodies):
+                continue
+            check_motion(stored, name, paths[kind], ("x",))
+            frames, particles = stored[f"{name}/x"].shape[:2]
+            if particles != shape[1] or frames > shape[0] or (kind != "observed" and frames < shape[0]):
+                raise DataError(f"{paths[kind]}: {name}: expected the checkpoint's {shape[1]} particles in the rollout's "
+                                f"{shape[0]} frames, found {particles} in {frames}; all files must be of one run")
+            check_motion(stored, name, paths[kind], ("F_tot", "covariances"))
+            x = stored[f"{name}/x"]
+            bodies[kind] = ShownMotion(x, covariances(stored, name, body), carried_by(body, x))
+        clips.append(Clip(name, rollouts[f"{name}/times"], bodies, body.colors.clamp(0, 1).numpy(), body.opacities.numpy(),
+                          body.factor.numpy(), body.world, spread_of(spreads, name, shape, folder / "uncertainty.npz"),
+                          **splat_keys(body)))  # fmt: skip
+    if not clips:
+        raise DataError(f"{folder / 'rollout.npz'}: expected the rollouts of a run, found none")
+    return clips
+
+
+def shown_body(folder: Path, checkpoint: str | Path | None) -> ShownBody:
+    """The body whose motions a folder has. Errors: DataError where nothing says what it looks like."""
+    path = Path(checkpoint) if checkpoint is not None else folder / "checkpoints" / "last.ckpt"
+    if checkpoint is None and not path.is_file() and (folder / FILE).is_file():
+        return ShownBody.read(folder / FILE)
+    if checkpoint is None and not folder.joinpath("checkpoints").is_dir():
+        raise DataError(f"{folder}: expected checkpoints/last.ckpt of a run, or body.npz of an exported motion, found neither; "
+                        "checkpoint=<run folder>/checkpoints/last.ckpt names the run's")
+    twin = Twin.load(path)
+    return ShownBody.of(twin.body, twin.world)
+
+
+def carried_by(body: ShownBody, x: np.ndarray) -> ShownSplats | None:
+    """The body's splats with its particles at (T, N, 3) [m]; None where it has none."""
+    if body.splats is None:
+        return None
+    shown = seen(body, torch.from_numpy(x).to(body.rest), None)
+    return ShownSplats(*(value.numpy() for value in (shown.means, shown.covariances, shown.colors())))
+
+
+def splat_keys(body: ShownBody) -> dict[str, np.ndarray]:
+    """What clips say of the splats that the body carries."""
+    if body.splats is None:
+        return {}
+    nearest = cKDTree(body.rest.numpy()).query(body.splats.means.numpy())[1]
+    return {"splat_opacities": body.splats.opacities.numpy(), "splat_particles": nearest}
+
+
+def spread_of(stored: dict[str, np.ndarray], name: str, shape: tuple[int, int], path: Path) -> np.ndarray | None:
+    """(T, N) [m], None where the file has none for this sequence. Errors: DataError naming file and entry."""
+    found = stored.get(f"{name}/sd")
+    if found is None:
+        return None
+    if found.shape != shape or found.dtype.kind != "f" or not np.isfinite(found).all() or found.min() < 0:
+        raise DataError(f"{path}: {name}/sd: expected {shape} finite standard deviations, found {found.dtype} {found.shape}")
+    return found
+
+
+def check_motion(stored: dict[str, np.ndarray], name: str, path: Path, keys: tuple[str, ...]) -> None:
+    """What there is of a motion is finite, and of the positions' frames and particles. Errors: DataError naming file and entry."""
+    frames = stored[f"{name}/x"].shape[:2]
+    for key in (key for key in keys if f"{name}/{key}" in stored):
+        found, each = stored[f"{name}/{key}"], (3,) if key == "x" else (3, 3)
+        if found.dtype.kind != "f" or found.shape != (*frames, *each) or len(frames) != 2 or 0 in frames:
+            raise DataError(f"{path}: {name}/{key}: expected floating point numbers of shape {('T', 'N', *each)}, as many frames "
+                            f"and particles as {name}/x has, found {found.dtype} {found.shape}")
+        if not np.isfinite(found).all():
+            raise DataError(f"{path}: {name}/{key}: expected finite numbers")
+
+
+def covariances(stored: dict[str, np.ndarray], name: str, body: ShownBody) -> np.ndarray:
+    """(T, N, 3, 3) [m^2] of a motion's splats: the stored ones; else those at rest, deformed by the stored F_tot, or where there
+    are positions alone by a local fit to them."""
+    if f"{name}/covariances" in stored:
+        return stored[f"{name}/covariances"]
+    if f"{name}/F_tot" in stored:
+        F = torch.from_numpy(stored[f"{name}/F_tot"])
+    else:
+        around = neighbourhood(body.rest)
+        F = torch.stack([around.deformation(x) for x in torch.from_numpy(stored[f"{name}/x"])])
+        F[:, around.weight == 0] = torch.eye(3)  # neighbours in a plane say nothing: as at rest
+    return deformed_covariances(F, body.covariances).numpy()
+
+
+def arrays(path: Path) -> dict[str, np.ndarray]:
+    """Contents of an npz file. Errors: DataError naming it."""
+    if not path.is_file():
+        raise DataError(f"{path}: file not found; expected the folder of a finished run (run=outputs/train/<date>/<time>); "
+                        "train.py writes this file at its end; it resumes with ckpt_path=<run folder>/checkpoints/last.ckpt")
+    return read_npz(path)
