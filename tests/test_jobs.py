@@ -428,7 +428,7 @@ def test_damaged_kernels_are_one_message(tmp_path, ending, damage):
     """As a killed compiler or a full disk leave them; in a process of its own, as a kernel that is loaded stays so."""
     (tmp_path / "kernel.py").write_text(textwrap.dedent("""
         import warp as wp
-        from mosa import refused
+        from mosa.system import refused
         wp.config.kernel_cache_dir = "kernels"
 
         @wp.kernel

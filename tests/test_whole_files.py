@@ -67,7 +67,7 @@ def test_frames_of_an_export_are_whole_and_of_this_motion_alone(tmp_path, monkey
         Path(path).write_bytes(before[:20])
         raise OSError(errno.ENOSPC, "full")
 
-    monkeypatch.setattr(mosa.twin, "write_ply", full)
+    monkeypatch.setattr(mosa.twin.twin, "write_ply", full)
     with pytest.raises(OSError, match="full"):
         write_frames(tmp_path, x[:3], colors)
     assert (tmp_path / "000.ply").read_bytes() == before and not list(tmp_path.glob("*.partial"))

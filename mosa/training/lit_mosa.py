@@ -73,7 +73,7 @@ OF_DATA = ("scene", "reconstruction", "rendering", "seed")
 
 def body_of(shape: RestShape, config: Mapping[str, Any]) -> Body:
     """The body of a reconstruction, with the law, settings and appearance of the run, on the device of `shape`."""
-    body = build_body(config, shape.tensors())
+    body = build_body(config, {name: tensor.cpu() for name, tensor in shape.tensors().items()})
     body.splats = shape.splats
     return body.to(shape.rest.device)
 

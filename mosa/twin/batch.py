@@ -36,10 +36,12 @@ class TwinWorlds:
         if isinstance(count, bool) or not isinstance(count, int) or count < 1:
             raise ConfigError(f"worlds: expected a whole number of at least 1, found {count!r}")
         counted("worlds", (count, len(body.rest)), "take fewer", each=500)  # bytes of a particle
-        shape, fits = (count, len(read_numbers(body))), isinstance(laws, Tensor) and laws.is_floating_point()
-        if laws is not None and not (fits and laws.shape == shape and bool(torch.isfinite(laws.detach()).all())):
-            found = tuple(laws.shape) if fits and laws.shape != shape else repr(laws)[:80]
-            raise ConfigError(f"laws: expected one for each of {count} worlds, a tensor {shape} of finite numbers, found {found}")
+        if laws is not None:
+            shape, fits = (count, len(read_numbers(body))), isinstance(laws, Tensor) and laws.is_floating_point()
+            if not (fits and laws.shape == shape and bool(torch.isfinite(laws.detach()).all())):
+                found = tuple(laws.shape) if fits and laws.shape != shape else repr(laws)[:80]
+                raise ConfigError(f"laws: expected one for each of {count} worlds, a tensor {shape} of finite numbers, "
+                                  f"found {found}")
         self.body, self.world, self.frame_dt, self.training_start = body, world, frame_dt, training_start
         self.count, self.laws = count, laws
         self.episode: Episode | None = None

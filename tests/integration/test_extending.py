@@ -123,7 +123,7 @@ def test_the_simulator_alone():
 BASELINE = """
 import my_mosa, torch
 from small_bodies import FRAME_DT, WORLD, small_body, start
-from mosa.config import build_adapter
+from mosa.config.build import build_adapter
 def rolled(k, E):
     body = small_body(adapter=False, E=E)
     body.settings = type(body.settings)(**{**vars(body.settings), "stride": 1})
