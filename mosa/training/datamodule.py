@@ -24,6 +24,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from mosa.config.build import plain, run_config
+from mosa.config.composition import composed
 from mosa.data.batches import Epochs, MotionBatch, SequenceBatch, ViewSchedule
 from mosa.data.observations import Observations, cropped, training_observations
 from mosa.data.sequences import load_sequences, taught_names
@@ -76,8 +77,6 @@ class SceneDataModule(L.LightningDataModule):
         learned from. predict: starts of predict_dataloader; none: those of all sequences. Errors, here or where a part is asked
         for: ConfigError naming the key, DataError naming the file."""
         super().__init__()
-        from mosa.config.composition import composed
-
         self.cfg = composed(scene, overrides)
         self.device, self.held_out, self.predict = device, held_out, list(predict)
 

@@ -32,6 +32,7 @@ from torch.utils.data import DataLoader
 
 from mosa.config.build import build_body, build_criterion, build_evaluation, build_identification, build_stages, build_world, plain
 from mosa.config.checkpoints import VERSION, read_checkpoint
+from mosa.config.composition import composed
 from mosa.data.batches import MotionBatch
 from mosa.errors import ConfigError, SimulationDiverged
 from mosa.evaluation import metrics
@@ -97,8 +98,6 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
     def __init__(self, first: str | Mapping[str, Any] | DictConfig | None = None, *overrides: str) -> None:
         """first, overrides: a whole configuration (`mosa.compose`), or overrides as on the command line. Errors: ConfigError."""
         super().__init__()
-        from mosa.config.composition import composed
-
         whole = dict(first) if isinstance(first, dict) and not overrides else plain(composed(first, overrides))
         self.cfg = {key: value for key, value in whole.items() if key not in MADE}
         self.save_hyperparameters({"cfg": self.cfg}, logger=False)
