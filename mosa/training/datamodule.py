@@ -41,7 +41,7 @@ from mosa.reconstruction.rest_shape import RestShape
 from mosa.reconstruction.settings import ReconstructionSettings, build_settings
 from mosa.system.progress import tqdm
 from mosa.training.run_folder import most_particles
-from mosa.types import MotionCues, Reconstruction, Scene
+from mosa.types import Reconstruction, Scene
 
 
 def unchanged(batch: Any) -> Any:
@@ -263,6 +263,5 @@ class SceneDataModule(L.LightningDataModule):
                 for name, (views, frames) in parts.items() if views and frames]  # fmt: skip
 
     def seen_in(self, name: str, seen: Observations, views: Sequence[int], frames: Sequence[int]) -> MotionBatch:
-        cues: MotionCues | None = None
         return MotionBatch(sequences=(SequenceBatch(name=name, index=0, views=list(views), frames=list(frames), observations=seen,
-                                                    cues=cues, extra={}),))
+                                                    cues=None, extra={}),))

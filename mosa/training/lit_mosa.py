@@ -108,7 +108,10 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         weights: Mapping[str, float], *, world: World | None = None, clip: float = 1.0, criterion: Criterion | None = None,
         settings: IdentificationSettings | None = None,
     ) -> None:  # fmt: skip
-        """Everything as it is before the first step. weights: per loss term (`mosa.modules.fitting.terms`)."""
+        """Everything as it is before the first step. weights: per loss term (`mosa.modules.fitting.terms`). Errors: ConfigError
+        naming weights of no term."""
+        if body is not None:
+            check_terms(weights, body.adapter)
         self.body, self.world, self.background = body, world, background
         self.takes, self.first_takes, self.stages = list(takes), list(takes), list(stages)
         self.weights, self.clip, self.config = dict(weights), clip, config
@@ -139,7 +142,6 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         """Of parts that were made elsewhere (see `_begin`). config: plain containers that a checkpoint keeps."""
         config = {} if config is None else config
         module = cls(config.get("cfg") or {})
-        check_terms(weights, body.adapter)
         module._begin(config, body, takes, background, stages, weights, world=world, **parts)
         return module
 
@@ -174,6 +176,9 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
         if self.trainer.precision not in PRECISIONS:
             raise ConfigError(f"trainer.precision: expected {' or '.join(PRECISIONS)}, found {self.trainer.precision!r}: the "
                               "simulation is single precision, or double by simulation.precision=64")
+        if self.trainer.accumulate_grad_batches != 1:  # the schedule of views counts a batch as a step
+            raise ConfigError(f"trainer.accumulate_grad_batches: expected 1, found {self.trainer.accumulate_grad_batches}: "
+                              "fit.views says how many views a step reads")
         return [Stages()]
 
     def attach(self, data, fitting: bool = True) -> None:
@@ -185,9 +190,7 @@ class LitMosa(NewtonSteps, GradientSteps, L.LightningModule):
             config = measured | {"cfg": self.cfg | {key: measured["cfg"][key] for key in OF_DATA}}
             config["world"] = measured["world"] | (self.cfg.get("world") or {})
             body = body_of(data.shape, config)
-            parts = parts_of(config, body)
-            check_terms(parts["weights"], body.adapter)
-            self._begin(config, body, (), data.scene.background.to(body.rest.device), **parts)
+            self._begin(config, body, (), data.scene.background.to(body.rest.device), **parts_of(config, body))
             self.start = data.starts["train"].written()
         elif len(data.shape.rest) != len(self.body.rest):
             raise ConfigError(f"ckpt_path: expected a scene whose body has {len(self.body.rest)} particles, found "

@@ -98,6 +98,8 @@ def test_a_checkpoint_is_fitted_on_validated_tested_and_predicts(fitted, cfg, tm
 def test_what_cannot_be_done_is_named(cfg):
     with pytest.raises(ConfigError, match="expected a SceneDataModule"):
         L.Trainer(**QUIET, enable_checkpointing=False).fit(LitMosa(cfg), train_dataloaders=[0])
+    with pytest.raises(ConfigError, match=r"trainer\.accumulate_grad_batches: expected 1, found 2: fit\.views"):
+        L.Trainer(**QUIET, enable_checkpointing=False, accumulate_grad_batches=2).fit(LitMosa(cfg), datamodule=SceneDataModule(cfg))
     with pytest.raises(ConfigError, match=r"trainer\.precision: expected 32-true, found '64-true'"):
         L.Trainer(**QUIET, enable_checkpointing=False, precision="64-true").fit(LitMosa(cfg), datamodule=SceneDataModule(cfg))
 
